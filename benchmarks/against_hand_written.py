@@ -21,7 +21,7 @@ from by_hand import CASES, DOUBLE_PENDULUM
 from measure import in_turn, main, row, skipped
 
 import lagjax as lj
-from lagjax.jax_internals.one_function import one_function
+from lagjax.jaxtools.fuse_cpu import one_function
 
 try:
     import numba

@@ -26,8 +26,9 @@ import numpy as np  # noqa: E402
 from measure import compiled, in_turn, main, row  # noqa: E402
 
 import lagjax as lj  # noqa: E402
-from lagjax.mechanics.coordinates import state  # noqa: E402
 from lagjax.mechanics.equations import equations_of  # noqa: E402
+from lagjax.system.coordinates import state  # noqa: E402
+from lagjax.system.model import model_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -128,7 +129,7 @@ def evaluations(system, q, v, params):
     """A compiled loop of evaluations, each at a state that depends on the previous one."""
 
     def loop(t, q, v, params):
-        equations = equations_of(system, t, q, v, params)
+        equations = equations_of(model_of(system, t, q, v, params))
         independent = equations.independent(t, q, v)
 
         def once(state, _):

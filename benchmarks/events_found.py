@@ -38,7 +38,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
 import lagjax as lj
-from lagjax.motion import sight
+from lagjax.integrate.events import brackets as sampling
 from lagjax.scenes import bead_on_hoop
 
 jax.config.update("jax_enable_x64", True)
@@ -414,7 +414,7 @@ def of_family(name, family, count, seed, lanes=False):
     return pairs, rtols, [judge(*x) for x in zip(pairs, rtols, outcomes)]
 
 
-def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sight.pieces_of):
+def at_ends_of_steps(begin, inner, off, end, h, touches, pieces=sampling.pieces_of):
     """The twin's pieces: no information and no doubt between the ends of a step."""
     found = pieces(begin, inner, off, end, h, touches)
     between = len(found.sign) - 1
@@ -442,11 +442,11 @@ def rows(wanted):
     for name in TWINS:
         what = f"twin, ends of steps only: {name}: share missed"
         if wanted(what):
-            sight.pieces_of, pieces = at_ends_of_steps, sight.pieces_of
+            sampling.pieces_of, pieces = at_ends_of_steps, sampling.pieces_of
             try:
                 *_, verdicts = of_family(name, FAMILIES[name], each, OPTIONS["seed"])
             finally:
-                sight.pieces_of = pieces
+                sampling.pieces_of = pieces
             found = totals(verdicts)
             yield row(what, found["missed"] / found["there"], 0.02, "more", **found)
     yield from costs(wanted)

@@ -24,8 +24,8 @@ from jax.flatten_util import ravel_pytree
 from measure import machine, row, versions, written
 
 import lagjax as lj
-from lagjax.fitting.equations import dampened
-from lagjax.motion.results import in_words
+from lagjax.fit.problem.residuals import dampened
+from lagjax.integrate.trajectory.results import in_words
 from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions
 
 jax.config.update("jax_enable_x64", True)

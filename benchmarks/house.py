@@ -11,9 +11,9 @@
     lambdas                 lambdas that get a name
     tested                  per cent of the files that have a test file of their name
 
-A walk counts the functions that are called with the system at the first call from Python: `stays` distinct functions,
-`files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from a file to one of a
-package above it.
+A walk counts the functions that are called with the system, or its model, at the first call from Python: `stays`
+distinct functions, `files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from
+a file to one of a package above it.
 
     python benchmarks/house.py [--json FILE]
 """
@@ -33,13 +33,14 @@ import numpy as np
 from measure import main, row
 
 import lagjax as lj
+from lagjax.system.model import Model
 
 jax.config.update("jax_enable_x64", True)
 
 ROOT = Path(lj.__file__).parent
 FILES = {path.relative_to(ROOT): path.read_text() for path in sorted(ROOT.rglob("*.py"))}
 TREES = {path: ast.parse(source) for path, source in FILES.items()}
-FLOORS = ("jax_internals", "numerics", "mechanics", "jumps", "motion", "analysis", "fitting", "sweeps")
+FLOORS = ("jaxtools", "numerics", "system", "mechanics", "integrate", "analysis", "fit", "sweep")
 STATE = ["system", "t", "q", "v", "params"]
 SHORT = 60
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
@@ -135,7 +136,7 @@ def walk(call):
         if event != "call" or not code.co_filename.startswith(root):
             return
         for name in code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]:
-            if isinstance(frame.f_locals.get(name), lj.System | lj.Hybrid):
+            if isinstance(frame.f_locals.get(name), lj.System | lj.Hybrid | Model):
                 found.setdefault((Path(code.co_filename).relative_to(ROOT), code.co_name))
 
     sys.setprofile(seen)
@@ -161,7 +162,7 @@ def walks(wanted):
         "integrate": (lambda: lj.integrate(mass, start, at_rest, params, ts=ts), 35, 6, 15),
         "fit": (lambda: lj.fit(mass, measured, params, free="g", progress=False), 60, None, 30),
         "normal modes": (lambda: lj.normal_modes(mass, 0.0, {"x": 0.0, "y": -1.0}, at_rest, params), 35, None, 20),
-        "periodic orbit": (lambda: lj.periodic_orbit(swing, 1.0, 0.0, 2.1, params), None, None, None),
+        "periodic orbit": (lambda: lj.periodic_orbit(swing, (1.0, 0.0), 2.1, params), None, None, None),
     }
     for name, (call, most, most_climbs, most_returns) in doors.items():
         if not wanted(name):

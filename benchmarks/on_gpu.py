@@ -45,7 +45,7 @@ from host_operations import host_operations, with_a_look  # noqa: E402
 from measure import CLOCK, in_new_process, main, row, skipped  # noqa: E402
 
 import lagjax as lj  # noqa: E402
-from lagjax.motion.accuracy import EXPECTED  # noqa: E402
+from lagjax.integrate.trajectory.error_report import EXPECTED  # noqa: E402
 from lagjax.scenes import bead_on_hoop  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)

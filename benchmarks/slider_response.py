@@ -50,8 +50,8 @@ run = lambda point: lj.integrate(bead, point["start"], 0.0, {"omega": point["ome
 knobs = lj.interact(run, {"omega": (0.0, 4.0, 0.02), "start": (0.1, 3.0)}, start={"omega": 0.6}, progress=False)
 """
 PRESSES, DRAGGED = 60, 100
-# The element in which JupyterLab shows the curves.
-PICTURE = ".widget-gridbox .widget-html-content"
+# The element in which JupyterLab shows the picture: the first HTML below the sliders.
+PICTURE = ".widget-vbox .widget-html-content"
 # Seconds between a picture and the next press, and the key; back again, so that a slider's range suffices.
 PACES = {"": (0.3, "ArrowRight"), ", in quick succession": (0.05, "ArrowLeft")}
 # What `docs/known-gaps.md` advises for jupyter_server_config.py.
@@ -111,14 +111,14 @@ def in_this_process(knobs):
         knobs.set(omega=omega)
         times.append(1e3 * (time.process_time() - began))
         wholes.append(knobs._picture.drawn_whole > before)
-    solve, lines = (milliseconds(f) for f in (lambda: knobs._values(knobs.point), knobs._picture._over))
+    solve, lines = (milliseconds(f) for f in (lambda: knobs._values(knobs.point), knobs._picture._svg))
     whole = statistics.median([x for x, is_whole in zip(times, wholes) if is_whole] or [0.0])
     more = {
         "solve": solve,
         "lines": lines,
         "with axes": whole,
         "whole": np.mean(wholes),
-        "bytes": len(knobs._over.value),
+        "bytes": len(knobs._shows.value),
     }
     yield row("kernel: ms of processor time a value, median", statistics.median(times), 20, **more)
 

@@ -35,7 +35,7 @@ from measure import in_turn, main, row, skipped
 
 import lagjax as lj
 from lagjax.scenes import bead_on_hoop
-from lagjax.sweeps.store import Store
+from lagjax.sweep.store import Store
 
 jax.config.update("jax_enable_x64", True)
 

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots
 from lagjax.mechanisms import MECHANISMS, andrews, bricard, car_axis, driven_crank, n_four_bar, slider_crank
 from lagjax.scenes import SCENES, woodpecker
 
@@ -37,14 +37,14 @@ def stills(axis, lines, count):
     for i in np.linspace(0, count - 1, STILLS).astype(int):
         for k, line in enumerate(lines):
             shade = 0.15 + 0.85 * i / (count - 1)
-            axis.plot(*line[i].T, "o-", color=plot.COLOURS[k % 5], alpha=shade, markersize=3, linewidth=1.2)
+            axis.plot(*line[i].T, "o-", color=plots.COLOURS[k % 5], alpha=shade, markersize=3, linewidth=1.2)
     axis.set(aspect="equal")
 
 
 def compared(axis, x, known, found, formula, **labels):
     """A closed form as a curve, and the computed values as dots on it."""
-    axis.plot(x, known, label=formula, **plot.style(1))
-    axis.plot(x[::6], found[::6], "o", color=plot.COLOURS[0], markersize=3, label="computed")
+    axis.plot(x, known, label=formula, **plots.style(1))
+    axis.plot(x[::6], found[::6], "o", color=plots.COLOURS[0], markersize=3, label="computed")
     axis.set(**labels)
     axis.legend(fontsize=8, frameon=False)
 
@@ -155,8 +155,8 @@ def draw_bricard(left, right):
         np.sum(np.cross(before, rods) * axes, axis=2), np.sum(before * rods, axis=2)
     )  # the angle by which r_(i-1) turns into r_i about u_i
     grid = np.linspace(-np.pi, np.pi, 200)
-    right.contour(*2 * [np.degrees(grid)], bricard.closure(*np.meshgrid(grid, grid)), [0.0], colors=[plot.COLOURS[1]])
-    right.plot(*np.degrees(angles[::3, :2]).T, "o", color=plot.COLOURS[0], markersize=3)
+    right.contour(*2 * [np.degrees(grid)], bricard.closure(*np.meshgrid(grid, grid)), [0.0], colors=[plots.COLOURS[1]])
+    right.plot(*np.degrees(angles[::3, :2]).T, "o", color=plots.COLOURS[0], markersize=3)
     right.set(xlabel="θ / °", ylabel="φ / °", title="cos θ + cos φ + cos θ cos φ = 0")
 
 
@@ -183,7 +183,7 @@ def draw_double_pendulum(left, right):
     mechanism = MECHANISMS["double_pendulum"]
     ts, q, v, _ = moved(mechanism)
     stills(left, [path([0, 0], q.r1, q.r2)], len(ts))
-    left.plot(*q.r2.T, color=plot.COLOURS[1], linewidth=0.8)
+    left.plot(*q.r2.T, color=plots.COLOURS[1], linewidth=0.8)
     left.set(title="Two masses on rods", xlabel="x / m", ylabel="y / m")
     kinetic = 0.5 * np.sum(v.r1**2, axis=1) + 0.5 * np.sum(v.r2**2, axis=1)
     compared(right, ts, -9.81 * (q.r1[:, 1] + q.r2[:, 1]), kinetic, "-g (m1 y1 + m2 y2)", xlabel="t / s",
@@ -195,11 +195,11 @@ def draw_fekete(left, right):
     ts, q, _, multipliers = moved(MECHANISMS["fekete"], end=20.0)
     left.plot(*unit(np.linspace(0, 2 * np.pi, 181)).T, color="black", linewidth=0.8)
     for k in range(20):
-        left.plot(q[:, k, 0], q[:, k, 1], color=plot.COLOURS[k % 5], linewidth=0.8)
+        left.plot(q[:, k, 0], q[:, k, 1], color=plots.COLOURS[k % 5], linewidth=0.8)
     left.plot(*q[-1, :, :2].T, "o", color="black", markersize=4)
     left.set(title="From four rings to rest, from above", aspect="equal", xlabel="x", ylabel="y")
-    right.plot(ts, multipliers["sphere"], color=plot.COLOURS[0], linewidth=0.8)
-    right.axhline(-19 / 4, label="-(N - 1)/4", **plot.style(1))
+    right.plot(ts, multipliers["sphere"], color=plots.COLOURS[0], linewidth=0.8)
+    right.axhline(-19 / 4, label="-(N - 1)/4", **plots.style(1))
     right.set(xlabel="t", ylabel="multipliers", title="At rest all are equal")
     right.legend(fontsize=8, frameon=False)
 
@@ -208,12 +208,12 @@ def draw_woodpecker():
     """One lap of the toy, and the beginning of the next."""
     ts = np.linspace(0.0, 0.18, 721)
     traj = woodpecker.motion(woodpecker.PARAMS, ts, rtol=1e-8, estimate_error=False)
-    fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
+    fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     left, right = axes[0]
-    left.plot(ts, 1e3 * traj.q["y"], **plot.style(0))
+    left.plot(ts, 1e3 * traj.q["y"], **plots.style(0))
     left.set(xlabel="t / s", ylabel="height of the sleeve / mm", title="One lap of 0.146 s: 19.4 mm down")
     for i, (name, label) in enumerate((("sleeve", "sleeve"), ("bird", "bird"))):
-        right.plot(ts, np.degrees(traj.q[name]), label=label, **plot.style(i))
+        right.plot(ts, np.degrees(traj.q[name]), label=label, **plots.style(i))
     known = np.degrees((woodpecker.PARAMS["r_M"] - woodpecker.PARAMS["r_0"]) / woodpecker.PARAMS["h_M"])
     for sign in (1, -1):
         right.axhline(
@@ -230,7 +230,7 @@ def picture(name):
         return SCENES[name].picture()
     if name == "woodpecker":
         return draw_woodpecker()
-    fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
+    fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     globals()[f"draw_{name}"](*axes[0])
     return fig
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots
 from lagjax.scenes import bead_on_hoop, rolling_hoop
 
 jax.config.update("jax_enable_x64", True)
@@ -20,8 +20,8 @@ def hoop(axis):
     angle = np.degrees(np.asarray(motion.q["theta"]))
     exact = rolling_hoop.exact_multipliers(params, motion.q["theta"], 1.45)
     for i, (name, label) in enumerate((("contact", "normal force"), ("rolling", "friction"))):
-        axis.plot(angle, motion.multipliers[name], label=label, **plot.style(i))
-        axis.plot(angle[::6], getattr(exact, name)[::6], "o", color=plot.COLOURS[i], markersize=3)
+        axis.plot(angle, motion.multipliers[name], label=label, **plots.style(i))
+        axis.plot(angle[::6], getattr(exact, name)[::6], "o", color=plots.COLOURS[i], markersize=3)
     axis.axvline(np.degrees(np.arcsin(rolling_hoop.departure_sine(params, 1.45))), color="black", linewidth=0.8)
     axis.set(xlabel="angle of the hoop / °", ylabel="force / N", title="Multipliers are forces (dots: exact)")
     axis.invert_xaxis()
@@ -38,10 +38,10 @@ def pitchfork(axis):
 
     speeds = np.linspace(0.3, 3.0, 55)
     swept = lj.sweep(rest, {"omega": speeds, "start": np.array([-0.1, 0.1])}, progress=False)
-    axis.plot(speeds, swept.values, "o", color=plot.COLOURS[0], markersize=3)
+    axis.plot(speeds, swept.values, "o", color=plots.COLOURS[0], markersize=3)
     above = np.linspace(1.0, 3.0, 200)
     for sign in (-1, 1):
-        axis.plot(above, sign * np.arccos(1 / above**2), label="arccos(ω0²/ω²)" if sign > 0 else None, **plot.style(1))
+        axis.plot(above, sign * np.arccos(1 / above**2), label="arccos(ω0²/ω²)" if sign > 0 else None, **plots.style(1))
     axis.set(xlabel="ω / ω0", ylabel="angle at rest / rad", title="Sweeps: a bead on a rotating hoop")
 
 
@@ -58,13 +58,13 @@ def fitted(axis):
     axis.plot(ts, data, ".", color="#888888", markersize=3, label="measured")
     fine = np.linspace(0.0, 10.0, 400)
     label = ", ".join(f"{n} = {x:.3f} ± {s:.3f}" for n, x, s in zip(("c", "ω²"), found.values, found.sd))
-    axis.plot(fine, found.motion(ts=fine).q, label=label, **plot.style(1))
+    axis.plot(fine, found.motion(ts=fine).q, label=label, **plots.style(1))
     axis.set(xlabel="t / s", ylabel="angle / rad", title="Fits, with their uncertainty", ylim=(-2.0, 3.4))
 
 
 def main(path):
     """Draw and write."""
-    fig, axes = plot.figure(1, 3, size=(4.2, 3.0))
+    fig, axes = plots.figure(1, 3, size=(4.2, 3.0))
     for axis, draw in zip(axes[0], (hoop, pitchfork, fitted)):
         draw(axis)
         axis.legend(fontsize=8, frameon=False)

@@ -15,119 +15,119 @@ from typing import TYPE_CHECKING
 
 # isort: split
 # A system: its Lagrangian and its constraints.
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
 from lagjax.mechanics.generators import Generator
-from lagjax.mechanics.hybrid import Hybrid, Switch
 from lagjax.mechanics.noether import NoetherCharge, noether_charge
-from lagjax.mechanics.system import System
+from lagjax.system.constraints import Holonomic, Nonholonomic
+from lagjax.system.hybrid import Hybrid, Switch
+from lagjax.system.system import System
 
 # isort: split
 # One state: quantities from the Lagrangian and the constraints.
+from lagjax.analysis.explain import Explanation, explain
+from lagjax.mechanics.accelerations import accelerations, constraint_force, constraint_residual
+from lagjax.mechanics.consistent_state import consistent_state
 from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix, momentum
-from lagjax.mechanics.multipliers import accelerations, constraint_force, constraint_residual
-from lagjax.motion.consistent_state import consistent_state
-from lagjax.motion.explanation import Explanation, explain
 
 # isort: split
 # Motion.
-from lagjax.animation import Animation
-from lagjax.mechanics.single_precision import PrecisionWarning
-from lagjax.motion.contacts import releases, slips, sticks, touches
-from lagjax.motion.crossings import Crossing, Crossings, EventWarning
-from lagjax.motion.hybrid_trajectory import HybridTrajectory, Switches
-from lagjax.motion.integrate import integrate
-from lagjax.motion.ledger import EnergyLedger, energy_ledger
-from lagjax.motion.over_jumps import JumpWarning
-from lagjax.motion.phase_graph import HybridExplanation
-from lagjax.motion.replay import Replay
-from lagjax.motion.results import RESULTS
-from lagjax.motion.saved import load_trajectory
-from lagjax.motion.sections import PoincareSection, periods, poincare, turning_points
-from lagjax.motion.trajectory import AccuracyWarning, Snapshot, Trajectory
-from lagjax.numerics.nystrom import Nystrom8, Nystrom12
-from lagjax.numerics.radau import Radau5
-from lagjax.numerics.runge_kutta import Dopri8, Tsit5
+from lagjax.analysis.energy import EnergyLedger, energy_ledger
+from lagjax.analysis.explain import HybridExplanation
+from lagjax.analysis.poincare import PoincareSection, periods, poincare, turning_points
+from lagjax.display.animation import Animation
+from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
+from lagjax.integrate.events.event import Crossing, Crossings, EventWarning
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.solve.over_jumps import JumpWarning
+from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
+from lagjax.integrate.trajectory.load import load_trajectory
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Snapshot, Trajectory
+from lagjax.numerics.methods.nystrom import Nystrom8, Nystrom12
+from lagjax.numerics.methods.radau import Radau5
+from lagjax.numerics.methods.runge_kutta import Dopri8, Tsit5
+from lagjax.system.coordinates import PrecisionWarning
 
 # isort: split
 # Many motions.
-from lagjax.pages.page import Page
-from lagjax.sweeps.engine import sweep
-from lagjax.sweeps.lanes import Status
-from lagjax.sweeps.result import Sweep, open_sweep
+from lagjax.display.web_page.page import Page
+from lagjax.sweep.batch_program import Status
+from lagjax.sweep.result import Sweep, open_sweep
+from lagjax.sweep.sweep import sweep
 
 # isort: split
 # From measured motion.
 from lagjax import learned
-from lagjax.fitting.asked import identifiability
-from lagjax.fitting.engine import fit
-from lagjax.fitting.identifiability import Identifiability
-from lagjax.fitting.records import Record
-from lagjax.fitting.result import Fit, FitWarning
-from lagjax.fitting.saved import load_fit
+from lagjax.fit.fit import fit
+from lagjax.fit.identifiability import identifiability
+from lagjax.fit.load import load_fit
+from lagjax.fit.problem.records import Record
+from lagjax.fit.result.result import Fit, FitWarning
+from lagjax.fit.uncertainty.identifiable import Identifiability
 
 # isort: split
 # Error against run time.
-from lagjax.comparison.diagram import WorkPrecision
-from lagjax.comparison.work_precision import work_precision
+from lagjax.work_precision.result import WorkPrecision
+from lagjax.work_precision.work_precision import work_precision
 
 if TYPE_CHECKING:
     from lagjax import scenes
+    from lagjax.analysis.continuation.equilibria import continue_equilibria
+    from lagjax.analysis.continuation.orbit_result import CriticalOrbit, OrbitBranch
+    from lagjax.analysis.continuation.orbits import continue_orbits
 
     # Analysis of a system.
-    from lagjax.analysis.branches import Branch, Branches, Critical
-    from lagjax.analysis.continuation import continue_equilibria
-    from lagjax.analysis.continued_orbits import continue_orbits
-    from lagjax.analysis.cycles import OrbitWarning, periodic_orbit
-    from lagjax.analysis.equilibria import equilibria
-    from lagjax.analysis.floquet import Floquet, floquet
-    from lagjax.analysis.found import Symmetries
-    from lagjax.analysis.found_equilibria import Equilibria
-    from lagjax.analysis.hamilton import Hamiltonian, hamiltonian
-    from lagjax.analysis.latex import EquationsOfMotion, latex
-    from lagjax.analysis.least_action import action
-    from lagjax.analysis.linearised import Linearisation, linearise
-    from lagjax.analysis.lyapunov import LyapunovExponents, lyapunov_exponents
-    from lagjax.analysis.modes import Mode, NormalModes, normal_modes
-    from lagjax.analysis.orbit import PeriodicOrbit
-    from lagjax.analysis.orbit_branch import CriticalOrbit, OrbitBranch
-    from lagjax.analysis.routh import Routhian, routhian
-    from lagjax.analysis.symmetries import symmetries
-    from lagjax.analysis.symmetry import SymmetryTest, is_symmetry
+    from lagjax.analysis.continuation.result import Branch, Branches, Critical
+    from lagjax.analysis.equilibria.equilibria import equilibria
+    from lagjax.analysis.equilibria.result import Equilibria
+    from lagjax.analysis.formulations.action import action
+    from lagjax.analysis.formulations.hamiltonian import Hamiltonian, hamiltonian
+    from lagjax.analysis.formulations.latex import EquationsOfMotion, latex
+    from lagjax.analysis.formulations.routhian import Routhian, routhian
+    from lagjax.analysis.modes.linearise import Linearisation, linearise
+    from lagjax.analysis.modes.normal_modes import Mode, NormalModes, normal_modes
+    from lagjax.analysis.orbits.floquet import Floquet, floquet
+    from lagjax.analysis.orbits.lyapunov import LyapunovExponents, lyapunov_exponents
+    from lagjax.analysis.orbits.periodic_orbit import OrbitWarning, periodic_orbit
+    from lagjax.analysis.orbits.result import PeriodicOrbit
+    from lagjax.analysis.symmetry.is_symmetry import SymmetryTest, is_symmetry
+    from lagjax.analysis.symmetry.result import Symmetries
+    from lagjax.analysis.symmetry.search import symmetries
 
     # Import and export.
     from lagjax.exchange.from_sympy import from_sympy
     from lagjax.exchange.standalone_programs import export, result_codes
 
     # Many motions, in a notebook.
-    from lagjax.interactive.interact import Knobs, interact
+    from lagjax.sliders.interact import Knobs, interact
 
 
 __version__ = "0.2.0"
 
 # Names that are imported on first access, by module.
 LATER = {
-    "lagjax.analysis.branches": "Branch Branches Critical",
-    "lagjax.analysis.continuation": "continue_equilibria",
-    "lagjax.analysis.continued_orbits": "continue_orbits",
-    "lagjax.analysis.cycles": "OrbitWarning periodic_orbit",
-    "lagjax.analysis.equilibria": "equilibria",
-    "lagjax.analysis.floquet": "Floquet floquet",
-    "lagjax.analysis.found": "Symmetries",
-    "lagjax.analysis.found_equilibria": "Equilibria",
-    "lagjax.analysis.hamilton": "Hamiltonian hamiltonian",
-    "lagjax.analysis.least_action": "action",
-    "lagjax.analysis.linearised": "Linearisation linearise",
-    "lagjax.analysis.lyapunov": "LyapunovExponents lyapunov_exponents",
-    "lagjax.analysis.modes": "Mode NormalModes normal_modes",
-    "lagjax.analysis.orbit": "PeriodicOrbit",
-    "lagjax.analysis.orbit_branch": "CriticalOrbit OrbitBranch",
-    "lagjax.analysis.latex": "EquationsOfMotion latex",
-    "lagjax.analysis.routh": "Routhian routhian",
-    "lagjax.analysis.symmetries": "symmetries",
-    "lagjax.analysis.symmetry": "SymmetryTest is_symmetry",
+    "lagjax.analysis.continuation.result": "Branch Branches Critical",
+    "lagjax.analysis.continuation.equilibria": "continue_equilibria",
+    "lagjax.analysis.continuation.orbits": "continue_orbits",
+    "lagjax.analysis.orbits.periodic_orbit": "OrbitWarning periodic_orbit",
+    "lagjax.analysis.equilibria.equilibria": "equilibria",
+    "lagjax.analysis.orbits.floquet": "Floquet floquet",
+    "lagjax.analysis.symmetry.result": "Symmetries",
+    "lagjax.analysis.equilibria.result": "Equilibria",
+    "lagjax.analysis.formulations.hamiltonian": "Hamiltonian hamiltonian",
+    "lagjax.analysis.formulations.action": "action",
+    "lagjax.analysis.modes.linearise": "Linearisation linearise",
+    "lagjax.analysis.orbits.lyapunov": "LyapunovExponents lyapunov_exponents",
+    "lagjax.analysis.modes.normal_modes": "Mode NormalModes normal_modes",
+    "lagjax.analysis.orbits.result": "PeriodicOrbit",
+    "lagjax.analysis.continuation.orbit_result": "CriticalOrbit OrbitBranch",
+    "lagjax.analysis.formulations.latex": "EquationsOfMotion latex",
+    "lagjax.analysis.formulations.routhian": "Routhian routhian",
+    "lagjax.analysis.symmetry.search": "symmetries",
+    "lagjax.analysis.symmetry.is_symmetry": "SymmetryTest is_symmetry",
     "lagjax.exchange.from_sympy": "from_sympy",
     "lagjax.exchange.standalone_programs": "export result_codes",
-    "lagjax.interactive.interact": "Knobs interact",
+    "lagjax.sliders.interact": "Knobs interact",
 }
 
 

@@ -22,10 +22,11 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 
-from lagjax import plot, report, stability
-from lagjax.numerics.runge_kutta import Dopri8
+from lagjax import report, stability
+from lagjax.display import plots
+from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.scenes import SCENES
-from lagjax.sweeps.running import usable_cores
+from lagjax.sweep.scheduler import usable_cores
 
 STABILITY = "stability"
 
@@ -37,7 +38,7 @@ FULL = {
 QUICK = {"methods": {"Dopri8": Dopri8()}, "tolerances": (1e-6, 1e-10), "repeats": 3}
 
 
-class Part(NamedTuple):
+class JobPart(NamedTuple):
     """A scene, or the stability report: its printed text, its numbers, and the requirements it missed."""
 
     printed: str
@@ -71,7 +72,7 @@ def main(arguments=None) -> int:
     return 1 if missed else 0
 
 
-def _parts(options, folder) -> Iterator[Part]:
+def _parts(options, folder) -> Iterator[JobPart]:
     """All requested parts, in order; several at a time, each in its own process."""
     tasks = [(name, options.quick, options.tier, folder) for name in options.scenes]
     at_a_time = _at_a_time(options)
@@ -95,7 +96,7 @@ def _at_a_time(options):
     return max(1, min(options.jobs, len(options.scenes)))
 
 
-def _part(name, quick, tier, folder) -> Part:
+def _part(name, quick, tier, folder) -> JobPart:
     # The job is an application: the library itself never sets JAX's options.
     jax.config.update("jax_enable_x64", True)
     return _stability(tier) if name == STABILITY else _scene(SCENES[name], quick, folder)
@@ -133,7 +134,7 @@ def _parse(arguments):
     return options
 
 
-def _stability(tier) -> Part:
+def _stability(tier) -> JobPart:
     """The stability report, with the rows that do not have the expected outcome."""
     _progress("stability")
     rows, outcomes = stability.trials(tier), []
@@ -149,10 +150,10 @@ def _stability(tier) -> Part:
         for o in outcomes
         if not o.passed
     ]
-    return Part(printed, numbers, missed)
+    return JobPart(printed, numbers, missed)
 
 
-def _scene(scene, quick, folder) -> Part:
+def _scene(scene, quick, folder) -> JobPart:
     """Check, time and draw a scene."""
     found, cases = _run_scene(scene, quick)
     _draw(scene, found, folder, with_picture=not quick)
@@ -163,7 +164,7 @@ def _scene(scene, quick, folder) -> Part:
         f"{scene.name}: {case.name}, error {case.error:.1e} > {case.allowed:.0e}" for case in cases if not case.passed
     ]
     numbers = {"runs": [asdict(row) for row in rows], "cases": [asdict(case) for case in cases]}
-    return Part(_described(scene, rows, cases), numbers, missed)
+    return JobPart(_described(scene, rows, cases), numbers, missed)
 
 
 def _run_scene(scene, quick):
@@ -181,14 +182,14 @@ def _run_scene(scene, quick):
 def _draw(scene, found, folder, with_picture):
     _progress(f"{scene.name}: pictures")
     try:
-        plot.import_matplotlib()
+        plots.import_matplotlib()
     except ImportError as error:
         print(f"no pictures: {error}", file=sys.stderr)
         return
     panels = [of_run.against_time(run.name) for run, of_run in found if run.drawn]
     # Run times of motions shorter than a call, or without an error, are not drawn.
     if panels:
-        plot.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
+        plots.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
     if with_picture:
         scene.picture().savefig(folder / f"{scene.name}.png")
 

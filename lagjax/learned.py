@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from lagjax.mechanics import coordinates
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.lagrangian import mass_matrix
-from lagjax.mechanics.multipliers import accelerations
+from lagjax.system import coordinates
 
 # The points at which an activation is checked, the distance over which its curvature may not jump, and the size of a
 # jump relative to the largest curvature.

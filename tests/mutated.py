@@ -11,7 +11,7 @@ import numpy as np
 from google_crc32c import value as crc32c
 from numcodecs.zstd import Zstd
 
-from lagjax.sweeps.metadata import digest_of
+from lagjax.sweep.metadata import digest_of
 
 # What takes the place of a part of a description.
 CODE = {"function": {"module": "os", "name": "system"}}
@@ -204,18 +204,17 @@ def mutated_file(good: Path, to: Path, rng: np.random.Generator) -> str:
 
 
 def describe(store: Path, change) -> None:
-    """Change the description of a store in both copies, with a digest that fits."""
-    first = json.loads((store / "lagjax/zarr.json").read_text())
-    description = change(first["attributes"]["lagjax"])
+    """Change the description of a store, with a digest that fits."""
+    file = store / "lagjax/zarr.json"
+    said = json.loads(file.read_text())
+    description = change(said["attributes"]["lagjax"])
     if isinstance(description, dict):
         try:
             description["digest"] = digest_of(description)
         except RecursionError:
             pass
-    for file in (store / "lagjax/zarr.json", store / "lagjax/marks/zarr.json"):
-        said = json.loads(file.read_text())
-        said["attributes"] = {"lagjax": description}
-        file.write_text(json.dumps(said))
+    said["attributes"] = {"lagjax": description}
+    file.write_text(json.dumps(said))
 
 
 def mark(store: Path, name: str, block: int) -> None:

@@ -7,8 +7,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from lagjax.animation import FIELD, MARKED_UP_TO, Animation
-from tests.pages.test_page import told
+from lagjax.display.animation import FIELD, MARKED_UP_TO, Animation
+from tests.display.web_page.test_page import told
 
 T = np.linspace(0.0, 2.0, 51)
 CIRCLE = np.stack([3 * np.cos(T), 3 * np.sin(T)], axis=1)[:, None]

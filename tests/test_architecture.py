@@ -1,39 +1,26 @@
-"""The architecture: layers, cycles, file sizes, docstrings, exports."""
+"""The architecture: rooms, cycles, file sizes, docstrings, exports."""
 
 import ast
 import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+import jax.numpy as np
 
 import lagjax
 
 ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-# From the ground up: a module imports only from its own layer or from those before it.
-LAYERS = (
-    *(
-        "jax_internals",
-        "numerics",
-        "mechanics",
-        "jumps",
-        "learned",
-        "plot",
-        "pages",
-        "animation",
-        "meter",
-        "motion",
-        "exchange",
-        "analysis",
-        "comparison",
-        "sweeps",
-        "interactive",
-    ),
-    *("fitting", "report", "mechanisms", "scenes", "stability"),
-)
+# From the ground up: a module imports only from its own room or from those before it.
+ROOMS = (
+    "jaxtools", "numerics", "display", "files", "system", "mechanics", "learned", "integrate", "exchange", "analysis",
+    "work_precision", "sweep", "sliders", "fit", "report", "mechanisms", "scenes", "stability",
+)  # fmt: skip
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
@@ -41,8 +28,8 @@ OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pa
 OPTIONAL |= {"zarr"}
 
 
-def layer(module):
-    """The layer of a dotted module name, `lagjax.motion.solve` -> "motion"."""
+def room(module):
+    """The room of a dotted module name, `lagjax.integrate.solve.programs` -> "integrate"."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 
@@ -68,11 +55,11 @@ def internal_imports(source):
 
 
 def upward_imports(name, source):
-    """The imports of a module from higher layers."""
-    if layer(name) in TOP:
+    """The imports of a module from higher rooms."""
+    if room(name) in TOP:
         return []
-    rank = LAYERS.index(layer(name))
-    return [target for target in internal_imports(source) if layer(target) in TOP or LAYERS.index(layer(target)) > rank]
+    rank = ROOMS.index(room(name))
+    return [target for target in internal_imports(source) if room(target) in TOP or ROOMS.index(room(target)) > rank]
 
 
 def nested_imports(source):
@@ -88,7 +75,7 @@ def nested_imports(source):
 
 
 def test_imports_point_down():
-    """No module imports from a layer above its own, and none imports inside a function."""
+    """No module imports from a room above its own, and none imports inside a function."""
     for path in FILES:
         source = path.read_text()
         assert upward_imports(module_name(path), source) == [], module_name(path)
@@ -97,9 +84,48 @@ def test_imports_point_down():
 
 def test_the_import_checks_can_fail():
     """Twin: an upward import and an import inside a function are found."""
-    assert upward_imports("lagjax.mechanics.system", "from lagjax.motion import integrate") != []
-    assert upward_imports("lagjax.mechanics.system", "import lagjax") != []
+    assert upward_imports("lagjax.system.system", "from lagjax.integrate import integrate") != []
+    assert upward_imports("lagjax.system.system", "import lagjax") != []
     assert nested_imports("def f():\n    import numpy") == ["numpy"]
+
+
+PAGE = ROOT.parent / "docs" / "architecture.md"
+STATION = re.compile(r"^\| `lagjax/(\S+\.py)` \| `(\w+)` \|", re.MULTILINE)
+
+
+def calls_of_first_integrate():
+    """(file, function) of each call inside lagjax by an `integrate` of a system never seen before, in order."""
+    found = []
+
+    def seen(frame, event, _):
+        path = frame.f_code.co_filename
+        if event == "call" and path.startswith(str(ROOT)):
+            found.append((Path(path).relative_to(ROOT).as_posix(), frame.f_code.co_name))
+
+    swing = lagjax.System(lambda t, q, v, params: 0.5 * v**2 + 1.2345 * params["g"] * np.cos(q))
+    sys.setprofile(seen)
+    try:
+        lagjax.integrate(swing, 1.0, 0.0, {"g": 9.81}, ts=np.linspace(0.0, 1.0, 3))
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def in_order(stations, calls):
+    """Whether all stations are among the calls, in this order."""
+    calls = iter(calls)
+    return all(station in calls for station in stations)
+
+
+def test_the_page_of_the_house():
+    """One call passes the stations of the page, in its order; every room and file that it names exists. Twin: turned
+    round it does not."""
+    text, stations = PAGE.read_text(), STATION.findall(PAGE.read_text())
+    calls = calls_of_first_integrate()
+    assert len(stations) > 10 and in_order(stations, calls) and not in_order(stations[::-1], calls)
+    assert all((ROOT.parent / path).exists() for path in re.findall(r"`(lagjax/\S+\.py)`", text))
+    named = re.findall(r"^([a-z_]+(?:, [a-z_]+)*)  ", text, re.MULTILINE)
+    assert {room for rooms in named for room in rooms.split(", ")} == set(ROOMS) - {"learned", "report"}
 
 
 def private_imports(source):
@@ -114,9 +140,9 @@ def private_imports(source):
 
 
 def test_private_modules_stay_in_one_package():
-    """Only `lagjax.jax_internals` imports undocumented modules of JAX and XLA."""
+    """Only `lagjax.jaxtools` imports undocumented modules of JAX and XLA."""
     for path in FILES:
-        if layer(module_name(path)) != "jax_internals":
+        if room(module_name(path)) != "jaxtools":
             assert private_imports(path.read_text()) == [], path
 
 

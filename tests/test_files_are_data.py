@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import file_table, files, written_trees
-from lagjax.sweeps import described, fingerprint, metadata, result, store
+from lagjax.files import npz, tree_json
+from lagjax.files import table as file_table
+from lagjax.sweep import chunks, fingerprint, metadata, result, store
 from tests import mutated
 from tests.mutated import describe, mutated_file, mutated_store
 
@@ -209,9 +210,9 @@ def test_the_table():
 def test_a_network_comes_back(good, tmp_path):
     """Layers with their activations come back, and a field of another kind is refused."""
     net = lj.learned.Network({"x": 1.0}, key=jax.random.key(0), width=4, activation=jax.nn.softplus)
-    writer = written_trees.Writer()
+    writer = tree_json.Writer()
     node = writer.down(net, "net")
-    again = written_trees.Reader(dict(writer.arrays).pop).up(node)
+    again = tree_json.Reader(dict(writer.arrays).pop).up(node)
     assert eqx.tree_equal(net, again) and again({"x": 0.3}) == net({"x": 0.3})
     for field, value in (
         ("sizes", "wide"),
@@ -222,7 +223,7 @@ def test_a_network_comes_back(good, tmp_path):
     ):
         wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
         with pytest.raises(ValueError, match=f"field {field}"):
-            written_trees.Reader(dict(writer.arrays).pop).up(wrong)
+            tree_json.Reader(dict(writer.arrays).pop).up(wrong)
 
 
 def changed(good, path, change):
@@ -303,7 +304,7 @@ def test_bombs_of_a_kilobyte(good, tmp_path, monkeypatch):
         assert wrong == [] and isinstance(found, ValueError)
         if name == "deflated":
             with monkeypatch.context() as patch:
-                patch.setattr(files, "_entries", lambda entries, path: {x.filename: x for x in entries.infolist()})
+                patch.setattr(npz, "_entries", lambda entries, path: {x.filename: x for x in entries.infolist()})
                 assert any(line.startswith("took ") for line in attack()[0])
 
 
@@ -311,20 +312,11 @@ def larger_grid(path, n):
     """A store that claims n times n points, in every part of its description, of which none were computed."""
     folder, axes = path / "lagjax/marks/c", {"k": np.zeros(n), "x": np.zeros(n)}
     shutil.rmtree(folder)
+    for name, x in axes.items():
+        spec = chunks.Spec(x.shape, x.shape, x.dtype, np.nan, [name])
+        chunks.write_chunk(path / name / "c/0", spec, x)
 
     def change(said):
-        for name, array in said["arrays"].items():
-            block = [1, n]
-            if name in axes:
-                array["shape"] = [n]
-                array["chunk_grid"]["configuration"]["chunk_shape"] = [n]
-                shutil.rmtree(path / name / "c")
-            elif name == "lagjax/marks":
-                array["shape"][0] = n
-            else:
-                inner = array["shape"][2:]
-                array["shape"] = [n, n, *inner]
-                array["chunk_grid"]["configuration"]["chunk_shape"] = [*block, *inner]
         said["block"] = [1, n]
         said["fingerprint"]["axes"] = {name: fingerprint.of_axis(x) for name, x in axes.items()}
         return said
@@ -336,7 +328,7 @@ def outside(path):
     """A store that names an array outside of it."""
 
     def change(said):
-        said["arrays"]["../outside"] = said["arrays"]["n"]
+        said["places"]["values"]["n"], said["dims"]["../outside"] = "../outside", said["dims"].pop("n")
         return said
 
     describe(path, change)
@@ -388,7 +380,7 @@ def test_stores_that_reach_out(good, tmp_path, monkeypatch):
         patch.setattr(result, "damaged", restoring)
         assert "wrote " in wrong_with(changes["metadata"])
         assert wrong_with(changes["outside"]) == ""
-        patch.setattr(described, "_is_inside", lambda name: True)
+        patch.setattr(metadata, "_is_inside", lambda name: True)
         assert "outside" in wrong_with(changes["outside"])
     with monkeypatch.context() as patch:
         patch.setattr(store, "read_chunk", trusting)

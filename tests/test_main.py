@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lagjax import job, plot, report, stability
+from lagjax import job, report, stability
+from lagjax.display import plots
 from tests.systems import PARAMS, pendulum
 
 TS = np.array([0.0, 0.5])
@@ -24,7 +25,7 @@ SCENE = report.Scene(
     misprints=("prints 1 for 2.",),
     runs=lambda: [swing(1e-12)],
     cases=lambda: [report.Case("easy", "went well", 0.0, 0.0)],
-    picture=lambda: plot.figure()[0],
+    picture=lambda: plots.figure()[0],
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lagjax import job, stability
-from lagjax.numerics.runge_kutta import Dopri8
+from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG, Outcome, Trial
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax import plot
-from lagjax.analysis.latex import written
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.printable import by_line, printable
+from lagjax.analysis.formulations.latex import written
+from lagjax.display import plots
+from lagjax.display.printable import by_line, printable
+from lagjax.system import coordinates
 
 BAD = "a$\\frac$\x1b[2J</script><!--<b>\u202e"
 
@@ -49,7 +49,7 @@ def test_in_a_plot():
     name = "$\\undefined{$"
     t = np.arange(3.0)
     panels = {name: {name: t, "y": t}}
-    for figure in (plot.time_series(t, panels), plot.lines(name, t, {name: t}, t > 1)):
+    for figure in (plots.time_series(t, panels), plots.lines(name, t, {name: t}, t > 1)):
         assert len(getattr(figure, "_repr_png_")()) > 1000
     with pytest.raises(ValueError, match="undefined"):
-        getattr(plot.time_series, "__wrapped__")(t, panels)._repr_png_()
+        getattr(plots.time_series, "__wrapped__")(t, panels)._repr_png_()

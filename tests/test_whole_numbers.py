@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates
+from lagjax.system import coordinates
 from tests.counting import compiles
 from tests.tiers import exhaustive_but
 

@@ -1,1 +1,1 @@
-"""The analysis of a system: symmetries, equilibria, branches, small motions, cycles, other forms of its equations."""
+"""What a system is like."""

@@ -18,12 +18,12 @@ import numpy as np
 from jax import export as jax_export
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.one_function import calls_host, poisoned
-from lagjax.jax_internals.primitives import jaxpr_as_fun
-from lagjax.jax_internals.tracing import SILENT
-from lagjax.motion.results import RESULTS
-from lagjax.motion.results import in_words as result_in_words
-from lagjax.motion.trajectory import Trajectory
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.results import in_words as result_in_words
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.fuse_cpu import calls_host, poisoned
+from lagjax.jaxtools.primitives import jaxpr_as_fun
+from lagjax.jaxtools.tracing import SILENT
 
 # The containers that a process without lagjax can pass and receive.
 PLAIN = (dict, list, tuple)

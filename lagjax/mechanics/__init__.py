@@ -1,1 +1,1 @@
-"""From a Lagrangian to equations of motion."""
+"""The equations of motion at one state."""

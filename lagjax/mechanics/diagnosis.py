@@ -5,9 +5,9 @@ Everything here looks at values, and so runs outside compiled programs.
 
 import numpy as np
 
-from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
+from lagjax.system import constraints, coordinates
 
 # A row counts as part of a combination if it makes up more than this share of it.
 SHARE = 1e-6
@@ -15,11 +15,11 @@ SHARE = 1e-6
 OFF_ABOVE = 1e-6
 
 
-def explain_failure(system, s: coordinates.State) -> str | None:
+def explain_failure(model, s: coordinates.State) -> str | None:
     """Say in the user's names why the equations fail at a state; None where they do not."""
-    found = examined(system, *s)
+    found = examined(model, s)
     linear, rows, lagrangian = found.linear, found.rows, found.lagrangian
-    names = coordinates.names(s.q)
+    names = model.names
     place = where(s)
     if not np.isfinite(lagrangian):
         return (
@@ -36,7 +36,7 @@ def explain_failure(system, s: coordinates.State) -> str | None:
                 "also behind a jnp.where whose other branch is taken.\n"
                 "Fix: make the argument safe before the function: jnp.sqrt(jnp.where(x > 0, x, 1.0))."
             )
-    equations = equation_names(system, s)
+    equations = model.equation_names
     for what, values in (("derivative", rows.jacobian), ("second derivative", rows.gamma)):
         if not np.all(np.isfinite(values)):
             bad = np.argwhere(~np.isfinite(np.asarray(values)))[0]
@@ -46,8 +46,8 @@ def explain_failure(system, s: coordinates.State) -> str | None:
                 "Fix: constrain the square of the distance."
             )
     return (
-        explain_singular(np.asarray(found.matrix), system, s)
-        or explain_contradiction(found, system, s)
+        explain_singular(np.asarray(found.matrix), model, s)
+        or explain_contradiction(found, model, s)
         or _explain_paradox(found, s)
     )
 
@@ -65,15 +65,6 @@ def _explain_paradox(found: Examined, s):
     )
 
 
-def equation_names(system, s: coordinates.State) -> list[str]:
-    """The name of each constraint equation, in the order in which they are stacked."""
-    return [
-        name + (f"[{i}]" if shape else "")
-        for name, shape in constraints.shapes(system, *s).items()
-        for i in range(shape[0] if shape else 1)
-    ]
-
-
 def describe(tree) -> str:
     """A pytree of numbers on one line, six digits each."""
     values = coordinates.flatten(tree)[0]
@@ -82,25 +73,25 @@ def describe(tree) -> str:
     return "(" + ", ".join(shown) + ")"
 
 
-def explain_singular(matrix, system, s: coordinates.State) -> str | None:
+def explain_singular(matrix, model, s: coordinates.State) -> str | None:
     """Name the coordinate or constraint in which a saddle-point matrix is singular; None if it is not."""
     for i in np.flatnonzero(~np.any(matrix, axis=1)):
-        return _singular_message(i, system, s)
+        return _singular_message(i, model, s)
     _, values, right = np.linalg.svd(_equilibrate(matrix))
     if values[-1] > SINGULAR_BELOW[matrix.dtype] * values[0]:
         return None
-    return _singular_message(int(np.argmax(np.abs(right[-1]))), system, s)
+    return _singular_message(int(np.argmax(np.abs(right[-1]))), model, s)
 
 
-def explain_contradiction(found: Examined, system, s: coordinates.State) -> str | None:
+def explain_contradiction(found: Examined, model, s: coordinates.State) -> str | None:
     """Name dependent constraints that ask for different accelerations; None where there are none."""
     contradicting = np.flatnonzero(found.contradictory)
     if not contradicting.size:
         return None
-    names = equation_names(system, s)
+    names = model.equation_names
     groups = {group[0]: group for group in dependencies(found.rows.jacobian, found.independent, names)}
     involved = groups[names[contradicting[0]]]
-    violated = _violated_by_velocities(system, s, involved)
+    violated = _violated_by_velocities(model, s, involved)
     if violated:
         return (
             f"constraints {listed(involved)} depend on each other, and the state is off them: {violated} instead of 0. "
@@ -117,14 +108,13 @@ def explain_contradiction(found: Examined, system, s: coordinates.State) -> str 
     )
 
 
-def _violated_by_velocities(system, s, names):
+def _violated_by_velocities(model, s, names):
     """Which of the named equations the velocities violate, with their residuals."""
-    x, unflatten = coordinates.flatten(s.q)
-    u, _ = coordinates.flatten(s.v)
-    residual = np.asarray(constraints.velocity_residual(system, s.t, x, u, s.params, unflatten))
-    slopes = np.asarray(equations_of(system, *s).row_sizes(s.t, s.q, s.v))
+    x, u = model.vectors(s.q, s.v)
+    residual = np.asarray(constraints.velocity_residual(model, s.t, x, u))
+    slopes = np.asarray(equations_of(model).row_sizes(s.t, s.q, s.v))
     allowed = OFF_ABOVE * slopes * max(1e-300, float(np.max(np.abs(u))))
-    rows = zip(equation_names(system, s), constraints.holonomic_equations(system, *s), residual, allowed)
+    rows = zip(model.equation_names, model.holonomic, residual, allowed)
     return ", ".join(
         f"{'d/dt ' if holonomic else ''}'{name}' = {r:.3g}"
         for name, holonomic, r, most in rows
@@ -160,8 +150,8 @@ def _equilibrate(matrix):
     return scaled
 
 
-def _singular_message(i, system, s):
-    names, equations = coordinates.names(s.q), equation_names(system, s)
+def _singular_message(i, model, s):
+    names, equations = model.names, model.equation_names
     n, place = len(names), where(s)
     if i < n:
         return (

@@ -3,12 +3,11 @@
 There are three ways. The robust way works in arrays: one matrix (`saddle_point.py`), or a band where the system is
 large and its parts touch few others (`sparse_saddle_point.py`). It exchanges rows, leaves dependent constraints out and
 says what is wrong. The fast way is for small systems: their equations are also written out number by number
-(`written_out.py`), which is many times as fast, and gives NaN where it fails.
+(`scalar_equations.py`), which is many times as fast, and gives NaN where it fails.
 
 A caller has an `Equations` and does not choose between them.
 """
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import equinox as eqx
@@ -19,37 +18,34 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jax_internals.one_by_one import jitted
-from lagjax.jax_internals.one_function import kept_as_call
-from lagjax.jax_internals.tracing import WATCHED
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.in_numbers import in_numbers
-from lagjax.mechanics.saddle_point import Dense, is_regular
-from lagjax.mechanics.sparse_plan import plan
-from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.fuse_cpu import kept_as_call
+from lagjax.jaxtools.tracing import WATCHED
+from lagjax.jaxtools.without_lapack_batches import jitted
+from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
+from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
+from lagjax.mechanics.scalar_form import in_numbers
+from lagjax.mechanics.sparse_saddle_point import Banded, plan
 from lagjax.mechanics.structure import is_diagonal
-from lagjax.mechanics.system import System
-from lagjax.mechanics.verdict import Verdict
-from lagjax.mechanics.written_out import UP_TO, WrittenOut, has_networks, is_small, write_out
+from lagjax.system import coordinates
+from lagjax.system.model import Form, Model
 
 
 class Equations(eqx.Module):
-    """The equations of a system with its parameters, for states of one shape.
+    """The equations of a model.
 
     `form` solves them in arrays. `written` solves them number by number, given the part that does not depend on the
     state, `prepared`; it is None for a system that is not small. `fallback`: whether programs contain the robust way,
-    for states where `written` fails. `unflatten` puts the coordinates of a small system, which come one by one, back
-    into the user's structure.
+    for states where `written` fails. `users`: the user's form of states, if these equations take coordinates one by
+    one.
     """
 
-    system: System
-    params: PyTree
+    model: Model
     prepared: tuple[tuple | None, tuple | None]
     form: Dense | Banded = eqx.field(static=True)
     written: WrittenOut | None = eqx.field(static=True)
     fallback: bool = eqx.field(static=True)
-    unflatten: Callable | None = eqx.field(static=True)
+    users: Form | None = eqx.field(static=True)
 
     @property
     def are_written(self) -> bool:
@@ -63,18 +59,18 @@ class Equations(eqx.Module):
 
     def inside(self, y):
         """Convert the user's position or velocity to the form that these equations take."""
-        return y if self.unflatten is None else coordinates.numbers(y)
+        return y if self.users is None else coordinates.numbers(y)
 
     def outside(self, y):
         """Convert a position, velocity or acceleration back to the user's structure."""
-        return y if self.unflatten is None else self.unflatten(jnp.stack(y))
+        return y if self.users is None else self.users.tree(jnp.stack(y))
 
     def rates(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
         """The accelerations, and the multipliers by name."""
         if self.written is None:
             return self.accelerations(t, q, v)
         a, stacked = self.fast(t, q, v)
-        fast = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        fast = a, self.model.split(stacked)
         if not self.fallback:
             return fast
         # `unvmap_all` keeps it a branch in a batch, taken for all lanes or for none.
@@ -82,31 +78,31 @@ class Equations(eqx.Module):
 
     def multipliers(self, t, q, v) -> dict[str, Array]:
         """The multipliers by name, solved the same way for all states of a batch: derivatives flow through them."""
-        if not self.system.constraints:
+        if not self.model.m:
             return {}
         return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
 
     def solution_or_nan(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
         """Accelerations and multipliers, NaN where they are not valid."""
         if self.written is None:
-            return _solution_or_nan(self.form, self.system, t, q, v, self.params)
+            return _solution_or_nan(self.form, self.model, t, q, v)
         a, stacked = self.fast(t, q, v)
-        fast = a, constraints.split(self.system, stacked, t, q, v, self.params)
+        fast = a, self.model.split(stacked)
         if not self.written.may_fail:
             return fast
-        robustly = lambda: _solution_or_nan(self.form, self.system, t, q, v, self.params)
+        robustly = lambda: _solution_or_nan(self.form, self.model, t, q, v)
         return lax.cond(eqxi.unvmap_all(all_finite(a)), lambda: fast, robustly)
 
     def verdict(self, t, q, v) -> Verdict:
         """Solve the equations at one state, and say whether the solution is valid."""
         if not self.are_taken_for_regular:
-            return _verdict(self.form, self.system, t, q, v, self.params)
+            return _verdict(self.form, self.model, t, q, v)
         # The different ways of not being regular are not told apart here.
         a, multipliers = self.rates(t, q, v)
-        lagrangian = self.system.lagrangian(t, q, v, self.params)
-        finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, lagrangian))[0]))
-        state = _vectors(self.system, t, q, v, self.params)
-        regular, mass = is_regular(*state)
+        x, u = self.model.vectors(q, v)
+        known = a, multipliers, self.model.lagrangian(t, x, u)
+        finite = jnp.all(jnp.isfinite(coordinates.flatten(known)[0]))
+        regular, mass = is_regular(self.model, t, x, u)
         return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
 
     def fast(self, t, q, v):
@@ -124,51 +120,47 @@ class Equations(eqx.Module):
 
         `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
         """
-        return _accelerations(self.form, self.system, t, q, v, self.params, baumgarte_rate, independent)
+        return _accelerations(self.form, self.model, t, q, v, baumgarte_rate, independent)
 
     def independent(self, t, q, v, dependent_below=None) -> Bool[Array, " m"] | None:
         """Which constraint equations to solve with near a state; None where fewer than two leave no choice."""
-        if constraints.count(self.system, t, q, v, self.params) < 2:
-            return None
-        return _independent(self.form, self.system, t, q, v, self.params, dependent_below)
+        return None if self.model.m < 2 else _independent(self.form, self.model, t, q, v, dependent_below)
 
     def displacement(self, t, q, v):
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
-        return self.form.displacement(*_vectors(self.system, t, q, v, self.params))
+        return self.form.displacement(self.model, t, *self.model.vectors(q, v))
 
     def row_sizes(self, t, q, v) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation."""
-        return self.form.row_sizes(*_vectors(self.system, t, q, v, self.params))
+        return self.form.row_sizes(self.model, t, *self.model.vectors(q, v))
 
 
-def equations_of(system, t, q, v, params, *, fast=False, fallback=True) -> Equations:
-    """The equations of a system, for states with the shapes and dtypes of this one; its values do not count.
+def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> Equations:
+    """The equations of a model.
 
     With `fast` the equations of a small system are also written out, and take states number by number
     (`Equations.inside`). Without `fallback` they are assumed regular; the caller deals with states where they are not.
     """
-    written, unflatten = None, None
-    if fast and is_small(system, t, q, v, params):
-        _, unflatten = coordinates.flatten(q)
-        system, q, v = in_numbers(system, unflatten), coordinates.numbers(q), coordinates.numbers(v)
-        written = _written_for(system, t, q, v, params)
-    prepared = (None, None) if written is None else written.prepare(system, params)
+    written, users = None, None
+    if fast and is_small(model):
+        model, users = in_numbers(model), model.form
+        written = _written_for(model)
+    prepared = (None, None) if written is None else written.prepare(model)
     fallback = fallback and written is not None and written.may_fail
-    return Equations(system, params, prepared, _form(system, t, q, v, params), written, fallback, unflatten)
+    return Equations(model, prepared, _form(model), written, fallback, users)
 
 
-def _form(system, t, q, v, params):
-    unknowns = sum(jnp.size(x) for x in jtu.tree_leaves(q)) + constraints.count(system, t, q, v, params)
-    sparse = plan(system, t, q, v, params)
+def _form(model: Model):
+    sparse, unknowns = plan(model), model.n + model.m
     if sparse is not None:
         return Banded(sparse)
     # Other small systems are written out, where zeros cost nothing.
-    may_divide = has_networks(system, params) and not system.constraints and unknowns <= UP_TO
-    return Dense(unknowns, may_divide and is_diagonal(system, t, q, v, params))
+    may_divide = has_networks(model) and not model.m and unknowns <= UP_TO
+    return Dense(unknowns, may_divide and is_diagonal(model))
 
 
-def _written_for(*problem) -> WrittenOut | None:
-    leaves, structure = jtu.tree_flatten(problem)
+def _written_for(model: Model) -> WrittenOut | None:
+    leaves, structure = jtu.tree_flatten(model)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
     # In a watched motion a failed check of the user's becomes NaN in the equations.
     key = structure, leaves, WATCHED.value
@@ -182,47 +174,30 @@ def _written_for(*problem) -> WrittenOut | None:
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.
 @lru_cache(maxsize=64)
 def _written(structure, leaves, watched) -> WrittenOut | None:
-    found = []
-
-    def at(arrays):
-        filled = [leaf if x is None else x for x, leaf in zip(arrays, leaves)]
-        found.append(write_out(*jtu.tree_unflatten(structure, filled)))
-
-    jax.eval_shape(at, [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves])
-    return found[0]
+    return write_out(jtu.tree_unflatten(structure, leaves))
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.
 @jitted
-def _accelerations(form, system, t, q, v, params, baumgarte_rate, independent):
-    state = _vectors(system, t, q, v, params)
-    a, multipliers = form.accelerations(*state, baumgarte_rate, independent)
-    return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
+def _accelerations(form, model, t, q, v, baumgarte_rate, independent):
+    a, multipliers = form.accelerations(model, t, *model.vectors(q, v), baumgarte_rate, independent)
+    return model.tree(a), model.split(multipliers)
 
 
 @jitted
-def _independent(form, system, t, q, v, params, dependent_below):
-    return form.independent(*_vectors(system, t, q, v, params), dependent_below)
+def _independent(form, model, t, q, v, dependent_below):
+    return form.independent(model, t, *model.vectors(q, v), dependent_below)
 
 
 @compiled
-def _verdict(form, system, t, q, v, params) -> Verdict:
-    state = _vectors(system, t, q, v, params)
-    found = form.verdict(*state)
-    by_name = constraints.split(system, found.multipliers, t, q, v, params)
-    return found._replace(a=state[-1](found.a), multipliers=by_name)
+def _verdict(form, model, t, q, v) -> Verdict:
+    found = form.verdict(model, t, *model.vectors(q, v))
+    return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
 
 
-def _solution_or_nan(form, system, t, q, v, params):
-    state = _vectors(system, t, q, v, params)
-    a, multipliers = form.solution_or_nan(*state)
-    return state[-1](a), constraints.split(system, multipliers, t, q, v, params)
-
-
-def _vectors(system, t, q, v, params):
-    """A state in vector form, as `Dense` and `Banded` take it."""
-    x, unflatten = coordinates.flatten(q)
-    return system, t, x, coordinates.flatten(v)[0], params, unflatten
+def _solution_or_nan(form, model, t, q, v):
+    a, multipliers = form.solution_or_nan(model, t, *model.vectors(q, v))
+    return model.tree(a), model.split(multipliers)
 
 
 def all_finite(tree) -> Bool[Array, ""]:

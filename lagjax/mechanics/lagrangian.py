@@ -17,14 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import traced_system
-from lagjax.mechanics.reactions import force_at, response
-from lagjax.mechanics.refusals import check_system
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.multiplier_forces import response
+from lagjax.system.check_functions import prepare
 
 
-class Linear(NamedTuple):
+class LinearEquation(NamedTuple):
     """The equation `M a = F` at one state, in vector form.
 
     `response`: B of a force F + B λ that depends on multipliers; None where it does not.
@@ -35,36 +33,39 @@ class Linear(NamedTuple):
     response: Float[Array, "n m"] | None
 
 
-def mass_and_forcing(system, t, x, u, params, unflatten) -> Linear:
+def mass_and_forcing(model, t, x, u) -> LinearEquation:
     """M and F at the state with position vector `x` and velocity vector `u`."""
-    forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+    forcing, inertia = forcing_and_inertia(model, t, x, u)
     if x.size == 1:
         mass = inertia(jnp.ones_like(u))[None]
     else:
         # One column of M for each velocity, stacked as rows: M is symmetric.
         mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
-    return Linear(mass.astype(x.dtype), forcing, response(system, t, x, u, params, unflatten))
+    return LinearEquation(mass.astype(x.dtype), forcing, response(model, t, x, u))
 
 
-def forcing_and_inertia(system, t, x, u, params, unflatten):
+def forcing_and_inertia(model, t, x, u):
     """F at a state without the part of the multipliers, and the function that multiplies an acceleration by M."""
 
-    def lagrangian(t, x, u):
-        return system.lagrangian(t, unflatten(x), unflatten(u), params)
-
     def momentum_and_gradient(t, x, u):
-        gradient, p = jax.grad(lagrangian, argnums=(1, 2))(t, x, u)
+        gradient, p = jax.grad(model.lagrangian, argnums=(1, 2))(t, x, u)
         return p, gradient
 
     _, push, gradient = jax.linearize(momentum_and_gradient, t, x, u, has_aux=True)
     zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(x)
     # ∂p/∂t + (∂p/∂q) v: the part of dp/dt that does not involve the acceleration.
-    forcing = gradient - push(jnp.ones_like(t), u, zero)
-    if system.force is not None:
-        forcing = forcing + _force_vector(system, t, x, u, params, unflatten)
-    if system.dissipation is not None:
-        forcing = forcing - jax.grad(lambda u: system.dissipation(t, unflatten(x), unflatten(u), params))(u)
+    forcing = gradient - push(jnp.ones_like(t), u, zero) + applied_force(model, t, x, u)
     return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
+
+
+def applied_force(model, t, x, u, multipliers=None) -> Float[Array, " n"]:
+    """`Q - ∂R/∂v`; without `multipliers` for those of zero."""
+    force = jnp.zeros_like(x)
+    if model.system.force is not None:
+        force = force + model.force(t, x, u, multipliers)
+    if model.system.dissipation is not None:
+        force = force - jax.grad(model.dissipation, argnums=2)(t, x, u)
+    return force
 
 
 def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
@@ -83,8 +84,8 @@ def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
 
     Source: Goldstein, Eq. (2.44).
     """
-    system, s = _checked(system, t, q, v, params)
-    return _momentum(system, *s)
+    model, s = prepare(system, t, q, v, params)
+    return _momentum(model, s)
 
 
 def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
@@ -104,8 +105,8 @@ def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
 
     Source: Goldstein, Eq. (1.71).
     """
-    system, s = _checked(system, t, q, v, params)
-    return _mass_matrix(system, *s)
+    model, s = prepare(system, t, q, v, params)
+    return _mass_matrix(model, s)
 
 
 def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
@@ -127,36 +128,22 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 
     Source: Goldstein, Eq. (2.53).
     """
-    system, s = _checked(system, t, q, v, params)
-    return _jacobi_integral(system, *s)
-
-
-def _checked(system, t, q, v, params):
-    check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
-    return traced_system(system, s), s
+    model, s = prepare(system, t, q, v, params)
+    return _jacobi_integral(model, s)
 
 
 @compiled
-def _momentum(system, t, q, v, params):
-    return jax.grad(system.lagrangian, argnums=2)(t, q, v, params)
+def _momentum(model, s):
+    return model.tree(jax.grad(model.lagrangian, argnums=2)(s.t, *model.vectors(s.q, s.v)))
 
 
 @compiled
-def _mass_matrix(system, t, q, v, params):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    return mass_and_forcing(system, t, x, u, params, unflatten).mass
+def _mass_matrix(model, s):
+    return mass_and_forcing(model, s.t, *model.vectors(s.q, s.v)).mass
 
 
 @compiled
-def _jacobi_integral(system, t, q, v, params):
-    value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
-    return coordinates.flatten(v)[0] @ coordinates.flatten(p)[0] - value
-
-
-def _force_vector(system, t, x, u, params, unflatten):
-    q, v = unflatten(x), unflatten(u)
-    no_multipliers = jnp.zeros(constraints.count(system, t, q, v, params), x.dtype)
-    force = force_at(system, t, q, v, params, no_multipliers)
-    return coordinates.flatten(force)[0].astype(x.dtype)
+def _jacobi_integral(model, s):
+    x, u = model.vectors(s.q, s.v)
+    value, p = jax.value_and_grad(model.lagrangian, argnums=2)(s.t, x, u)
+    return u @ p - value

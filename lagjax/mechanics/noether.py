@@ -22,16 +22,17 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.first_call import traced_system
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.accelerations import accelerations_at
 from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.reactions import force_at
-from lagjax.mechanics.refusals import check_system
-from lagjax.mechanics.system import System
+from lagjax.mechanics.lagrangian import applied_force
+from lagjax.system import constraints, coordinates
+from lagjax.system.argument_checks import check_system
+from lagjax.system.check_functions import traced_system
+from lagjax.system.model import model_of
+from lagjax.system.system import System
 
 
 class NoetherCharge(eqx.Module):
@@ -45,24 +46,21 @@ class NoetherCharge(eqx.Module):
 
     def __call__(self, t, q, v, params) -> Float[Array, ""]:
         """The charge at one state."""
-        system, s = self._checked(t, q, v, params)
-        return _charge(system, self.generator, *s)
+        return _charge(*self._checked(t, q, v, params))
 
     def rate(self, t, q, v, params) -> Float[Array, ""]:
         """How fast the charge changes at one state, `[L]`: ρ + f·(ξ - τ v)."""
-        system, s = self._checked(t, q, v, params)
-        multipliers = accelerations(system, *s)[1] if system.constraints else {}
-        return _rate(system, self.generator, *s, multipliers)
+        generator, model, s = self._checked(t, q, v, params)
+        return _rate(generator, model, s, accelerations_at(model, s)[1] if model.m else {})
 
     def size(self, t, q, v, params) -> Float[Array, ""]:
         """The size of the terms that the charge is a sum of, to compare a change of it with."""
-        system, s = self._checked(t, q, v, params)
-        return _size(system, self.generator, *s)
+        return _size(*self._checked(t, q, v, params))
 
     def _checked(self, *state):
         s = coordinates.state(*state)
         self.generator.check(s)
-        return traced_system(self.system, s), s
+        return self.generator, model_of(traced_system(self.system, s), *s), s
 
     def __repr__(self):
         return f"NoetherCharge({self.generator.name} of {self.system})"
@@ -100,7 +98,7 @@ def noether_charge(system: System, generator) -> NoetherCharge:
     return NoetherCharge(system, as_generator(generator))
 
 
-class Flow(NamedTuple):
+class GeneratorFlow(NamedTuple):
     """A generator at one state: ξ, τ and F, and their total derivatives along the motion; ξ in vector form."""
 
     xi: Float[Array, " n"]
@@ -111,55 +109,41 @@ class Flow(NamedTuple):
     gauge_rate: Float[Array, ""]
 
 
-def flow(generator: Generator, t, q, v, params) -> Flow:
+def flow(generator: Generator, t, q, v, params) -> GeneratorFlow:
     """A generator and its total derivatives at one state."""
     at = lambda t, q: generator.at(t, q, params)
     (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
     vector = lambda y: coordinates.flatten(y)[0]
-    return Flow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
+    return GeneratorFlow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
 
 
-def applied_force(system, t, q, v, params, multipliers) -> PyTree:
-    """`Q - ∂R/∂v` in vector form, with the multipliers stacked."""
-    x, unflatten = coordinates.flatten(v)
-    force = jnp.zeros_like(x)
-    if system.force is not None:
-        force = force + coordinates.flatten(force_at(system, t, q, v, params, multipliers))[0].astype(x.dtype)
-    if system.dissipation is not None:
-        force = force - jax.grad(lambda u: system.dissipation(t, q, unflatten(u), params))(x)
-    return force
-
-
-def _terms(system, generator, t, q, v, params):
-    value, p = jax.value_and_grad(system.lagrangian, argnums=2)(t, q, v, params)
-    xi, tau, gauge = generator.at(t, q, params)
-    p, xi, u = (coordinates.flatten(y)[0] for y in (p, xi, v))
-    return p * xi, tau * p * u, tau * value, gauge
+def _terms(generator, model, s):
+    x, u = model.vectors(s.q, s.v)
+    value, p = jax.value_and_grad(model.lagrangian, argnums=2)(s.t, x, u)
+    xi, tau, gauge = generator.at(s.t, s.q, s.params)
+    return p * model.vector(xi), tau * p * u, tau * value, gauge
 
 
 @compiled
-def _charge(system, generator, t, q, v, params):
-    moved, power, value, gauge = _terms(system, generator, t, q, v, params)
+def _charge(generator, model, s):
+    moved, power, value, gauge = _terms(generator, model, s)
     return jnp.sum(moved - power) + value - gauge
 
 
 @compiled
-def _size(system, generator, t, q, v, params):
-    return sum(jnp.sum(jnp.abs(term)) for term in _terms(system, generator, t, q, v, params))
+def _size(generator, model, s):
+    return sum(jnp.sum(jnp.abs(term)) for term in _terms(generator, model, s))
 
 
 @compiled
-def _rate(system, generator, t, q, v, params, multipliers):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    moved = flow(generator, t, q, v, params)
-    lagrangian = lambda t, x, u: system.lagrangian(t, unflatten(x), unflatten(u), params)
+def _rate(generator, model, s, multipliers):
+    x, u = model.vectors(s.q, s.v)
+    moved = flow(generator, *s)
     change = (moved.tau, moved.xi, moved.xi_rate - u * moved.tau_rate)
-    value, rate = jax.jvp(lagrangian, (t, x, u), change)
+    value, rate = jax.jvp(model.lagrangian, (s.t, x, u), change)
     rate = rate + value * moved.tau_rate - moved.gauge_rate
-    stacked = [jnp.atleast_1d(multipliers[name]) for name in system.constraints]
-    stacked = jnp.concatenate(stacked) if stacked else jnp.zeros(0, x.dtype)
-    force = applied_force(system, t, q, v, params, stacked)
-    if system.constraints:
-        force = force + stacked @ constraints.jacobian(system, t, x, u, params, unflatten)
+    stacked = model.stacked(multipliers)
+    force = applied_force(model, s.t, x, u, stacked)
+    if model.m:
+        force = force + stacked @ constraints.jacobian(model, s.t, x, u)
     return rate + force @ (moved.xi - moved.tau * u)

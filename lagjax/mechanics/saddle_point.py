@@ -24,6 +24,8 @@ disagree by as much as the state is off, and solving with all of them would divi
 
 Source: Goldstein, Eq. (2.24)-(2.27); Hairer & Wanner, *Solving ODEs II*, Eq. (VII.1.46); García de Jalón &
 Gutiérrez-López, Multibody Syst. Dyn. 30 (2013) 311 (uniqueness of a, minimum-norm λ).
+
+Judge whether a solution of the equations at one state is valid.
 """
 
 from collections.abc import Callable
@@ -34,20 +36,57 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.lagrangian import Linear, mass_and_forcing
-from lagjax.mechanics.reactions import Reactions, with_reactions
-from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
-from lagjax.numerics import dense
-from lagjax.numerics.rank import DEPENDENT_BELOW, independent_rows, unit_rows
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
+from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
+from lagjax.numerics.linalg import dense
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
+from lagjax.system import constraints
+from lagjax.system.coordinates import State
+
+# A constraint whose derivative is this much smaller than nearby has none: it is written as a square.
+VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
+
+
+class Verdict(NamedTuple):
+    """A solution of the equations at one state, as vectors or by name, and whether it is valid.
+
+    `mass`: the largest entry of each row of M.
+    """
+
+    a: PyTree[Array]
+    multipliers: Any
+    finite: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    contradictory: Bool[Array, ""]
+    mass: Float[Array, " n"]
+
+
+def slightly_off(y):
+    """Shift a position or velocity by a thousandth of its size, differently in each coordinate."""
+    size = jnp.max(jnp.abs(y))
+    return y + 1e-3 * jnp.cos(jnp.arange(y.size, dtype=y.dtype)) * jnp.where(size > 0, size, 1.0)
+
+
+def vanishing(size, nearby):
+    """Which rows of A are round-off: their `size` is far below that at a nearby state."""
+    return size <= VANISHES_BELOW[np.dtype(size.dtype)] * jnp.nan_to_num(nearby, posinf=0.0)
+
+
+def acceleration_round_off(inertia, forces, x, u):
+    """The round-off of an acceleration in equilibrium or uniform motion, where all its terms nearly cancel."""
+    by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
+    extent = jnp.max(jnp.abs(x))
+    by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
+    return 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity)
+
 
 # Below this reciprocal condition, after scaling, the matrix counts as singular.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Dense(NamedTuple):
-    """The equations solved as one matrix of `unknowns` rows. A state is given as (system, t, x, u, params, unflatten).
+    """The equations solved as one matrix of `unknowns` rows. A state is given as (model, t, x, u).
 
     `diagonal`: there are no constraints, and the mass matrix is known to be diagonal.
     """
@@ -55,26 +94,26 @@ class Dense(NamedTuple):
     unknowns: int
     diagonal: bool = False
 
-    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, independent=None):
+    def accelerations(self, model, t, x, u, baumgarte_rate=None, independent=None):
         """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
 
         If None, they are chosen at this state.
         """
-        linear = mass_and_forcing(system, t, x, u, params, unflatten)
-        if not system.constraints:
+        linear = mass_and_forcing(model, t, x, u)
+        if not model.m:
             no_multipliers = jnp.zeros(0, x.dtype)
             if self.diagonal:
                 return linear.forcing / jnp.sum(linear.mass, axis=1), no_multipliers
             return dense.solve(linear.mass, linear.forcing), no_multipliers
-        jacobian, gamma = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+        jacobian, gamma = constraints.acceleration_rows(model, t, x, u)
         if baumgarte_rate is not None:
-            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+            gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
         independent = independent_rows(jacobian) if independent is None else independent
         return _solved(linear, jacobian, gamma, independent)[:2]
 
-    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
-        return independent_rows(constraints.jacobian(system, t, x, u, params, unflatten), dependent_below)
+        return independent_rows(constraints.jacobian(model, t, x, u), dependent_below)
 
     def displacement(self, *state) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
@@ -116,7 +155,7 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
     return solution[:n], minimum_norm(jacobian, multipliers, independent)
 
 
-def _solved(linear: Linear, jacobian, gamma, independent) -> Reactions:
+def _solved(linear: LinearEquation, jacobian, gamma, independent) -> Reactions:
     """The solution where the force may depend on the multipliers."""
     solve = lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent)
     return with_reactions(solve, linear.forcing, gamma, linear.response)
@@ -220,8 +259,8 @@ class Examined(NamedTuple):
 
     a: PyTree[Array]
     multipliers: Any
-    linear: Linear
-    rows: constraints.Rows
+    linear: LinearEquation
+    rows: constraints.ConstraintRows
     independent: Bool[Array, " m"]
     lagrangian: Float[Array, ""]
     matrix: Float[Array, "k k"]
@@ -230,18 +269,16 @@ class Examined(NamedTuple):
 
 
 @compiled
-def examined(system, t, q, v, params) -> Examined:
+def examined(model, s: State) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
-    x, unflatten = coordinates.flatten(q)
-    found = _examined(system, t, x, coordinates.flatten(v)[0], params, unflatten)
-    by_name = constraints.split(system, found.multipliers, t, q, v, params)
-    return found._replace(a=unflatten(found.a), multipliers=by_name)
+    found = _examined(model, s.t, *model.vectors(s.q, s.v))
+    return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
 
 
-def _examined(system, t, x, u, params, unflatten) -> Examined:
+def _examined(model, t, x, u) -> Examined:
     """The same in vector form."""
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    rows = _without_vanishing(system, t, x, u, params, unflatten)
+    linear = mass_and_forcing(model, t, x, u)
+    rows = _without_vanishing(model, t, x, u)
     independent = independent_rows(rows.jacobian)
     a, multipliers, unique = _solved(linear, rows.jacobian, rows.gamma, independent)
     return Examined(
@@ -250,19 +287,19 @@ def _examined(system, t, x, u, params, unflatten) -> Examined:
         linear=linear,
         rows=rows,
         independent=independent,
-        lagrangian=jnp.asarray(system.lagrangian(t, unflatten(x), unflatten(u), params)),
+        lagrangian=jnp.asarray(model.lagrangian(t, x, u)),
         matrix=_scaled_matrix(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
         unique=unique,
     )
 
 
-def _without_vanishing(system, t, x, u, params, unflatten):
+def _without_vanishing(model, t, x, u):
     """The rows of all constraints; those that are round-off, being far larger at a nearby state, are set to zero."""
-    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    rows = constraints.acceleration_rows(model, t, x, u)
     if not rows.gamma.size:
         return rows
-    nearby = constraints.jacobian(system, t, *map(slightly_off, (x, u)), params, unflatten)
+    nearby = constraints.jacobian(model, t, *map(slightly_off, (x, u)))
     size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
     vanishes = vanishing(size(rows.jacobian), size(nearby))
     return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))

@@ -3,9 +3,9 @@
     M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
 
 M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
-equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and Aᵀ are
+equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and Aᵀ are
 functions, derivatives of the user's, and S is found from its products with a few coloured vectors. Which entries can
-be nonzero is read off the jaxpr (`sparse_plan.py`) and holds at every state.
+be nonzero is read off the jaxpr (`sparse_saddle_point.py`) and holds at every state.
 
 One step of iterative refinement on the whole system follows. It restores the digits that S, being a square, loses, and
 corrects the error from a vanishing mass, which counts as a small one in M⁻¹. Where the refinement does not converge the
@@ -17,23 +17,115 @@ null space of Aᵀ, and hence of G. Applied to a vector, `mu (G + mu)⁻¹` keep
 rest smaller by `mu` over an eigenvalue of G.
 
 Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, §5 (Schur complement).
+
+Decide whether a system is large and made of parts that touch few others, and how to solve it then.
+
+The jaxpr shows which velocities M couples, and which velocities each constraint equation restricts. With M in small
+blocks, the matrix S = A M⁻¹ Aᵀ of the multipliers couples equations that act on a common block; ordered, it is a band.
+Nothing here depends on values, so a plan holds at every state.
 """
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.mechanics import constraints
+from lagjax.jaxtools.sparsity import pattern
 from lagjax.mechanics.lagrangian import forcing_and_inertia
-from lagjax.mechanics.sparse_plan import Plan
-from lagjax.mechanics.verdict import Verdict, acceleration_round_off, slightly_off, vanishing
-from lagjax.numerics import banded, dense
+from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, slightly_off, vanishing
+from lagjax.numerics.linalg import banded, dense
+from lagjax.system import constraints
+from lagjax.system.model import Model
+
+# The banded solve is faster from six unknowns on (a chain of two: 2.4 microseconds against 4.8; of twelve: 4 against
+# 24); the dense one exchanges rows, which suits any mass matrix, and is kept where little is to be gained.
+UNKNOWNS_AT_LEAST = 24
+# Blocks of M are inverted by elimination up to this size.
+BLOCK_AT_MOST = dense.ELIMINATE_UP_TO
+# A band wider than this share of its rows leaves little out.
+BAND_AT_MOST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is known of a system independently of values: blocks of M, colours of M and A, the band of S."""
+
+    members: Int[np.ndarray, "blocks size"]
+    place: Int[np.ndarray, " n"]
+    of_mass: banded.Colours
+    of_rows: banded.Colours
+    of_columns: banded.Colours
+    band: banded.Band | None
+
+    def __str__(self):
+        size = self.members.shape[1]
+        mass = "mass matrix diagonal" if size == 1 else f"mass matrix in blocks of up to {size}"
+        if self.band is None:
+            return mass
+        rows, half_bandwidth = self.band.order
+        return f"banded, half bandwidth {half_bandwidth}, {len(rows)} equations; {mass}"
+
+
+def plan(model: Model) -> Plan | None:
+    """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
+    if model.reacts or model.n + model.m < UNKNOWNS_AT_LEAST:
+        return None
+    leaves, structure = jtu.tree_flatten(model)
+    leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+    try:
+        hash((structure, leaves))
+    except TypeError:
+        return _plan.__wrapped__(structure, leaves)
+    return _plan(structure, leaves)
+
+
+# The equations are traced at several places of one program.
+@lru_cache(maxsize=64)
+def _plan(structure, leaves) -> Plan | None:
+    model = jtu.tree_unflatten(structure, leaves)
+    t, u = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
+    given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t, u
+
+    def at(given):
+        arrays, t, x = given
+        filled = [leaf if x is None else x for x, leaf in zip(arrays, leaves)]
+        return jtu.tree_unflatten(structure, filled), t, x
+
+    def momentum(u, given):
+        model, t, x = at(given)
+        return jax.grad(model.lagrangian, argnums=2)(t, x, u)
+
+    def residual(u, given):
+        return constraints.velocity_residual(*at(given), u)
+
+    of_mass = pattern(momentum, u, given)
+    blocks = banded.blocks(of_mass)
+    if max(map(len, blocks)) > BLOCK_AT_MOST:
+        return None
+    members = np.full((len(blocks), max(map(len, blocks))), u.size)
+    coupled = np.zeros((u.size, u.size), np.float32)
+    for k, block in enumerate(blocks):
+        members[k, : len(block)] = block
+        coupled[np.ix_(block, block)] = 1
+    of_rows = pattern(residual, u, given)
+    m, band = len(of_rows), None
+    if m:
+        rows = of_rows.astype(np.float32)
+        band = banded.band(rows @ coupled @ rows.T > 0)
+        if band.order.half_bandwidth > max(1, BAND_AT_MOST * m):
+            return None
+    where = np.flatnonzero(members.ravel() < u.size)
+    place = where[np.argsort(members.ravel()[where])]
+    return Plan(members, place, *map(banded.colours, (coupled > 0, of_rows, of_rows.T)), band)
+
 
 # The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
@@ -57,36 +149,36 @@ class Operators(NamedTuple):
 
 
 class Banded(NamedTuple):
-    """The equations solved through S, by a plan. A state is given as (system, t, x, u, params, unflatten)."""
+    """The equations solved through S, by a plan. A state is given as (model, t, x, u)."""
 
     plan: Plan
 
-    def accelerations(self, system, t, x, u, params, unflatten, baumgarte_rate=None, kept=None):
+    def accelerations(self, model, t, x, u, baumgarte_rate=None, kept=None):
         """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
         plan = self.plan
-        forcing, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
+        forcing, inertia = forcing_and_inertia(model, t, x, u)
         if plan.band is None:
             return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
-        push, pull, rate = _rows(system, t, x, u, params, unflatten)
+        push, pull, rate = _rows(model, t, x, u)
         gamma = -rate
         if baumgarte_rate is not None:
-            gamma = gamma + constraints.baumgarte_feedback(system, t, x, u, params, unflatten, baumgarte_rate)
+            gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
         kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         a, multipliers = _solve(plan, operators, forcing, gamma)
         shortest = partial(_shortest, plan, push, pull)
         return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
 
-    def independent(self, system, t, x, u, params, unflatten, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
         """Which constraint equations to solve with; see `numerics.banded.independent`."""
-        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        push, pull, _ = _rows(model, t, x, u)
         return _independent(self.plan, push, pull, x.dtype, dependent_below)
 
-    def displacement(self, system, t, x, u, params, unflatten) -> Callable:
+    def displacement(self, model, t, x, u) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         plan = self.plan
-        _, inertia = forcing_and_inertia(system, t, x, u, params, unflatten)
-        push, pull, _ = _rows(system, t, x, u, params, unflatten)
+        _, inertia = forcing_and_inertia(model, t, x, u)
+        push, pull, _ = _rows(model, t, x, u)
         kept = _independent(plan, push, pull, x.dtype)
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         schur, invert = _schur(plan, operators, x.dtype)
@@ -98,25 +190,25 @@ class Banded(NamedTuple):
 
         return of_residuals
 
-    def row_sizes(self, system, t, x, u, params, unflatten, norm=jnp.sum) -> Float[Array, " m"]:
+    def row_sizes(self, model, t, x, u, norm=jnp.sum) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
         if self.plan.band is None:
             return jnp.zeros(0, x.dtype)
-        push, _, _ = _rows(system, t, x, u, params, unflatten)
+        push, _, _ = _rows(model, t, x, u)
         return norm(jnp.abs(banded.compressed(push, self.plan.of_rows, x.dtype)), axis=0)
 
-    def verdict(self, system, t, x, u, params, unflatten) -> Verdict:
+    def verdict(self, model, t, x, u) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
-        plan, state = self.plan, (system, t, x, u, params, unflatten)
+        plan, state = self.plan, (model, t, x, u)
         a, multipliers = self.accelerations(*state)
         forcing, inertia = forcing_and_inertia(*state)
-        known = [forcing, system.lagrangian(t, unflatten(x), unflatten(u), params)]
+        known = [forcing, model.lagrangian(t, x, u)]
         singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
         if plan.band is not None:
             push, pull, rate = _rows(*state)
             known.append(rate)
             kept = _independent(plan, push, pull, x.dtype)
-            at = lambda x, u: self.row_sizes(system, t, x, u, params, unflatten, jnp.max)
+            at = lambda x, u: self.row_sizes(model, t, x, u, jnp.max)
             vanishes = vanishing(at(x, u), at(*map(slightly_off, (x, u))))
             operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
             singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
@@ -158,11 +250,11 @@ def _largest_inertia(plan, inertia, x):
     return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
 
 
-def _rows(system, t, x, u, params, unflatten):
+def _rows(model, t, x, u):
     """The products with A and Aᵀ, and d/dt of the velocity residual at constant velocity: -gamma."""
 
     def residual(t, x, u):
-        return constraints.velocity_residual(system, t, x, u, params, unflatten)
+        return constraints.velocity_residual(model, t, x, u)
 
     _, rate = jax.jvp(lambda t, x: residual(t, x, u), (t, x), (jnp.ones_like(t), u))
     _, push = jax.linearize(lambda u: residual(t, x, u), u)

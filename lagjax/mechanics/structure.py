@@ -2,8 +2,8 @@
 
 `structure` says what the mass matrix depends on and which coordinates it couples, which coordinates are cyclic, whether
 time is explicit, whether L has terms linear in the velocities, and what is constant in the constraints. It examines
-their programs written out number by number (`in_numbers.py`): an entry that is a zero there is zero everywhere, and one
-that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
+their programs written out number by number (`scalar_form.py`): an entry that is a zero there is zero everywhere, and
+one that no chain of operations connects with a coordinate does not depend on it. Of the packages for the sparsity of
 jaxprs, asdex finds the patterns, but neither what an entry depends on nor the program without its zeros, which the
 solver runs; one pass gives all three.
 
@@ -25,15 +25,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.jax_internals.names import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC
-from lagjax.jax_internals.programs import Literal, depends, interpreted
-from lagjax.mechanics import constraints, coordinates
-from lagjax.mechanics.in_numbers import WRITTEN, Numbers, in_numbers
+from lagjax.jaxtools.cache import varies
+from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC, Literal, depends, interpreted
+from lagjax.jaxtools.scalarize import TooLong
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.reactions import force_with_ones
-from lagjax.mechanics.system import System
-from lagjax.numerics import banded
-from lagjax.numerics.scalars import TooLong
+from lagjax.mechanics.multiplier_forces import force_with_ones
+from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
+from lagjax.numerics.linalg import banded
+from lagjax.system import coordinates
+from lagjax.system.model import Model, unchecked
+from lagjax.system.system import System
 
 # Coordinates and equations together; the programs of larger systems are not written out.
 UP_TO = 24
@@ -66,87 +67,84 @@ class Structure(NamedTuple):
     constraints: dict[str, ConstraintStructure]
 
 
-def structure(system, t, q, v, params) -> Structure | None:
-    """The structure of a system; only names and shapes of the state count. None if it or its program is large."""
-    names = coordinates.names(q)
-    if len(names) + constraints.count(system, t, q, v, params) > UP_TO:
+def structure(model: Model) -> Structure | None:
+    """The structure of a system. None if it or its program is large."""
+    if model.n + model.m > UP_TO:
         return None
-    _, unflatten = coordinates.flatten(q)
-    system = in_numbers(system, unflatten)
     try:
-        return _structure((system, t, coordinates.numbers(q), coordinates.numbers(v), params), names)
+        return _structure(in_numbers(model), model.names)
     except TooLong:
         return None
 
 
-def _structure(args, names):
-    system, n = args[0], len(names)
-    mass = _numbers(_mass, args)
+def _structure(model: Model, names):
+    system, n = model.system, model.n
+    mass = _numbers(_mass, model)
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
-    lagrangian = _numbers(lambda system, *state: system.lagrangian(*state), args)
-    linear = _numbers(_momentum_at_rest, args)
-    programs = [_numbers(lambda _, *state, f=f: f(*state), args) for f in functions_of(system)]
+    lagrangian = _numbers(_of(system.lagrangian), model)
+    linear = _numbers(_momentum_at_rest, model)
+    programs = [_numbers(_of(f), model) for f in functions_of(model)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
         explicit_time=any("t" in _depends_on(program, names) for program in programs),
         cyclic=tuple(name for name in names if name not in _depends_on(lagrangian, names)),
         linear_terms=tuple(name for name, x in zip(names, linear.program.jaxpr.outvars) if not is_zero(x)),
-        constraints={name: _constraint_structure(c, args, names) for name, c in system.constraints.items()},
+        constraints={name: _constraint_structure(c, model, names) for name, c in system.constraints.items()},
     )
 
 
-def unseen_coordinates(system, t, q, v, params) -> np.ndarray:
+def _of(function):
+    """One of the user's functions as a function of the model and the state."""
+    return lambda model, *state: function(*state, model.params)
+
+
+def unseen_coordinates(model: Model) -> np.ndarray:
     """Which coordinates are known to occur in none of L, R, Q and the constraints: (n,) booleans.
 
     They may all be shifted, and nothing else of the motion changes.
     """
-    x, unflatten = coordinates.flatten(q)
-    if x.size + constraints.count(system, t, q, v, params) > UP_TO:
-        return _unseen_leaves(system, t, q, v, params)
-    written = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
-    occurs = np.zeros(x.size, bool)
+    if model.n + model.m > UP_TO:
+        return _unseen_leaves(model)
+    written, occurs = in_numbers(model), np.zeros(model.n, bool)
     try:
-        for f in functions_of(written[0]):
-            numbers = _numbers(lambda _, *state, f=f: f(*state), written)
+        for f in functions_of(written):
+            numbers = _numbers(_of(f), written)
             _, *state = numbers.state_variables
-            occurs |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: x.size]])
+            occurs |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: model.n]])
     except TooLong:
-        return _unseen_leaves(system, t, q, v, params)
+        return _unseen_leaves(model)
     return ~occurs
 
 
-def _unseen_leaves(system, t, q, v, params):
+def _unseen_leaves(model: Model):
     """The same, for whole leaves of q."""
     unseen = []
-    for i, leaf in enumerate(jtu.tree_leaves(q)):
+    for i, shape in enumerate(model.form.shapes):
         at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
-        kinds = {_dependence(f, (t, q, v, params), at) for f in functions_of(system)}
-        unseen += [kinds == {Depends.NOT}] * int(np.size(leaf))
+        kinds = {_dependence(f, model, at) for f in functions_of(model)}
+        unseen += [kinds == {Depends.NOT}] * int(np.prod(shape))
     return np.array(unseen)
 
 
-def is_diagonal(system, t, q, v, params) -> bool:
+def is_diagonal(model: Model) -> bool:
     """Whether the mass matrix is known to be diagonal."""
-    x, _ = coordinates.flatten(q)
-    if x.size == 1:
+    if model.n == 1:
         return True
     try:
-        mass = _numbers(_mass, (system, t, q, v, params))
+        mass = _numbers(_mass, model)
     except TooLong:
         return False
-    off_diagonal = ~np.eye(x.size, dtype=bool).reshape(-1)
+    off_diagonal = ~np.eye(model.n, dtype=bool).reshape(-1)
     return all(is_zero(x) for x, off in zip(mass.program.jaxpr.outvars, off_diagonal) if off)
 
 
-def is_free_of_velocities(system, t, q, v, params) -> bool:
+def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
-    if system.constraints:
+    if model.m:
         return False
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    equations = lambda t, x, u, params: mass_and_forcing(system, t, x, u, params, unflatten)
-    return _dependence(equations, (t, x, u, params), lambda args: args[2]) == Depends.NOT
+    equations = lambda t, q, v, params: mass_and_forcing(model.of(params), t, *model.vectors(q, v))
+    return _dependence_on_any(equations, model, lambda args: jtu.tree_leaves(args[2])) == Depends.NOT
 
 
 def is_zero(x) -> bool:
@@ -154,20 +152,18 @@ def is_zero(x) -> bool:
     return isinstance(x, Literal) and x.val == 0
 
 
-def _numbers(function, args):
-    return Numbers(function, args, most=WRITTEN)
+def _numbers(function, model):
+    return Numbers(function, model, most=WRITTEN)
 
 
-def _mass(system, t, q, v, params):
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    mass = mass_and_forcing(system, t, x, u, params, unflatten).mass
-    return [mass[i, j] for i in range(x.size) for j in range(x.size)]
+def _mass(model, t, q, v):
+    mass = mass_and_forcing(model, t, *model.vectors(q, v)).mass
+    return [mass[i, j] for i in range(model.n) for j in range(model.n)]
 
 
-def _momentum_at_rest(system, t, q, v, params):
+def _momentum_at_rest(model, t, q, v):
     at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
-    return jax.grad(system.lagrangian, argnums=2)(t, q, at_rest, params)
+    return jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
 
 
 def _depends_on(numbers, names):
@@ -178,10 +174,10 @@ def _depends_on(numbers, names):
     return tuple([*found, "velocities"] if depends(jaxpr, state[n:]) else found)
 
 
-def _constraint_structure(constraint, args, names):
+def _constraint_structure(constraint, model, names):
     by = 1 if constraint.of_positions else 2
-    value = _numbers(lambda _, *state: constraint.residual(*state), args)
-    slope = _numbers(lambda _, *state: jax.jacfwd(lambda *s: constraint.residual(*s), argnums=by)(*state), args)
+    value = _numbers(_of(constraint.residual), model)
+    slope = _numbers(_of(lambda *state: jax.jacfwd(constraint.residual, argnums=by)(*state)), model)
     return ConstraintStructure(linear=not _depends_on(slope, names), moving="t" in _depends_on(value, names))
 
 
@@ -194,42 +190,44 @@ class Depends(IntEnum):
     OTHERWISE = 3
 
 
-def angles(system, t, q, v, params) -> PyTree[bool]:
+def angles(model: Model) -> PyTree[bool]:
     """Which leaves of q are angles, in the structure of q."""
-    leaves, structure = jtu.tree_flatten(q)
     found = []
-    for i in range(len(leaves)):
-        kinds = {
-            _dependence(f, (t, q, v, params), lambda args, i=i: jtu.tree_leaves(args[1])[i])
-            for f in functions_of(system)
-        }
+    for i in range(len(model.form.shapes)):
+        at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
+        kinds = {_dependence(f, model, at) for f in functions_of(model)}
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
-    return jtu.tree_unflatten(structure, found)
+    return jtu.tree_unflatten(model.form.structure, found)
 
 
-def conserved_momenta(system, t, q, v, params) -> list[str]:
+def are_angles(model: Model) -> np.ndarray:
+    """Which coordinates are angles, (n,) booleans."""
+    leaves = zip(jtu.tree_leaves(angles(model)), model.form.shapes)
+    return np.array([angle for angle, shape in leaves for _ in range(int(np.prod(shape)))], bool)
+
+
+def conserved_momenta(model: Model) -> list[str]:
     """The coordinates with a momentum known to be conserved: not in L or a constraint, and no force acts."""
-    names = coordinates.names(q)
+    system, names = model.system, model.names
     forced = system.force is not None or system.dissipation is not None
     if forced or not system.is_holonomic or len(names) > UP_TO:
         return []
-    _, unflatten = coordinates.flatten(q)
-    system = in_numbers(system, unflatten)
-    args = (system, t, coordinates.numbers(q), coordinates.numbers(v), params)
+    model = in_numbers(model)
     try:
-        occurring = [_depends_on(_numbers(lambda _, *state, f=f: f(*state), args), names) for f in functions_of(system)]
+        occurring = [_depends_on(_numbers(_of(f), model), names) for f in functions_of(model)]
     except TooLong:
         return []
     return [name for name in names if not any(name in found for found in occurring)]
 
 
-def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
+def what_changes_momentum(model: Model, name) -> Iterator[str]:
     """What may change the momentum of a coordinate, in words."""
-    if not _contains(system.lagrangian, name, t, q, v, params, argument=2):
+    system = model.system
+    if not _contains(system.lagrangian, name, model, argument=2):
         yield "L does not contain its velocity"
-    if system.force is not None and _pushes(system, name, t, q, v, params):
+    if system.force is not None and _pushes(model, name):
         yield "a force acts on it"
-    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params, argument=2):
+    if system.dissipation is not None and _contains(system.dissipation, name, model, argument=2):
         yield "dissipation acts on it"
     functions = {"L contains it": system.lagrangian}
     for other, c in system.constraints.items():
@@ -238,55 +236,51 @@ def what_changes_momentum(system, name, t, q, v, params) -> Iterator[str]:
         else:
             yield f"constraint '{other}' restricts velocities"
     for words, function in functions.items():
-        if _contains(function, name, t, q, v, params):
+        if _contains(function, name, model):
             yield words
 
 
-def forced_by(system, name, t, q, v, params) -> Iterator[str]:
+def forced_by(model: Model, name) -> Iterator[str]:
     """Which forces on other coordinates depend on this one, in words."""
-    if system.force is not None and _contains(force_with_ones(system), name, t, q, v, params):
+    if model.system.force is not None and _contains(force_with_ones(model), name, model):
         yield "the force contains it"
-    if system.dissipation is not None and _contains(system.dissipation, name, t, q, v, params):
+    if model.system.dissipation is not None and _contains(model.system.dissipation, name, model):
         yield "dissipation contains it"
 
 
-def _pushes(system, name, t, q, v, params) -> bool:
+def _pushes(model: Model, name) -> bool:
     """Whether the force on a coordinate is not a literal zero; also True if that is not known."""
-    _, unflatten = coordinates.flatten(q)
-    args = in_numbers(system, unflatten), t, coordinates.numbers(q), coordinates.numbers(v), params
     try:
-        force = _numbers(lambda system, *state: force_with_ones(system)(*state), args)
+        force = _numbers(_of(force_with_ones(in_numbers(model))), in_numbers(model))
     except TooLong:
         return True
-    return not is_zero(force.program.jaxpr.outvars[coordinates.names(q).index(name)])
+    return not is_zero(force.program.jaxpr.outvars[model.names.index(name)])
 
 
-def _contains(function, name, t, q, v, params, argument=1) -> bool:
+def _contains(function, name, model: Model, argument=1) -> bool:
     """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also True if not known."""
-    sizes = [np.size(leaf) for leaf in jtu.tree_leaves(q)]
-    leaf = int(np.searchsorted(np.cumsum(sizes), coordinates.names(q).index(name), side="right"))
+    sizes, known = [int(np.prod(shape)) for shape in model.form.shapes], model.names
+    leaf = int(np.searchsorted(np.cumsum(sizes), known.index(name), side="right"))
     if sizes[leaf] == 1:
-        found = _dependence(function, (t, q, v, params), lambda args: jtu.tree_leaves(args[argument])[leaf])
-        return found != Depends.NOT
-    _, unflatten = coordinates.flatten(q)
-    alone, known = in_numbers(System(function), unflatten), coordinates.names(q)
-    args = alone, t, coordinates.numbers(q), coordinates.numbers(v), params
+        return _dependence(function, model, lambda args: jtu.tree_leaves(args[argument])[leaf]) != Depends.NOT
+    alone = in_numbers(unchecked(System(function), model.params, model.form._replace(residuals=())))
     try:
         # The function may be a force: all its entries count.
-        numbers = _numbers(lambda system, *state: coordinates.flatten(system.lagrangian(*state))[0], args)
+        numbers = _numbers(_of(lambda *s: coordinates.flatten(alone.system.lagrangian(*s))[0]), alone)
     except TooLong:
         return True
     place = 1 + (argument - 1) * len(known) + known.index(name)
     return depends(numbers.program.jaxpr, [numbers.state_variables[place]])
 
 
-def conserves_jacobi_integral(system, t, q, v, params) -> bool:
+def conserves_jacobi_integral(model: Model) -> bool:
     """Whether the Jacobi integral is known to be constant: no explicit time, no force, only positions constrained."""
-    return next(what_changes_jacobi_integral(system, t, q, v, params), None) is None
+    return next(what_changes_jacobi_integral(model), None) is None
 
 
-def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
+def what_changes_jacobi_integral(model: Model) -> Iterator[str]:
     """What may change the Jacobi integral, in words."""
+    system = model.system
     if system.force is not None:
         yield "there is a force"
     if system.dissipation is not None:
@@ -294,43 +288,50 @@ def what_changes_jacobi_integral(system, t, q, v, params) -> Iterator[str]:
     for name, c in system.constraints.items():
         if not c.of_positions:
             yield f"constraint '{name}' restricts velocities"
-    if sees_time(system.lagrangian, t, q, v, params):
+    if sees_time(system.lagrangian, model):
         yield "L depends on t"
     for name, c in system.constraints.items():
-        if c.of_positions and sees_time(c.residual, t, q, v, params):
+        if c.of_positions and sees_time(c.residual, model):
             yield f"constraint '{name}' depends on t"
 
 
-def sees_time(function, *state) -> bool:
+def sees_time(function, model: Model) -> bool:
     """Whether a function of (t, q, v, params) depends on t."""
-    return _dependence(function, state, lambda args: args[0]) != Depends.NOT
+    return _dependence(function, model, lambda args: args[0]) != Depends.NOT
 
 
-def is_autonomous(system, t, q, v, params) -> bool:
+def is_autonomous(model: Model) -> bool:
     """Whether nothing that the motion depends on depends on t."""
-    return not any(sees_time(f, t, q, v, params) for f in functions_of(system))
+    return not any(sees_time(f, model) for f in functions_of(model))
 
 
-def functions_of(system):
+def functions_of(model: Model):
     """All functions that the motion depends on, of (t, q, v, params)."""
     functions = []
-    for phase in system.phases:
-        functions += [phase.lagrangian, None if phase.force is None else force_with_ones(phase), phase.dissipation]
-        functions += [c.residual for c in phase.constraints.values()]
+    for phase in model.phases:
+        system = phase.system
+        forced = None if system.force is None else force_with_ones(phase)
+        functions += [system.lagrangian, forced, system.dissipation]
+        functions += [c.residual for c in system.constraints.values()]
     return [f for f in functions if f is not None]
 
 
-def _dependence(function, args, leaf_of):
+def _dependence(function, model: Model, leaf_of):
     """How the outputs of a function of (t, q, v, params) depend on one leaf of these."""
-    arrays, static = eqx.partition(args, eqx.is_array)
+    return _dependence_on_any(function, model, lambda args: [leaf_of(args)])
+
+
+def _dependence_on_any(function, model: Model, leaves_of):
+    """How they depend on any of several leaves."""
+    arrays, static = eqx.partition((*model.example, model.params), varies)
 
     def of_arrays(arrays):
         return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
 
     program = jax.make_jaxpr(of_arrays)(arrays)
     count, structure = len(program.jaxpr.invars), jtu.tree_structure(arrays)
-    chosen = leaf_of(jtu.tree_unflatten(structure, range(count)))
-    kinds = [Depends.LINEARLY if i == chosen else Depends.NOT for i in range(count)]
+    chosen = set(leaves_of(jtu.tree_unflatten(structure, range(count))))
+    kinds = [Depends.LINEARLY if i in chosen else Depends.NOT for i in range(count)]
     return max(interpreted(program, kinds, _apply, lambda *_: Depends.NOT), default=Depends.NOT)
 
 

@@ -35,10 +35,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
 class Chain(NamedTuple):

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms.mechanism import Mechanism
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
 class Ends(NamedTuple):

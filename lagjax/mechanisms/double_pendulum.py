@@ -17,10 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, squared_distance
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
 class Masses(NamedTuple):

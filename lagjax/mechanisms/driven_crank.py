@@ -19,11 +19,11 @@ Source: Simeon, *Math. Modelling of Systems* 2 (1996) 1, with a rigid rod: Ω = 
 
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms import slider_crank
 from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.slider_crank import Body, Parts
+from lagjax.mechanisms.slider_crank import Body, SliderCrankParts
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = slider_crank.PARAMS | {"rate": 150.0}
 
@@ -48,12 +48,12 @@ def exact(t, params):
     # Velocities of the rod's centre and of the block along -x, per unit of rate, and their slopes in θ.
     centre, block = l1 * s + l2 * w * s2 / 2, l1 * s + l2 * w * s2
     d_centre, d_block = l1 * c + l2 * (dw * s2 + w**2 * c2) / 2, l1 * c + l2 * (dw * s2 + w**2 * c2)
-    q = Parts(
+    q = SliderCrankParts(
         crank=Body(l1 * c / 2, l1 * s / 2, angle),
         rod=Body(l1 * c + l2 * c2 / 2, l1 * s / 2, np.arcsin(s2)),
         block=l1 * c + l2 * c2,
     )
-    v = Parts(
+    v = SliderCrankParts(
         crank=Body(-rate * l1 * s / 2, rate * l1 * c / 2, rate * np.ones_like(angle)),
         rod=Body(-rate * centre, rate * l1 * c / 2, rate * w),
         block=-rate * block,
@@ -73,12 +73,12 @@ MECHANISM = Mechanism(
     end=0.1,
     freedom=0,
     reference=(
-        Parts(
+        SliderCrankParts(
             crank=Body(-0.0569765934644116, 0.04877158801178376, 15.0),
             rod=Body(0.02789649478674791, 0.04877158801178376, -0.33116391346483814),
             block=0.16974617650231902,
         ),
-        Parts(
+        SliderCrankParts(
             crank=Body(-7.315738201767564, -8.54648901966174, 150.0),
             rod=Body(-11.692972514256255, -8.54648901966174, 60.25032214593665),
             block=-8.754468624977381,

@@ -20,9 +20,9 @@ Value Problem Solvers* (Bari), problem "fekete" (there with a second set of mult
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms.mechanism import Mechanism
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"alpha": 0.5}
 

@@ -31,13 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
-class Parts(NamedTuple):
+class GovernorParts(NamedTuple):
     """The shaft's angle, the slider's height, and the two balls, (3,) each."""
 
     psi: Float[Array, ""] | float
@@ -117,18 +116,18 @@ MECHANISM = Mechanism(
     source="González et al., Multibody Syst. Dyn. 16 (2006) 179; IFToMM benchmark library, A05",
     system=system,
     params=PARAMS,
-    q0=Parts(psi=0.0, z=0.5, C=np.array([REACH, 0.0, 0.5]), D=np.array([-REACH, 0.0, 0.5])),
-    v0=Parts(psi=RATE, z=0.0, C=np.array([0.0, RATE * REACH, 0.0]), D=np.array([0.0, -RATE * REACH, 0.0])),
+    q0=GovernorParts(psi=0.0, z=0.5, C=np.array([REACH, 0.0, 0.5]), D=np.array([-REACH, 0.0, 0.5])),
+    v0=GovernorParts(psi=RATE, z=0.0, C=np.array([0.0, RATE * REACH, 0.0]), D=np.array([0.0, -RATE * REACH, 0.0])),
     end=10.0,
     freedom=4,
     reference=(
-        Parts(
+        GovernorParts(
             psi=55.93539999404147,
             z=0.6196198224120089,
             C=np.array([0.7972290289444487, -0.5610850470625497, 0.6197403232129428]),
             D=np.array([-0.7972290289444487, 0.5610850470625497, 0.6197403232129428]),
         ),
-        Parts(
+        GovernorParts(
             psi=5.548217317680775,
             z=-0.7476045185405928,
             C=np.array([2.8616156116529217, 4.6001380663079114, -0.7477370057722393]),

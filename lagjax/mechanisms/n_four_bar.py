@@ -4,7 +4,8 @@ N + 1 legs of length l stand side by side on A_i = (i l, 0); N couplers join the
 
     |B_i - A_i|² = l²  (i = 0 ... N),      |B_i - B_(i-1)|² = l²  (i = 1 ... N)
 
-These are 2 (N + 1) coordinates and 2N + 1 equations: one degree of freedom. With uniform rods of mass m (`natural.py`)
+These are 2 (N + 1) coordinates and 2N + 1 equations: one degree of freedom. With uniform rods of mass m
+(`mechanism.py`)
 
     L = Σ_legs (m |Ḃ_i|²/6 - ½ m g y_i)
       + Σ_couplers (m (|Ḃ_(i-1)|² + Ḃ_(i-1)·Ḃ_i + |Ḃ_i|²)/6 - ½ m g (y_(i-1) + y_i))
@@ -23,10 +24,9 @@ computational benchmark problems, A02 (N = 40 there; N = 2, as here, in OpenSim'
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
-from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.natural import rod_kinetic_energy, squared_distance
+from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"m": 1.0, "l": 1.0, "g": 9.81}
 

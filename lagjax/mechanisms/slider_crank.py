@@ -30,9 +30,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.mechanisms.mechanism import Mechanism
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
 class Body(NamedTuple):
@@ -43,7 +43,7 @@ class Body(NamedTuple):
     angle: Float[Array, ""] | float
 
 
-class Parts(NamedTuple):
+class SliderCrankParts(NamedTuple):
     """The three bodies; the block has only x."""
 
     crank: Body
@@ -105,17 +105,17 @@ MECHANISM = Mechanism(
     system=system,
     params=PARAMS,
     # Crank and rod along the rail, the crank turning at 150 rad/s and so the rod at -ρ 150.
-    q0=Parts(crank=Body(0.075, 0.0, 0.0), rod=Body(0.3, 0.0, 0.0), block=0.45),
-    v0=Parts(crank=Body(0.0, 11.25, 150.0), rod=Body(0.0, 11.25, -75.0), block=0.0),
+    q0=SliderCrankParts(crank=Body(0.075, 0.0, 0.0), rod=Body(0.3, 0.0, 0.0), block=0.45),
+    v0=SliderCrankParts(crank=Body(0.0, 11.25, 150.0), rod=Body(0.0, 11.25, -75.0), block=0.0),
     end=0.1,
     freedom=1,
     reference=(
-        Parts(
+        SliderCrankParts(
             crank=Body(0.046498324604522266, 0.05884645961289837, 13.468452708896843),
             rod=Body(0.2309716258933242, 0.05884645961289837, -0.40314128439378855),
             block=0.3689466025776039,
         ),
-        Parts(
+        SliderCrankParts(
             crank=Body(-7.116416474761444, 5.62313256296388, 120.93193917823424),
             rod=Body(-16.63110436957618, 5.62313256296388, -40.7547274012662),
             block=-19.029375789629476,

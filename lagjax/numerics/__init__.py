@@ -1,1 +1,1 @@
-"""Numerical tools that do not depend on mechanics."""
+"""Methods and linear algebra that know no mechanics."""

@@ -31,17 +31,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import plot
-from lagjax.analysis.continuation import continue_equilibria
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.crossings import EventWarning
-from lagjax.motion.integrate import integrate
+from lagjax.analysis.continuation.equilibria import continue_equilibria
+from lagjax.display import plots
+from lagjax.integrate.events.event import EventWarning
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
-from lagjax.scenes.elliptic import agm, jacobi_elliptic
-from lagjax.sweeps import sweep
+from lagjax.scenes.potentials import agm, jacobi_elliptic
+from lagjax.sweep import sweep
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"m": 0.5, "a": 0.75, "g": 9.8125, "omega": 6.0}
 # Exactly at the critical speed: g/a = 16 = omega².
@@ -142,7 +142,7 @@ def short_of_horizontal(params):
     return jnp.arcsin(params["g"] / (params["a"] * params["omega"] ** 2))
 
 
-class Squares(NamedTuple):
+class BeadSquares(NamedTuple):
     """Squared frequencies of small motions; a negative one is minus a squared growth rate."""
 
     bottom: jax.Array
@@ -150,10 +150,10 @@ class Squares(NamedTuple):
     top: jax.Array
 
 
-def small_motion(params) -> Squares:
+def small_motion(params) -> BeadSquares:
     """ω0² - ω² at the bottom, ω² sin²α = ω² - ω0⁴/ω² about α (meaningful above ω0), -(ω0² + ω²) at the top."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
-    return Squares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
+    return BeadSquares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
 
 
 def frequency(square):
@@ -365,7 +365,7 @@ def _settling():  # for the case and the picture; not too near ω0, where settli
 
 def picture():
     """The pitchfork, with beads that settled on it; and the period, which diverges at the homoclinic orbit."""
-    fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
+    fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     _draw_pitchfork(axes[0, 0])
     _draw_periods(axes[0, 1], float(natural_rate(PARAMS)))
     return fig
@@ -384,10 +384,10 @@ def _draw_periods(axis, unit):
     speeds, measured = np.linspace(0.003, 2.5, 700), np.linspace(0.1, 2.4, 9)
     for i, psi in enumerate((0.125, 1.0, 2.0)):
         period = exact_period(PARAMS | {"omega": unit * speeds}, psi)
-        axis.plot(speeds, unit * period / (2 * np.pi), label=rf"$\psi_m$ = {psi:g}", **plot.style(i))
+        axis.plot(speeds, unit * period / (2 * np.pi), label=rf"$\psi_m$ = {psi:g}", **plots.style(i))
         params = [PARAMS | {"omega": unit * speed} for speed in measured]
         halves = [swing(p, psi, 0.75 * exact_period(p, psi), 1e-8).end.t for p in params]
-        axis.plot(measured, unit * np.array(halves) / np.pi, plot.MARKERS[i], color=plot.COLOURS[i], markersize=4)
+        axis.plot(measured, unit * np.array(halves) / np.pi, plots.MARKERS[i], color=plots.COLOURS[i], markersize=4)
     axis.set(xlabel=r"$\omega/\omega_0$", ylabel=r"period $\times\,\omega_0/2\pi$", title="Released at rest")
     axis.set_ylim(0.0, 4.0)
     axis.legend(fontsize=8, frameon=False, title="curves: exact; marks: measured", title_fontsize=8)

@@ -34,13 +34,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import plot
-from lagjax.analysis.modes import normal_modes
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
+from lagjax.analysis.modes.normal_modes import normal_modes
+from lagjax.display import plots
+from lagjax.integrate.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
-from lagjax.sweeps import sweep
+from lagjax.sweep import sweep
+from lagjax.system.system import System
 
 PARAMS = {"m": 0.5, "K": 20.0, "k": 8.0, "R0": 0.75, "omega": 2.5}
 Q0 = {"R": 1.0, "r": 0.125}
@@ -107,7 +107,7 @@ def to_rotating(params, t, q, v):
     return {"R": R, "r": r}, {"R": v["x"] * c + v["y"] * s + omega * r, "r": -v["x"] * s + v["y"] * c - omega * R}
 
 
-class Balance(NamedTuple):
+class RailBalance(NamedTuple):
     """Quantities of one state: energy, Jacobi integral, angular momentum, the rails' torque and its power."""
 
     E: jax.Array
@@ -117,7 +117,7 @@ class Balance(NamedTuple):
     power: jax.Array
 
 
-def balance(params, q, v) -> Balance:
+def balance(params, q, v) -> RailBalance:
     """E, h' = E - ω L_z, L_z, τ = r (K (R - R0) - k R) and dE/dt = ω τ, from the rotating coordinates.
 
     h' is computed independently of E and L_z, as ½m(Ṙ² + ṙ²) + V - ½mω²(R² + r²).
@@ -126,7 +126,7 @@ def balance(params, q, v) -> Balance:
     V = 0.5 * K * (q["R"] - R0) ** 2 + 0.5 * k * q["r"] ** 2
     along, across = v["R"] - omega * q["r"], v["r"] + omega * q["R"]
     torque = q["r"] * (K * (q["R"] - R0) - k * q["R"])
-    return Balance(
+    return RailBalance(
         E=0.5 * m * (along**2 + across**2) + V,
         h=0.5 * m * (v["R"] ** 2 + v["r"] ** 2) + V - 0.5 * m * omega**2 * (q["R"] ** 2 + q["r"] ** 2),
         L_z=m * (q["R"] * across - q["r"] * along),
@@ -140,18 +140,18 @@ def equilibrium_length(params):
     return params["K"] * params["R0"] / (params["K"] - params["m"] * params["omega"] ** 2)
 
 
-class Squares(NamedTuple):
+class RailSquares(NamedTuple):
     """Squared frequencies of the two modes; a negative one is minus a squared growth rate."""
 
     fast: jax.Array
     slow: jax.Array
 
 
-def mode_squares(params) -> Squares:
+def mode_squares(params) -> RailSquares:
     """Ω² of both modes: the slow one as c / Ω_fast², so that it does not cancel near a critical speed."""
     half_sum, root, product = _characteristic(params)
     fast = half_sum + 0.5 * root
-    return Squares(fast=fast, slow=product / fast)
+    return RailSquares(fast=fast, slow=product / fast)
 
 
 def _characteristic(params):
@@ -351,7 +351,7 @@ def _map_case():
 
 def picture():
     """The carriage's path in the laboratory, and where the rails hold it."""
-    fig, axes = plot.figure(1, 2, size=(4.6, 4.0))
+    fig, axes = plots.figure(1, 2, size=(4.6, 4.0))
     _draw_path(axes[0, 0])
     _draw_map(axes[0, 1])
     return fig
@@ -364,9 +364,9 @@ def _draw_path(axis):
     exact, _ = to_lab(PARAMS, some, *exact_motion(PARAMS, Q0, V0, some))
     around = np.linspace(0.0, 2 * np.pi, 181)
     length = float(equilibrium_length(PARAMS))
-    axis.plot(length * np.cos(around), length * np.sin(around), label=r"$R_{eq}$", **plot.style(2))
-    axis.plot(path.q["x"], path.q["y"], label="integrated", **plot.style(0))
-    axis.plot(exact["x"], exact["y"], plot.MARKERS[0], color=plot.COLOURS[1], markersize=4, label="exact")
+    axis.plot(length * np.cos(around), length * np.sin(around), label=r"$R_{eq}$", **plots.style(2))
+    axis.plot(path.q["x"], path.q["y"], label="integrated", **plots.style(0))
+    axis.plot(exact["x"], exact["y"], plots.MARKERS[0], color=plots.COLOURS[1], markersize=4, label="exact")
     axis.set(xlabel="x", ylabel="y", title=r"Two turns in the laboratory, $\omega$ = 2.5", aspect="equal")
     axis.set(xlim=(-1.35, 1.35), ylim=(-1.35, 1.75))
     axis.legend(fontsize=8, frameon=False, loc="upper center", ncols=3)
@@ -376,18 +376,18 @@ def _draw_map(axis):
     """Regions by the verdict of normal modes, and the motions of 144 pairs of springs, integrated for 40 s."""
     low, high = 0.05, 20.0
     x, y = np.meshgrid(*2 * [np.geomspace(low, high, 60)])
-    axis.contourf(x, y, is_held(x, y), [0.5, 1.5], colors=[plot.COLOURS[2]], alpha=0.25)
+    axis.contourf(x, y, is_held(x, y), [0.5, 1.5], colors=[plots.COLOURS[2]], alpha=0.25)
     axis.axvline(1.0, color="black", linewidth=1)
     axis.axhline(1.0, color="black", linewidth=1)
     words = "stable", "stable,\ngyroscopic", "grows", "grows"
     for x, y, words in zip((0.11, 8.5, 0.11, 9.0), (0.5, 11.0, 9.0, 0.5), words):
-        axis.text(x, y, words, ha="center", va="center", fontsize=9, bbox=plot.ON_MARKS)
-    axis.text(1.0, 0.06, r"$\omega^2 = K/m$", fontsize=8, rotation=90, ha="center", va="bottom", bbox=plot.ON_MARKS)
-    axis.text(0.052, 1.0, r"$\omega^2 = k/m$", fontsize=8, va="center", bbox=plot.ON_MARKS)
+        axis.text(x, y, words, ha="center", va="center", fontsize=9, bbox=plots.ON_MARKS)
+    axis.text(1.0, 0.06, r"$\omega^2 = K/m$", fontsize=8, rotation=90, ha="center", va="bottom", bbox=plots.ON_MARKS)
+    axis.text(0.052, 1.0, r"$\omega^2 = k/m$", fontsize=8, va="center", bbox=plots.ON_MARKS)
     p, q, swept = _mapped()
     far = ~(swept.values < LEAVES)
-    axis.loglog(p[~far], q[~far], plot.MARKERS[0], color=plot.COLOURS[0], markersize=3, label="integrated: stays")
-    axis.loglog(p[far], q[far], plot.MARKERS[6], color=plot.COLOURS[1], markersize=4, label="integrated: leaves")
+    axis.loglog(p[~far], q[~far], plots.MARKERS[0], color=plots.COLOURS[0], markersize=3, label="integrated: stays")
+    axis.loglog(p[far], q[far], plots.MARKERS[6], color=plots.COLOURS[1], markersize=4, label="integrated: leaves")
     named = {"xlabel": r"$m\omega^2/K$", "ylabel": r"$m\omega^2/k$", "title": "Two critical speeds"}
     axis.set(xlim=(low, high), ylim=(low, high), **named)
     axis.legend(fontsize=8, framealpha=0.9, edgecolor="none", loc="lower right")

@@ -27,12 +27,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import plot
-from lagjax.analysis.symmetries import symmetries
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
+from lagjax.analysis.symmetry.search import symmetries
+from lagjax.display import plots
+from lagjax.integrate.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand, potentials
+from lagjax.system.system import System
 
 PARAMS = {
     "plane": {"G": 1.0, "sigma": 0.75},
@@ -357,12 +357,12 @@ def picture():
     """A generic orbit around the helix: conserved quantities and others."""
     orbit = helix_orbit(PARAMS["helix"])
     a, h = PARAMS["helix"]["a"], PARAMS["helix"]["h"]
-    fig, axes = plot.figure(1, 2, size=(4.6, 3.8))
+    fig, axes = plots.figure(1, 2, size=(4.6, 3.8))
     left, right = axes[0]
     low, high = float(jnp.min(orbit.q["z"])), float(jnp.max(orbit.q["z"]))
     z = np.linspace(low, high, 600)
     left.plot(a * np.cos(2 * np.pi * z / h), z, label="wire", color="0.6", linewidth=1.0)
-    left.plot(orbit.q["x"], orbit.q["z"], label="particle", **plot.style(0))
+    left.plot(orbit.q["x"], orbit.q["z"], label="particle", **plots.style(0))
     left.set(xlabel="x / a", ylabel="z / a", title="Around the helix")
     left.legend(fontsize=8, frameon=False, loc="upper left")
     found = charges_along("helix", orbit)
@@ -373,7 +373,7 @@ def picture():
         "h p_z + 2 pi L_z": "h p_z + 2π L_z",
     }
     for i, (key, label) in enumerate(shown.items()):
-        right.plot(orbit.t, found[key] - found[key][0], label=label, **plot.style(i))
+        right.plot(orbit.t, found[key] - found[key][0], label=label, **plots.style(i))
     right.set(xlabel="t", ylabel="change since t = 0", title="One combination is conserved")
     right.legend(fontsize=8, frameon=False)
     return fig

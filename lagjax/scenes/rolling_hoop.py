@@ -36,16 +36,16 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special
 
-from lagjax import plot
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.constraints import Holonomic, Nonholonomic
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.crossings import Crossing
-from lagjax.motion.integrate import integrate
-from lagjax.motion.results import RESULTS
+from lagjax.display import plots
+from lagjax.integrate.events.event import Crossing
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
+from lagjax.system.constraints import Holonomic, Nonholonomic
+from lagjax.system.system import System
 
 PARAMS = {"m": 1.25, "R": 1.0, "a": 0.25, "g": 9.8125, "beta": 1.0}
 TOP = np.pi / 2
@@ -348,7 +348,7 @@ def _hundred_swings():
 
 def picture():
     """The path of the hoop, and why it leaves: the normal force of five bodies, and the friction that rolling needs."""
-    fig, axes = plot.figure(1, 2, size=(4.9, 4.0))
+    fig, axes = plots.figure(1, 2, size=(4.9, 4.0))
     _draw_path(axes[0, 0])
     axis, weight = axes[0, 1], PARAMS["m"] * PARAMS["g"]
     theta = np.linspace(TOP, np.radians(15.0), 151)
@@ -356,9 +356,9 @@ def picture():
         params = PARAMS | {"beta": beta}
         leaves = np.degrees(np.arcsin(departure_sine(params, TOP)))
         force = exact_multipliers(params, theta, TOP).contact / weight
-        axis.plot(np.degrees(theta), force, label=f"{name}, leaves at {leaves:.1f}°", **plot.style(i))
+        axis.plot(np.degrees(theta), force, label=f"{name}, leaves at {leaves:.1f}°", **plots.style(i))
     friction = exact_multipliers(PARAMS, theta, TOP).rolling / weight
-    axis.plot(np.degrees(theta), friction, label="friction on the hoop", **plot.style(5))
+    axis.plot(np.degrees(theta), friction, label="friction on the hoop", **plots.style(5))
     axis.axhline(0.0, color="black", linewidth=0.8)
     axis.set(xlabel="θ / degrees", ylabel="force / (m g)", title="The multipliers, from rest at the top")
     axis.invert_xaxis()
@@ -377,12 +377,12 @@ def _draw_path(axis):
     axis.fill(np.cos(around), np.sin(around), facecolor="0.85", edgecolor="0.4")
     left = leaving(PARAMS, theta0)
     fall = flight(PARAMS, left, np.linspace(0.0, float(time_to_floor(PARAMS, left)), 31))
-    axis.plot(l * np.cos(theta), l * np.sin(theta), label="rolling", **plot.style(0))
-    axis.plot(fall.x, fall.y, label="flight", **plot.style(1))
+    axis.plot(l * np.cos(theta), l * np.sin(theta), label="rolling", **plots.style(0))
+    axis.plot(fall.x, fall.y, label="flight", **plots.style(1))
     hoops = [(l * np.cos(x), l * np.sin(x), 0) for x in theta[:-1:7]]
     hoops += [(fall.x[i], fall.y[i], 1) for i in (0, 15, 30)]
     for x, y, i in hoops:
-        axis.plot(x + a * np.cos(around), y + a * np.sin(around), color=plot.COLOURS[i], linewidth=0.9)
+        axis.plot(x + a * np.cos(around), y + a * np.sin(around), color=plots.COLOURS[i], linewidth=0.9)
     axis.axhline(-1.0, color="0.4")
     axis.set(xlabel="x", ylabel="y", title=f"Leaves at t = {time:.4f}", aspect="equal", xlim=(-1.1, 2.1))
     axis.legend(fontsize=8, frameon=False)

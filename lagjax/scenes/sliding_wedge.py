@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import plot
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
+from lagjax.display import plots
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
-from lagjax.sweeps import sweep
+from lagjax.sweep import sweep
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"m": 1.5, "M": 4.0, "alpha": 0.5, "g": 9.8125}
 Q0 = {"X": 0.0, "x": 0.0, "y": 0.0}
@@ -174,15 +174,15 @@ def picture():
     """Accelerations over sixteen decades of the mass ratio: who moves, and how much."""
     ratios = np.logspace(-8, 8, 161)
     a = over_mass_ratios(ratios).values
-    fig, axes = plot.figure(1, 2, size=(4.6, 3.4))
+    fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     g = PARAMS["g"]
     for i, (label, values) in enumerate({"particle, x": a["x"], "particle, y": a["y"], "wedge, X": a["X"]}.items()):
-        axes[0, 0].semilogx(ratios, values / g, label=label, **plot.style(i))
+        axes[0, 0].semilogx(ratios, values / g, label=label, **plots.style(i))
     axes[0, 0].set(xlabel="m / M", ylabel="acceleration / g", title="Who moves")
     axes[0, 0].legend(fontsize=8, frameon=False)
     some, angles = (0.01, 0.375, 10.0, 1000.0), np.linspace(0.0, np.pi / 2, 91)
     for i, (ratio, force) in enumerate(zip(some, _normal_forces(np.array(some), angles))):
-        axes[0, 1].plot(np.degrees(angles), force / (PARAMS["m"] * g), label=f"m/M = {ratio:g}", **plot.style(i))
+        axes[0, 1].plot(np.degrees(angles), force / (PARAMS["m"] * g), label=f"m/M = {ratio:g}", **plots.style(i))
     axes[0, 1].set(xlabel="angle of the incline / degrees", ylabel="normal force / (m g)", title="The multiplier")
     axes[0, 1].legend(fontsize=8, frameon=False)
     return fig

@@ -20,16 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
-from lagjax import plot
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.hybrid import Hybrid, Switch
-from lagjax.mechanics.system import System
-from lagjax.motion.contacts import releases, slips, sticks, touches
-from lagjax.motion.hybrid_trajectory import HybridTrajectory
-from lagjax.motion.integrate import integrate
+from lagjax.display import plots
+from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.report import Case, Scene, relative_error
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling
+from lagjax.system.constraints import Holonomic
+from lagjax.system.hybrid import Hybrid, Switch
+from lagjax.system.system import System
 
 PARAMS = rolling_hoop.PARAMS | {"mu": 0.25}
 # The angle at which a motion from rest at the top is started: at the top itself it would stay.
@@ -154,7 +154,7 @@ def _too_little_to_roll():
 
 def picture():
     """The angles of slipping and leaving over the friction coefficient, and how near to rolling the hoop still is."""
-    fig, axes = plot.figure(1, 2, size=(4.9, 3.8))
+    fig, axes = plots.figure(1, 2, size=(4.9, 3.8))
     lines, marks = np.geomspace(0.05, 20.0, 121), 2.0 ** np.arange(-4.0, 4.1, 0.5)
     curves, points = (
         Friction(*map(np.array, zip(*(function(PARAMS | {"mu": mu}) for mu in many))))
@@ -162,7 +162,7 @@ def picture():
     )
     left, right = axes[0]
     for i, name in enumerate(("slips", "leaves")):
-        left.semilogx(lines, np.degrees(getattr(curves, name)), label=f"{name}, closed form", **plot.style(i))
+        left.semilogx(lines, np.degrees(getattr(curves, name)), label=f"{name}, closed form", **plots.style(i))
         left.semilogx(marks, np.degrees(getattr(points, name)), "o", color="black", markersize=4)
     for level, x, y, words in ((30.0, 0.06, 28.0, "friction without bound: 30°"), (41.81, 3.0, 42.6, "none: 41.81°")):
         left.axhline(level, color="0.5", linewidth=0.8)
@@ -170,7 +170,7 @@ def picture():
     left.set(xlabel="coefficient of friction μ", ylabel="θ / degrees", title="It slips, and then leaves", ylim=(26, 88))
     left.legend(fontsize=8, frameon=False)
     a = PARAMS["a"]
-    right.semilogx(lines, a * curves.spin / curves.speed, label="closed form", **plot.style(0))
+    right.semilogx(lines, a * curves.spin / curves.speed, label="closed form", **plots.style(0))
     right.semilogx(marks, a * points.spin / points.speed, "o", color="black", markersize=4, label="integrated")
     right.set(
         xlabel="coefficient of friction μ", ylabel="a φ' / speed", title="How it turns when it leaves: 1 is rolling"

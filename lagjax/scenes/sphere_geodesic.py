@@ -32,14 +32,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax import plot
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
+from lagjax.display import plots
+from lagjax.integrate.integrate import integrate
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 PARAMS = {"R": 2.5}
 # The end points of the generic arc: ψ₁, θ₁, ψ₂, θ₂.
@@ -352,15 +352,15 @@ def _thousand_turns():
 
 def picture():
     """Integrated great circles over the azimuth, and the saddle of an arc longer than half a turn."""
-    fig, axes = plot.figure(1, 2, size=(4.8, 3.6))
+    fig, axes = plots.figure(1, 2, size=(4.8, 3.6))
     axis, theta = axes[0, 0], np.linspace(-np.pi, np.pi, 25)
     fine = np.linspace(-np.pi, np.pi, 361)
     for i, inclination in enumerate((20.0, 45.0, 60.0, 80.0)):
         A = float(np.tan(np.radians(inclination)))
         q0, v0 = map(float, exact_over_azimuth(A, 0.0, theta[0]))
         path = integrate(over_azimuth, q0, v0, PARAMS, ts=theta, rtol=1e-9, atol=1e-9)
-        axis.plot(np.degrees(fine), np.degrees(exact_over_azimuth(A, 0.0, fine)[0]), **plot.style(i))
-        marks = {"color": plot.COLOURS[i], "marker": plot.MARKERS[i], "markersize": 4, "linestyle": ""}
+        axis.plot(np.degrees(fine), np.degrees(exact_over_azimuth(A, 0.0, fine)[0]), **plots.style(i))
+        marks = {"color": plots.COLOURS[i], "marker": plots.MARKERS[i], "markersize": 4, "linestyle": ""}
         axis.plot(np.degrees(theta), np.degrees(path.q), label=f"{inclination:.0f}°, A² + B² = {A**2:.2g}", **marks)
     axis.set(xlabel="azimuth θ / degrees", ylabel="colatitude ψ / degrees", title="Integrated, on cot ψ = A cos θ")
     axis.set_xticks(range(-180, 181, 90))
@@ -370,7 +370,7 @@ def picture():
     minor = float(great_circle(*WIDE).angle)
     for i, (name, angle) in enumerate((("minor", minor), ("half turn", np.pi), ("major", 2 * np.pi - minor))):
         change = jax.vmap(lambda x: varied_length(angle, x))(amplitude) - angle
-        axis.plot(amplitude, change, label=f"{name}, {np.degrees(angle):.0f}°", **plot.style(i))
+        axis.plot(amplitude, change, label=f"{name}, {np.degrees(angle):.0f}°", **plots.style(i))
     axis.set(xlabel="sideways displacement / R", ylabel="change of length / R", title="Stationary, not always shortest")
     axis.legend(fontsize=8, frameon=False)
     return fig

@@ -9,8 +9,8 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.system import System
 from lagjax.stability.trial import DEGRADED, REDUCED, Trial
+from lagjax.system.system import System
 
 
 def attracted(t, q, v, params):

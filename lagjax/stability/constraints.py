@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.constraints import Holonomic
-from lagjax.mechanics.system import System
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.trial import REFUSED, Trial, by_parameter
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 
 
 def free_fall(t, q, v, params):

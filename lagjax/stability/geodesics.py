@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.system import System
 from lagjax.scenes import sphere_geodesic
 from lagjax.stability.trial import FULL, REDUCED, REFUSED, Trial, zeros
+from lagjax.system.system import System
 
 
 def angles_lagrangian(t, q, v, params):

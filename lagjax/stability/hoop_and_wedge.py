@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.numerics.runge_kutta import Dopri8
+from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.scenes import bead_on_hoop, sliding_wedge
-from lagjax.scenes.elliptic import jacobi_elliptic
+from lagjax.scenes.potentials import jacobi_elliptic
 from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
 
 

@@ -4,10 +4,10 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.system import System
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.hoop_and_wedge import by_both, swing
 from lagjax.stability.trial import DEGRADED, REDUCED, REFUSED, Trial
+from lagjax.system.system import System
 
 
 def pendulum(t, q, v, params):

@@ -12,9 +12,9 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
+from lagjax.integrate.integrate import integrate
 from lagjax.stability.trial import ACCURATE, FULL, Outcome
+from lagjax.system.system import System
 
 # A step is stable if the amplitude grows by less than GROWTH in STEPS steps; |R| of Dopri8 crosses 1 steeply.
 STEPS, GROWTH = 4000, 1.01

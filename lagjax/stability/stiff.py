@@ -4,13 +4,13 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.system import System
 from lagjax.mechanisms import car_axis, governor
-from lagjax.numerics.radau import Radau5
-from lagjax.numerics.runge_kutta import Dopri8
+from lagjax.numerics.methods.radau import Radau5
+from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, FULL, REDUCED, REFUSED, Trial, zeros
+from lagjax.system import coordinates
+from lagjax.system.system import System
 
 
 def spring(t, q, v, params):

@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.comparison.tables import table
-from lagjax.mechanics import coordinates
-from lagjax.mechanics.compiled import compiled
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
-from lagjax.motion.trajectory import Trajectory
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.compiled import compiled
 from lagjax.report import relative_error
+from lagjax.system import coordinates
+from lagjax.system.system import System
+from lagjax.work_precision.result import table
 
 PER_PERIOD = 100.0
 # A result with fewer than two correct digits is never accurate, whatever the tolerance.

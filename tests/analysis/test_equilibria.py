@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.found_equilibria import NO_BALANCE, NOT_FINITE, NOT_LASTING
+from lagjax.analysis.equilibria.result import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (
@@ -184,7 +184,7 @@ def test_sleeping_top():
 @pytest.mark.exhaustive
 def test_governor():
     """The balls' moment about a hinge vanishes, from the equilibrium of one rod and the slider, written by hand."""
-    parts, p, rate = governor.Parts, governor.PARAMS, governor.RATE
+    parts, p, rate = governor.GovernorParts, governor.PARAMS, governor.RATE
 
     def turn(q, params):
         around = lambda r: jnp.stack([-r[1], r[0], 0 * r[2]])

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates, equations, sparse_plan
+from lagjax.mechanics import equations, sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import Dense
 from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 from tests.large_systems import chain
 from tests.plain import not_plain
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
@@ -21,10 +23,10 @@ SYSTEM, Q, V, OF_CHAIN = chain(2)
 def in_three_ways(monkeypatch):
     """The equations of the chain in one matrix, as a band, and number by number; and its state."""
     s = coordinates.state(0.0, Q, V, OF_CHAIN)
-    dense, written = equations_of(SYSTEM, *s), equations_of(SYSTEM, *s, fast=True, fallback=False)
-    monkeypatch.setattr(sparse_plan, "UNKNOWNS_AT_LEAST", 2)
-    monkeypatch.setattr(sparse_plan, "BAND_AT_MOST", 1.0)
-    banded = equations_of(SYSTEM, *s)
+    dense, written = equations_of(model_of(SYSTEM, *s)), equations_of(model_of(SYSTEM, *s), fast=True, fallback=False)
+    monkeypatch.setattr(sparse_saddle_point, "UNKNOWNS_AT_LEAST", 2)
+    monkeypatch.setattr(sparse_saddle_point, "BAND_AT_MOST", 1.0)
+    banded = equations_of(model_of(SYSTEM, *s))
     assert isinstance(dense.form, Dense) and isinstance(banded.form, Banded)
     assert written.are_taken_for_regular and not dense.are_written
     return dense, banded, written, s
@@ -68,7 +70,7 @@ def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     same = lambda t, q, params: jnp.stack([q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2] * 2)
     twice = lj.System(rod_pendulum.lagrangian, {"rod": lj.Holonomic(same)})
     s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
-    robust, regular = (equations_of(twice, *s, fast=True, fallback=fallback) for fallback in (True, False))
+    robust, regular = (equations_of(model_of(twice, *s), fast=True, fallback=fallback) for fallback in (True, False))
     numbers = s.t, robust.inside(s.q), robust.inside(s.v)
     of = lambda one: jax.jit(lambda t, q, v: (one.rates(t, q, v), one.verdict(t, q, v).finite))(*numbers)
     ((a, multipliers), finite), ((unknown, _), nowhere) = of(robust), of(regular)
@@ -86,7 +88,7 @@ def test_equations_are_written_out_once_for_all_traces():
 
     def put_down(x):
         q = {"x": x, "y": s.q["y"]}
-        written.append(equations_of(rod_pendulum, s.t, q, s.v, s.params, fast=True).written)
+        written.append(equations_of(model_of(rod_pendulum, s.t, q, s.v, s.params), fast=True).written)
         return x
 
     x = s.q["x"]
@@ -95,7 +97,7 @@ def test_equations_are_written_out_once_for_all_traces():
     jax.make_jaxpr(jax.vmap(put_down))(x[None])
     assert len({id(found) for found in written}) == 1 and written[0] is not None
     another = lj.System(lambda *state: 2.0 * rod_pendulum.lagrangian(*state), rod_pendulum.constraints)
-    assert equations_of(another, *s, fast=True).written is not written[0]
+    assert equations_of(model_of(another, *s), fast=True).written is not written[0]
 
 
 @pytest.mark.parametrize("change", ["closed over", "given"])

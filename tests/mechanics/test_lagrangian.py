@@ -8,13 +8,14 @@ import pytest
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.equations import equations_of
+from lagjax.system.model import model_of
 
 rng = np.random.default_rng(20)
 
 
 def a_of(system, t, q, v, params):
     """The accelerations of an unconstrained system."""
-    return equations_of(system, t, q, v, params).accelerations(t, q, v)[0]
+    return equations_of(model_of(system, t, q, v, params)).accelerations(t, q, v)[0]
 
 
 def double_pendulum(t, q, v, params):

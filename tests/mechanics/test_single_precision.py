@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates, single_precision
+from lagjax.system import coordinates
 
 free = lj.System(lambda t, q, v, params: 0.5 * v**2)
 TS = np.linspace(0.0, 1.0, 2)
@@ -21,7 +21,7 @@ TS = np.linspace(0.0, 1.0, 2)
 @pytest.fixture
 def untold(monkeypatch):
     """A process without x64 in which nothing has warned yet."""
-    monkeypatch.setattr(single_precision, "_settled", [])
+    monkeypatch.setattr(coordinates, "_settled", [])
     with jax.enable_x64(False):
         yield
 
@@ -40,7 +40,7 @@ def test_told_once(untold, number):
     for count in (1, 0):
         found = told(lambda: coordinates.state(0.0, number, number, None))
         assert [kind for kind, *_ in found] == [lj.PrecisionWarning] * count
-    single_precision._settled.clear()
+    coordinates._settled.clear()
     with pytest.warns(lj.PrecisionWarning, match=r'(?s)1e-7.*Fix: jax.config.update\("jax_enable_x64", True\) before'):
         coordinates.state(0.0, number, number, None)
 
@@ -55,7 +55,7 @@ def test_not_told_where_it_is_meant(untold, number):
 
 def test_not_told_with_x64(monkeypatch):
     """Twin: with x64 nothing warns, not even float32."""
-    monkeypatch.setattr(single_precision, "_settled", [])
+    monkeypatch.setattr(coordinates, "_settled", [])
     assert told(lambda: [coordinates.state(0.0, x, x, None) for x in (1.0, jnp.float32(1.0))]) == []
 
 

@@ -7,19 +7,21 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
-from lagjax.mechanics import constraints, coordinates, sparse_plan
+from lagjax.mechanics import sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.system import constraints, coordinates
+from lagjax.system.model import model_of
 from tests.large_systems import bars, chain, links, loop, net, particles
 
 
 def dense_equations(system, q, v, params):
     """M, F, A and gamma as arrays."""
     t, q, v, params = coordinates.state(0.0, q, v, params)
-    x, unflatten = coordinates.flatten(q)
-    u, _ = coordinates.flatten(v)
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    return (linear.mass, linear.forcing, *constraints.acceleration_rows(system, t, x, u, params, unflatten))
+    model = model_of(system, t, q, v, params)
+    x, u = model.vectors(q, v)
+    linear = mass_and_forcing(model, t, x, u)
+    return (linear.mass, linear.forcing, *constraints.acceleration_rows(model, t, x, u))
 
 
 def dense_solution(system, q, v, params):
@@ -42,7 +44,7 @@ def of_library(system, q, v, params):
 
 def planned(system, q, v, params):
     """The plan for a system; None if it is solved densely."""
-    return sparse_plan.plan(system, *coordinates.state(0.0, q, v, params))
+    return sparse_saddle_point.plan(model_of(system, *coordinates.state(0.0, q, v, params)))
 
 
 def with_masses(masses):
@@ -133,7 +135,7 @@ def acceleration(system, q, v):
 
     def sparse(params):
         state = jnp.asarray(0.0), q, v
-        a, multipliers = equations_of(system, *state, params).accelerations(*state)
+        a, multipliers = equations_of(model_of(system, *state, params)).accelerations(*state)
         return jnp.concatenate([a.ravel(), multipliers["links"]])
 
     def dense(params):
@@ -185,7 +187,7 @@ def largest_array(function, *args):
 def running(system, q, v, params):
     """One evaluation of the equations of motion, and its arguments."""
     s = coordinates.state(0.0, q, v, params)
-    return lambda t, q, v, params: equations_of(system, t, q, v, params).accelerations(t, q, v), *s
+    return lambda t, q, v, params: equations_of(model_of(system, t, q, v, params)).accelerations(t, q, v), *s
 
 
 def test_nothing_dense_is_formed():

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import coordinates
 from lagjax.mechanics.structure import angles, conserves_jacobi_integral, is_diagonal, structure
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 from tests.plain import not_plain
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
@@ -31,7 +32,7 @@ def test_angles(potential, found):
     """A coordinate is an angle if it occurs only inside sines and cosines."""
     system = lj.System(lambda t, q, v, params: free(t, q, v, params) - potential(q))
     s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, None)
-    assert tuple(angles(system, *s).values()) == found
+    assert tuple(angles(model_of(system, *s)).values()) == found
 
 
 def test_constraints_and_forces_count():
@@ -40,24 +41,24 @@ def test_constraints_and_forces_count():
     s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, None)
     gear = {"gear": lj.Holonomic(lambda t, q, params: q["a"] - 2 * q["b"])}
     spring = lambda t, q, v, params: {"a": -q["a"], "b": jnp.zeros(())}
-    assert tuple(angles(lj.System(turning), *s).values()) == (True, True)
-    assert tuple(angles(lj.System(turning, gear), *s).values()) == (False, False)
-    assert tuple(angles(lj.System(turning, force=spring), *s).values()) == (False, True)
+    assert tuple(angles(model_of(lj.System(turning), *s)).values()) == (True, True)
+    assert tuple(angles(model_of(lj.System(turning, gear), *s)).values()) == (False, False)
+    assert tuple(angles(model_of(lj.System(turning, force=spring), *s)).values()) == (False, True)
 
 
 def test_vectors_of_angles():
     """A chain's vector of angles is one leaf, taken as a whole."""
     chain = lambda t, q, v, params: 0.5 * v @ v + jnp.sum(jnp.cos(q[:, None] - q[None, :])) + jnp.cos(q).sum()
     s = coordinates.state(0.0, np.zeros(4), np.zeros(4), None)
-    assert angles(lj.System(chain), *s) is True
+    assert angles(model_of(lj.System(chain), *s)) is True
     mixed = lambda t, q, v, params: 0.5 * v @ v + jnp.cos(q[0]) - q[1] ** 2
-    assert angles(lj.System(mixed), *s) is False
+    assert angles(model_of(lj.System(mixed), *s)) is False
 
 
 def test_conserved_jacobi_integral():
     """Explicit time in L or a constraint, a force, dissipation or a velocity constraint each take it away."""
     s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, {"k": 1.0})
-    known = lambda **parts: conserves_jacobi_integral(lj.System(**({"lagrangian": free} | parts)), *s)
+    known = lambda **parts: conserves_jacobi_integral(model_of(lj.System(**({"lagrangian": free} | parts)), *s))
     fixed, moving = (lj.Holonomic(lambda t, q, params, rate=rate: q["a"] - q["b"] * (1 + rate * t)) for rate in (0, 1))
     assert known() and known(constraints={"fixed": lj.Holonomic(lambda t, q, params: q["a"] - q["b"])})
     assert not known(lagrangian=lambda t, q, v, params: free(t, q, v, params) * jnp.cos(t))
@@ -72,7 +73,7 @@ def test_conserved_jacobi_integral():
 def of(lagrangian, q, constraints=None, **functions):
     """The structure at some state."""
     s = coordinates.state(0.3, q, jnp.ones_like(q), None)
-    return structure(lj.System(lagrangian, constraints, **functions), *s)
+    return structure(model_of(lj.System(lagrangian, constraints, **functions), *s))
 
 
 def test_mass_matrix():
@@ -133,7 +134,7 @@ def test_a_long_program_is_not_taken_apart(nodes, known):
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(angles)) ** 2 + (q[1] - jnp.sin(angles)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + q[0] * v[1] * wire(q))
     s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.ones(3), None)
-    assert (structure(system, *s) is not None) == known
+    assert (structure(model_of(system, *s)) is not None) == known
     report = dict(lj.explain(system, *s[:3]).rows)
     assert report["mass matrix"] == "positive definite" + ", diagonal, constant" * known
     assert report["solved"] == ("3 divisions before the loop" if known else "3 equations by elimination")
@@ -152,4 +153,4 @@ def test_a_long_mass_matrix_is_not_known_to_be_diagonal():
         return lj.System(lagrangian)
 
     s = coordinates.state(0.0, np.ones(2), np.ones(2), None)
-    assert is_diagonal(of(4), *s) and not is_diagonal(of(500), *s)
+    assert is_diagonal(model_of(of(4), *s)) and not is_diagonal(model_of(of(500), *s))

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.mechanics import constraints, coordinates
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanisms import MECHANISMS, andrews, car_axis
+from lagjax.system import constraints, coordinates
+from lagjax.system.model import model_of
 from tests.mechanisms import published
 
 
@@ -20,9 +21,9 @@ def stacked(tree):
 @eqx.filter_jit
 def matrices(system, t, q, v, params):
     """M, F, A and gamma from lagjax."""
-    (x, unflatten), (u, _) = coordinates.flatten(q), coordinates.flatten(v)
-    linear = mass_and_forcing(system, t, x, u, params, unflatten)
-    rows = constraints.acceleration_rows(system, t, x, u, params, unflatten)
+    model = model_of(system, t, q, v, params)
+    x, u = model.vectors(q, v)
+    linear, rows = mass_and_forcing(model, t, x, u), constraints.acceleration_rows(model, t, x, u)
     return linear.mass, linear.forcing, rows.jacobian, rows.gamma
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from lagjax.mechanics.constraints import Holonomic
 from lagjax.mechanisms import (
     andrews,
     bricard,
@@ -17,6 +16,7 @@ from lagjax.mechanisms import (
     n_four_bar,
     slider_crank,
 )
+from lagjax.system.constraints import Holonomic
 from tests.mechanisms import published
 from tests.mechanisms.test_equations import stacked
 

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax.numerics.dense import Saddle
+from lagjax.numerics.linalg.dense import Saddle
 
 
 @jax.jit

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import special
 
-from lagjax.mechanics.constraints import Holonomic
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, momentum
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
 from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
-from lagjax.scenes.elliptic import agm, jacobi_elliptic
+from lagjax.scenes.potentials import agm, jacobi_elliptic
+from lagjax.system.constraints import Holonomic
+from lagjax.system.system import System
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 

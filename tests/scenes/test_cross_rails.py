@@ -6,12 +6,12 @@ import mpmath
 import numpy as np
 import pytest
 
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, momentum
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.mechanics.system import System
-from lagjax.motion.integrate import integrate
 from lagjax.report import relative_error
 from lagjax.scenes import cross_rails as scene
+from lagjax.system.system import System
 from tests.references import keys, reference
 
 PARAMS, Q0, V0 = scene.PARAMS, scene.Q0, scene.V0

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from lagjax.motion.integrate import integrate
+from lagjax.integrate.integrate import integrate
 from lagjax.report import relative_error
 from lagjax.scenes import mass_distributions as scene
 from lagjax.scenes import potentials

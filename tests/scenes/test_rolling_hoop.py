@@ -7,8 +7,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.motion.integrate import integrate
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.scenes import rolling_hoop as hoop
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but

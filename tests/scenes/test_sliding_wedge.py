@@ -10,6 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.mechanics.equations import equations_of
 from lagjax.scenes import sliding_wedge as wedge
+from lagjax.system.model import model_of
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 
@@ -32,7 +33,7 @@ NOT_AT_1E_12 = {"alpha=pi/2-2^-30 (exact real)": 2e-7}
 def at_the_start(params):
     """Accelerations and multipliers at the start."""
     start = 0.0, wedge.Q0, wedge.V0
-    return equations_of(wedge.system, *start, params).accelerations(*start)
+    return equations_of(model_of(wedge.system, *start, params)).accelerations(*start)
 
 
 @pytest.fixture(scope="module")

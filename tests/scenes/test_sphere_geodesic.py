@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lagjax.integrate.integrate import integrate
+from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix
-from lagjax.mechanics.multipliers import accelerations
-from lagjax.motion.integrate import integrate
 from lagjax.scenes import sphere_geodesic as geodesic
 from tests.references import keys, reference, reference_inputs
 

@@ -1,0 +1,364 @@
+"""Critical points between two points of a branch: solved by Newton's method, classified, with their derivatives.
+
+The extended systems are those of `equilibrium_equations.py`. At a branch point the two directions are the roots of the
+algebraic bifurcation equation: with b₁, b₂ a basis of the null space of `(E_y, E_μ)`, and τ = α b₁ + β b₂,
+
+    ψ·D²E[τ, τ] = a α² + 2 b α β + c β² = 0
+
+If one of them leaves the parameter constant (τ_μ = 0), the point is a pitchfork or a line of equilibria; otherwise it
+is transcritical.
+
+Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.20-5.26; Govaerts, ch. 3.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.analysis.continuation.arclength import BranchPoint
+from lagjax.analysis.continuation.equilibrium_equations import (  # fmt: skip
+    BRANCH,
+    COLLISION,
+    ESCAPE,
+    FLUTTER,
+    FOLD,
+    MULTIPLE,
+    SteadyTracer,
+    curvature,
+    dynamic_at,
+    extended_at,
+    extended_by_params,
+)
+
+NEWTON = 12
+# A direction whose component along the parameter is smaller leaves the parameter constant.
+ACROSS = 1e-5
+# Changes of the parameter below this fraction of its range count as none.
+CONSTANT = 1e-9
+# Branches meet where the unfolding β of a branch point is smaller; the equations are scaled to order one.
+MEETS = 1e-8
+
+
+@dataclass
+class CriticalPoint:
+    """A critical point: its kind, z, the tangents of crossing branches, a frequency, the parameter's derivatives."""
+
+    kind: str
+    z: np.ndarray
+    directions: list[np.ndarray]
+    frequency: float
+    derivative: Any
+    accuracy: float
+    used: list[np.ndarray]
+
+
+def between(tracer: SteadyTracer, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
+    """All critical points between two neighbouring points of a branch."""
+    found = []
+    if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
+        # On a line of equilibria only round-off changes.
+        return []
+    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
+    if crosses and (point := _branch_point(tracer, a, b)):
+        found.append(point)
+    if folds and not found and (point := _fold(tracer, a, b)):
+        found.append(point)
+    known = a.growing is not None and b.growing is not None
+    if known and a.growing != b.growing and not found and (point := _loses_stability(tracer, a, b)):
+        found.append(point)
+    if not found and (a.negative - b.negative) % 2 == 0 and a.negative != b.negative:
+        point = _multiple_zero(tracer, *_halved(tracer, a, b, lambda p: p.negative))
+        found += [point] if point else []
+    return found
+
+
+def _halved(tracer, a, b, count_of):
+    """Bisect a branch between a and b, where a count changes: two points much nearer to the change."""
+    low, high, left, right = 0.0, 1.0, a, b
+    for _ in range(14):
+        share = 0.5 * (low + high)
+        middle = tracer.between(a, b, share)
+        if middle is None or count_of(middle) is None:
+            break
+        if count_of(middle) == count_of(left):
+            low, left = share, middle
+        else:
+            high, right = share, middle
+    return left, right
+
+
+def _null_vectors(jacobian):
+    """Approximate left and right null vectors of E_y."""
+    u, _, vt = np.linalg.svd(jacobian[:, :-1])
+    return u[:, -1], vt[-1]
+
+
+def _guess_between(tracer, a, b, share):
+    """A first guess for z between two points."""
+    share = float(np.clip(share, 0.02, 0.98))
+    point = tracer.between(a, b, share)
+    return point.z if point else a.z + share * (b.z - a.z)
+
+
+def _inside(tracer, a, b, z):
+    """Whether a solution lies between the points, or nearly so."""
+    step = b.z - a.z
+    length = np.sqrt(tracer.weights @ step**2)
+    share = (tracer.weights * step) @ (z - a.z) / length**2
+    aside = z - a.z - share * step
+    return -0.2 < share < 1.2 and np.sqrt(tracer.weights @ aside**2) < 0.5 * length
+
+
+def _branch_point(tracer, a, b):
+    sizes = [np.linalg.slogdet(np.concatenate([p.jacobian, (tracer.weights * p.tangent)[None]]))[1] for p in (a, b)]
+    share = 1 / (1 + np.exp(np.clip(sizes[1] - sizes[0], -50, 50)))
+    z = _guess_between(tracer, a, b, share)
+    psi, _ = _null_vectors(tracer.at(z)[1])
+    big = _newton(tracer, BRANCH, np.concatenate([z, psi, [0.0]]), np.zeros(1))
+    if big is None or not _inside(tracer, a, b, big[0][: z.size]):
+        return None
+    big, accuracy = big
+    if abs(big[-1]) > MEETS:
+        return None
+    directions = _directions(tracer, big)
+    if not directions:
+        return None
+    kind = "pitchfork" if any(abs(t[-1]) < ACROSS for t in directions) else "transcritical"
+    return CriticalPoint(
+        kind, big[: z.size], directions, 0.0, _derivative(tracer, BRANCH, big, np.zeros(1)), accuracy, []
+    )
+
+
+def _directions(tracer, big):
+    """The unit tangents of both branches through a branch point."""
+    n = tracer.frame.columns.size
+    z, psi = big[: n + 1], big[n + 1 : 2 * n + 1]
+    jacobian = tracer.at(z)[1]
+    basis = np.linalg.svd(jacobian)[2][-2:]
+    form = lambda i, j: float(psi @ np.asarray(_curvature(tracer, z, basis[i], basis[j])))
+    a, b, c = form(0, 0), form(0, 1), form(1, 1)
+    disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
+    if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
+        return []
+    # This form gives both roots without cancellation.
+    root = -(b + np.copysign(np.sqrt(disc), b))
+    pairs = [(root, a), (c, root)]
+    tangents = []
+    for alpha, beta in pairs:
+        t = alpha * basis[0] + beta * basis[1]
+        tangents.append(t / np.sqrt(tracer.weights @ t**2))
+    return tangents
+
+
+def _curvature(tracer, z, a, b):
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    return curvature(tracer.frame, cast(z), cast(a), cast(b))
+
+
+def _fold(tracer, a, b):
+    share = a.tangent[-1] / (a.tangent[-1] - b.tangent[-1])
+    z = _guess_between(tracer, a, b, share)
+    psi, phi = _null_vectors(tracer.at(z)[1])
+    solved = _newton(tracer, FOLD, np.concatenate([z, psi]), np.zeros(1))
+    if solved is None or not _inside(tracer, a, b, solved[0][: z.size]):
+        return None
+    big, accuracy = solved
+    return CriticalPoint("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
+
+
+def escape(tracer: SteadyTracer, point: BranchPoint) -> CriticalPoint | None:
+    """The critical point where the solution of linear equations goes to infinity, from a point far out."""
+    n = tracer.frame.columns.size
+    half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]
+    half[:n] *= 0.5
+    # The equations are linear if the Jacobian is the same halfway.
+    if np.max(np.abs(tracer.at(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
+        return None
+    psi = np.linalg.svd(here)[0][:, -1]
+    guide = np.append(np.zeros(n), 0.0)
+    start = np.concatenate([np.zeros(n), point.z[-1:], psi])
+    solved = _newton(tracer, ESCAPE, start, guide)
+    if solved is None:
+        return None
+    big, accuracy = solved
+    z = np.concatenate([point.z[:n], big[n : n + 1]])
+    return CriticalPoint("escape", z, [], 0.0, _derivative(tracer, ESCAPE, big, guide), accuracy, [])
+
+
+def _loses_stability(tracer, a, b):
+    """Where the number of growing roots changes without a crossing branch or a fold: flutter, or several zeros."""
+    left, right = _halved(tracer, a, b, lambda p: p.growing)
+    few, many = (left, right) if left.growing < right.growing else (right, left)
+    root = _newly_growing_root(few, many)
+    size = np.nanmax(np.abs(many.outputs[-1]))
+    if abs(root.imag) < 1e-3 * abs(size) and abs(root.imag) <= 30 * abs(root.real):
+        return _multiple_zero(tracer, few, many) or _divergence(tracer, a, b, few, many)
+    return _flutter(tracer, few, many, root)
+
+
+def _newly_growing_root(few, many):
+    """The root that grows at `many` but not at `few`."""
+    known = many.outputs[-1][np.isfinite(many.outputs[-1])]
+    grows = known[np.argsort(-known.real)][: many.growing]
+    # Of several growing roots the slowest is the one that has just begun to grow.
+    root = grows[np.argmin(grows.real)]
+    return complex(root.real, abs(root.imag))
+
+
+def _multiple_zero(tracer, few, many):
+    z, n = few.z, tracer.frame.columns.size
+    _, phi = _null_vectors(few.jacobian)
+    solved = _newton(tracer, MULTIPLE, np.concatenate([z, phi]), phi)
+    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
+        return None
+    big, accuracy = solved
+    derivative = _derivative(tracer, MULTIPLE, big, phi)
+    return CriticalPoint("multiple zero", big[: n + 1], [], 0.0, derivative, accuracy, [])
+
+
+def _divergence(tracer, a, b, few, many):
+    """Where a root leaves zero while other roots are always zero.
+
+    With k roots that are always zero the characteristic polynomial begins with `c s^k`, and c changes its sign. Its
+    coefficients, computed from the roots, are accurate to round-off, although a zero of multiplicity k is off by the
+    k-th root of round-off.
+    """
+    fastest = tracer.fastest
+    count_zeros = lambda point: int(np.sum(np.abs(point.outputs[-1]) < 1e-5 * fastest))
+    zeros = min(count_zeros(a), count_zeros(b))
+
+    def product(roots):
+        known = roots[np.isfinite(roots)]
+        return float(np.poly(known / fastest)[known.size - zeros].real)
+
+    leading = lambda point: product(point.outputs[-1])
+    best, off = tracer.zero_between(a, b, leading) or (many, np.inf)
+    if off > tracer.eps**0.6 * tracer.size(best.z):
+        return CriticalPoint("divergence", many.z, [], 0.0, None, float(np.max(np.abs(few.z - many.z))), [])
+    derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).outputs[-1]))
+    return CriticalPoint("divergence", best.z, [], 0.0, derivative, off, [])
+
+
+def _slopes(tracer, point, value):
+    """Derivatives of the parameter at which `value(z, tracer)` is zero along a branch, by central differences."""
+    number, steady = tracer.frame.place.of_params, tracer.frame.steady
+    row = np.zeros_like(point.z)
+    row[-1] = 1.0
+    h = tracer.eps ** (1 / 3)
+
+    def at(other, z, parameter):
+        corrected = other.corrected(z, row, parameter)
+        return np.nan if corrected is None else value(corrected, other)
+
+    here = point.z[-1]
+    by_parameter = (at(tracer, point.z, here + h) - at(tracer, point.z, here - h)) / (2 * h)
+    floats, rest = eqx.partition(steady.params, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(floats)
+
+    def by(i, entry):
+        step = h * max(abs(float(np.ravel(leaves[i])[entry])), h)
+
+        def moved(sign):
+            leaf = np.array(leaves[i])
+            leaf.reshape(-1)[entry] += sign * step
+            params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
+            frame = replace(tracer.frame, steady=steady.of(params))
+            return at(SteadyTracer(frame, tracer.low, tracer.high), point.z, here)
+
+        return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
+
+    is_parameter = lambda i, entry: (
+        number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
+    )
+    slopes = [np.reshape([0.0 if is_parameter(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
+             for i, x in enumerate(leaves)]  # fmt: skip
+    return structure.unflatten(slopes)
+
+
+def _near(tracer, a, b, z):
+    return np.max(np.abs(tracer.weights * (z - a.z))) < 1e-2 + 10 * np.max(np.abs(b.z - a.z))
+
+
+def _flutter(tracer, few, many, root):
+    """The onset of flutter: a pair of roots that crosses the imaginary axis, or two pairs that meet on it."""
+    n = tracer.frame.columns.size
+    roots = many.outputs[-1][np.isfinite(many.outputs[-1])]
+    omega = abs(root.imag)
+    # Without damping the mirror image of a growing root decays, so two roots are near this point of the axis.
+    roots_nearby = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
+    kind = COLLISION if roots_nearby > 1 else FLUTTER
+    stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(tracer.frame, few.z.astype(tracer.dtype)))
+    matrix = stiffness + 1j * omega * damping - omega**2 * mass
+    size = np.max(np.abs(stiffness) + omega * np.abs(damping) + omega**2 * np.abs(mass), axis=1)
+    matrix = matrix / np.where(size > 0, size, 1.0)[:, None]
+    w = np.conj(np.linalg.svd(matrix)[2][-1])
+    guide = np.concatenate([w.real, w.imag])
+    start = [few.z, [omega], w.real, w.imag]
+    if kind == COLLISION:
+        slope = omega * (damping + 2j * omega * mass) / np.where(size > 0, size, 1.0)[:, None]
+        second = -np.linalg.pinv(matrix, rcond=1e-5) @ (slope @ w)
+        second = second - w * (np.conj(w) @ second)
+        start += [second.real, second.imag]
+    solved = _newton(tracer, kind, np.concatenate(start), guide)
+    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
+        return CriticalPoint("flutter", few.z, [], omega, None, float(np.max(np.abs(few.z - many.z))), [])
+    big, accuracy = solved
+    return CriticalPoint(
+        "flutter", big[: n + 1], [], abs(float(big[n + 1])), _derivative(tracer, kind, big, guide), accuracy, []
+    )
+
+
+def _newton(tracer, kind, big, guide):
+    """Solve the extended system by Newton's method with steps of least norm; also returns the parameter's last step."""
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    last, n, step, length = np.inf, tracer.frame.columns.size, big, np.inf
+    for i in range(NEWTON):
+        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, cast(big), cast(guide)))
+        if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
+            return None
+        step = _least_squares(jacobian, value)
+        length = float(np.max(np.abs(step)))
+        if i > 3 and length > last and length > tracer.eps**0.5 * tracer.size(big):
+            return None
+        big = big - step
+        if length <= 4 * tracer.eps * tracer.size(big) or i > 3 and length >= last:
+            break
+        last = length
+    accuracy = abs(float(step[n]))
+    return (big, accuracy) if length < tracer.eps**0.6 * tracer.size(big) else None
+
+
+def _least_squares(matrix, known):
+    """The least-squares solution of least norm, with rows and columns scaled to one."""
+    columns = np.max(np.abs(matrix), axis=0)
+    columns = np.where(columns > 0, columns, 1.0)
+    rows = np.max(np.abs(matrix / columns), axis=1)
+    rows = np.where(rows > 0, rows, 1.0)
+    scaled = matrix / columns / rows[:, None]
+    known = (known.T / rows).T
+    return (np.linalg.lstsq(scaled, known, rcond=1e-10)[0].T / columns).T
+
+
+def _derivative(tracer, kind, big, guide):
+    """The derivatives of the critical parameter by every number in `params`, a tree like `params`."""
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    _, jacobian = extended_at(kind, tracer.frame, cast(big), cast(guide))
+    by_params = extended_by_params(kind, tracer.frame, cast(big), cast(guide))
+    n, unit = tracer.frame.columns.size, tracer.unit
+    leaves, structure = jax.tree.flatten(by_params)
+    if not leaves:
+        return by_params
+    flat = np.concatenate([np.asarray(x, float).reshape(big_rows(x), -1) for x in leaves], axis=1)
+    slopes = -unit * _least_squares(np.asarray(jacobian, float), flat)[n]
+    places = np.cumsum([0, *(np.asarray(x)[0].size for x in leaves)])
+    parts = [slopes[i:j].reshape(np.shape(x)[1:]) for i, j, x in zip(places, places[1:], leaves)]
+    return jax.tree.unflatten(structure, parts)
+
+
+def big_rows(x) -> int:
+    """The number of equations of a derivative."""
+    return np.shape(x)[0]

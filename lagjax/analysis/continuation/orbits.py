@@ -1,0 +1,419 @@
+"""How a cycle changes with a parameter: a branch of cycles, its folds, and where it becomes unstable.
+
+Critical points between two points of a branch of cycles: a multiplier passes 1 or -1, or a pair leaves.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.analysis.continuation.arclength import BranchPoint, Path
+from lagjax.analysis.continuation.orbit_equations import (  # fmt: skip
+    ENERGY,
+    ENTRY,
+    NUMBER,
+    PERIOD,
+    Along,
+    Guide,
+    OrbitFrame,
+    OrbitTracer,
+    drive_by_parameter,
+    sizes_at,
+)
+from lagjax.analysis.continuation.orbit_result import CriticalOrbit, OrbitBranch
+from lagjax.analysis.equilibria.equilibria import checked
+from lagjax.analysis.orbits.flow import flow_of
+from lagjax.analysis.orbits.monodromy import OrbitProblem, problem_of, tolerance_of
+from lagjax.analysis.orbits.result import PeriodicOrbit
+from lagjax.analysis.orbits.shooting import OrbitRequest, guessed
+from lagjax.analysis.params_by_name import no_such_number, numbers_in
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.packed import pack
+from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
+
+HALVINGS = 40
+# A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
+DIPS, VERTICES = 0.3, 8
+
+
+class FoundOrbit(NamedTuple):
+    """The kind of a critical point, the point, and how far off its parameter may be."""
+
+    kind: str
+    point: BranchPoint
+    accuracy: float
+
+
+def between(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint) -> list[FoundOrbit]:
+    """All critical points between two neighbouring points."""
+    found = []
+    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
+    if folds:
+        # At a pitchfork the parameter turns along the side branch, where the multiplier only touches 1.
+        kind = "fold" if crosses or not tracer.crosses else "branch point"
+        found.append(_zero(tracer, a, b, kind, lambda p: p.tangent[-1]))
+    elif crosses:
+        found.append(_zero(tracer, a, b, "branch point", lambda p: p.outputs.plus))
+    if a.outputs.minus * b.outputs.minus < 0:
+        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.outputs.minus))
+    if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
+        found.append(_torus(tracer, a, b))
+    return [one for one in found if one is not None]
+
+
+def dips(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[FoundOrbit | BranchPoint]:
+    """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
+    for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
+        left, middle, right = of(a), of(b), of(c)
+        same = left * middle > 0 and middle * right > 0
+        if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
+            continue
+        lowest = _beyond_zero(tracer, a, b, c, of)
+        if lowest is not None:
+            sides = [_zero(tracer, a, lowest, kind, of), _zero(tracer, lowest, c, kind, of)]
+            return [one for one in (sides[0], lowest, sides[1]) if one is not None]
+    return []
+
+
+def _beyond_zero(tracer, a, b, c, of):
+    """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
+    length = lambda p, q: float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
+    whole = length(a, b) + length(b, c)
+    x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
+    sign, tried = np.sign(f[0]), set(x)
+    for _ in range(VERTICES):
+        near = np.argsort(np.abs(np.array(x) - x[int(np.argmin(np.abs(f)))]))[:3]
+        (x0, x1, x2), (f0, f1, f2) = np.array(x)[near], np.array(f)[near]
+        slope, bend = (f1 - f0) / (x1 - x0), ((f2 - f1) / (x2 - x1) - (f1 - f0) / (x1 - x0)) / (x2 - x0)
+        if not np.isfinite(bend) or bend * sign <= 0:
+            return None
+        vertex = 0.5 * (x0 + x1) - slope / (2 * bend)
+        point = tracer.between(a, c, vertex) if 0 < vertex < 1 and vertex not in tried else None
+        if point is None:
+            return None
+        if of(point) * sign < 0:
+            return point
+        tried.add(vertex)
+        x.append(vertex)
+        f.append(of(point))
+    return None
+
+
+def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
+    found = tracer.zero_between(a, b, of)
+    if found is None or not np.isfinite(found[1]):
+        return None
+    point, off = found
+    return FoundOrbit(kind, point, off * tracer.unit)
+
+
+def _torus(tracer, a, b) -> FoundOrbit | None:
+    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
+    many = a if a.growing > b.growing else b
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
+    slowest = min(outside, key=abs, default=1.0)
+    if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
+        return None
+    found = _zero(tracer, a, b, "torus", lambda p: p.outputs.pairs)
+    if found is not None:
+        return found
+    low, high, point = 0.0, 1.0, None
+    for _ in range(HALVINGS):
+        share = 0.5 * (low + high)
+        middle = tracer.between(a, b, share)
+        if middle is None or middle.growing is None or share in (low, high):
+            break
+        point = middle
+        low, high = (share, high) if middle.growing == a.growing else (low, share)
+    off = abs(float(b.z[-1] - a.z[-1])) * (high - low) * tracer.unit
+    return None if point is None else FoundOrbit("torus", point, off)
+
+
+# Singular values of the equations below this fraction of the largest count as zero.
+DEPENDENT = 1e-7
+# The period of a drive counts as constant if its logarithm changes by less.
+CONSTANT = 1e-9
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
+
+
+def continue_orbits(
+    orbit: PeriodicOrbit, *, along: str, to: float, rtol: float | None = None, most_points: int = 1000
+) -> OrbitBranch:
+    """Follow a periodic orbit as a parameter changes, through folds, with its stability.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, {"g": 1.0})
+    >>> branch = lj.continue_orbits(orbit, along="q", to=2.0)
+    >>> print(branch.period[[0, -1]].round(6))
+    [6.699976 8.349753]
+
+    **Arguments:**
+
+    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins.
+    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. For a system that
+      does not depend on time also `"period"`, or a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
+      it is conserved, `"energy"` (the Jacobi integral). Along a number in the parameters the orbits hold what `orbit`
+      was found with. The period of a drive follows its parameters.
+    - `to`: its last value; the first is that of the orbit. The branch is followed within this range.
+    - `rtol`: as in `lj.periodic_orbit`. `most_points`: the largest number of points of the branch.
+
+    **Returns:** an `OrbitBranch`, with all points found before the branch ended; its `status` says why it ended.
+
+    **Raises:**
+
+    - `TypeError` for an `orbit` that is not a periodic orbit, and inside `jax.jit`, `vmap` or `grad`, because the
+      number of points depends on values.
+    - `ValueError` for an orbit that did not converge, and for an `along` that names nothing or a held quantity.
+
+    Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
+    Bifurcation Chaos 1 (1991) 745.
+    """
+    _check(orbit)
+    # Integers in the parameters become floats, so that a branch may follow them too.
+    system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
+    problem = problem_of(system, *s)
+    place, asked = _along(along, orbit, problem)
+    frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
+    first, last = float(z[-1] * frame.unit), float(to)
+    low, high = sorted((float(z[-1]), last / float(frame.unit)))
+    tracer, path, found = _traced(frame, z, low, high, np.sign(last - first), most_points)
+    return _result(orbit, problem, place, tracer, path, found, along, first, last)
+
+
+def _check(orbit):
+    if not isinstance(orbit, PeriodicOrbit):
+        raise TypeError(
+            f"lj.continue_orbits needs a periodic orbit, not {type(orbit).__name__}.\n"
+            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
+            'along="...", to=...).'
+        )
+    if not is_eager() or is_traced(orbit):
+        raise TypeError(
+            "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
+            "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."
+        )
+    if np.ndim(orbit.period):
+        raise ValueError(
+            f"this is a batch of orbits, of shape {np.shape(orbit.period)}: a branch begins at a single orbit.\n"
+            "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
+        )
+    if not bool(orbit.converged):
+        raise ValueError(
+            f"this orbit does not close: its end is {float(orbit.residual):.2g} of its size away from its start.\n"
+            "Usual cause: lj.periodic_orbit did not converge, and warned about it.\n"
+            "Fix: another start or period, until orbit.converged."
+        )
+
+
+def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, OrbitRequest]:
+    """What changes along the branch, and what the orbits still hold."""
+    asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
+    numbers = numbers_in(problem.state.params)
+    if along in numbers:
+        return Along(along, NUMBER, numbers[along]), asked
+    entries = [*names, *(f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}" for name in names)]
+    if along not in (ENERGY, PERIOD, *entries):
+        more = '"period", "energy", or a coordinate or velocity of the start, such as "' + names[0] + '"'
+        raise no_such_number(along, problem.state.params, more)
+    if not reasons.autonomous:
+        raise ValueError(
+            f"along={along!r}: the system depends on time, so its orbits are isolated, with the period of the drive.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    if along != PERIOD and not reasons.energy:
+        raise ValueError(
+            f"along={along!r}: the Jacobi integral is not conserved here, so the orbits at given parameters are "
+            "isolated.\nUsual cause: a force or dissipation.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    free = asked._replace(free=True, energy=False, held=())
+    if along == ENERGY:
+        return Along(along, ENERGY), free
+    if along == PERIOD:
+        if not reasons.energy:
+            raise ValueError(
+                "along='period': the system itself determines the period of its cycles.\n"
+                f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
+            )
+        return Along(along, PERIOD), free._replace(free=False)
+    return Along(along, ENTRY, None, entries.index(along)), free
+
+
+@compiled
+def _guess(flow, t, z, period, asked):
+    return guessed(flow, t, z, period, asked, 1, None).scale
+
+
+def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
+    """The units, the held quantities, and the point at which the branch begins."""
+    s, system = problem.state, problem.system
+    params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params)
+    flow = flow_of(model_of(system, s.t, s.q, s.v, params), rtol, problem.rows)
+    nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
+    flat = coordinates.vector
+    nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
+    scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
+    integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
+    first = {ENERGY: integral, PERIOD: period, ENTRY: nodes[0][place.entry]}.get(place.kind)
+    first = place.number.get(s.params) if place.number is not None else first
+    first, last = float(first), float(to)
+    if not np.isfinite(last) or first == last:
+        raise ValueError(
+            f"to={to} leaves the parameter {place.name!r} no range: it starts at {first:.6g}.\n"
+            f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
+        )
+    unit = np.asarray(abs(last - first), s.t.dtype)
+    y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
+    no_rows = jnp.zeros((0, y.size), s.t.dtype)
+    frame = OrbitFrame(
+        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
+        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
+    )  # fmt: skip
+    z = np.append(y, first / unit)
+    if not problem.reasons.autonomous and place.kind == NUMBER:
+        with_drive = replace(frame, drive=drive)
+        moved = float(drive_by_parameter(with_drive, z))
+        frame = with_drive if abs(moved) > CONSTANT else frame
+    return frame, z
+
+
+def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list[FoundOrbit]]:
+    """Trace the branch from its start."""
+    size = frame.scale.size
+    guide = Guide(z[:size], np.zeros(size, z.dtype))
+    tracer = OrbitTracer(frame, low, high, guide, True)
+    tracer.guide = tracer.evaluated(z).guide
+    free = _free_directions(tracer, z)
+    if len(free):
+        # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
+        frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
+        tracer = OrbitTracer(frame, low, high, tracer.guide, _free_are_trivial(frame, len(free)))
+    row = np.eye(z.size)[-1]
+    corrected = tracer.corrected(z, row)
+    begin = tracer.point(z if corrected is None else corrected, towards * row)
+    if isinstance(begin, str):
+        raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
+    tracer.moved_to(begin)
+    follower = _Follower(tracer)
+    path = tracer.trace(begin, most, follower.step)
+    if path.status == "infinity":
+        path.status = f"infinity, near {frame.along.name} = {path.points[-1].outputs.parameter:.6g}"
+    return tracer, path, follower.found
+
+
+def _free_directions(tracer, z):
+    """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
+    _, jacobian, _ = tracer.at(z)
+    _, sizes, right = np.linalg.svd(jacobian)
+    rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
+    kernel = right[rank:]
+    if len(kernel) < 2:
+        return np.zeros((0, z.size - 1))
+    # One direction of the kernel changes the parameter, the others do not.
+    lead = kernel[:, -1] / max(np.linalg.norm(kernel[:, -1]), 1e-300)
+    across = np.linalg.svd(lead[None])[2][1:] @ kernel
+    return across[:, :-1]
+
+
+def _free_are_trivial(frame, count):
+    """Whether all free directions belong to multipliers that are known to be trivial."""
+    shifts = sum(frame.reasons.ignorable)
+    known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
+    return count <= known
+
+
+class _Follower:
+    """Inspects each step of a branch, and collects its critical points."""
+
+    def __init__(self, tracer: OrbitTracer):
+        self.tracer, self.found = tracer, []
+
+    def step(self, before: BranchPoint, after: BranchPoint, path: Path) -> str | None:
+        """Put the critical points between two points into the path; return why the branch ends, or None."""
+        tracer, name = self.tracer, self.tracer.frame.along.name
+        if tracer.frame.asked.moves:
+            largest = max(point.outputs.moves for point in path.points)
+            shrinks = after.outputs.moves < AT_REST * largest
+            if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
+                if before.outputs.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
+                return f"a period that grows without end, near {name} = {before.outputs.parameter:.6g}"
+        if after.outputs.period > ENDLESS * float(tracer.frame.period):
+            return f"a period that grows without end, near {name} = {after.outputs.parameter:.6g}"
+        all_critical, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._insert(path, all_critical, before, after)
+        if not all_critical and earlier and earlier[0].critical is None and before.critical is None:
+            self._insert(path, dips(tracer, earlier[0], before, after), before, after)
+        return None
+
+    def _insert(self, path, all_critical, before, after):
+        """Insert points into the path, each before or after its last point."""
+        place = len(path.points) - 1
+        along = self.tracer.weights * (after.z - before.z)
+        for critical in all_critical:
+            point = critical.point if isinstance(critical, FoundOrbit) else critical
+            if isinstance(critical, FoundOrbit):
+                point.critical = len(self.found)
+                # A multiplier has size 1 there, so the nearest other point decides the stability.
+                point.growing = None
+                self.found.append(critical)
+            if along @ (point.z - before.z) < 0:
+                path.points.insert(place, point)
+                place += 1
+            else:
+                path.points.append(point)
+
+    def _at_rest(self, points):
+        """The parameter, extrapolated to a motion of size zero.
+
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
+        """
+        frame, b = self.tracer.frame, points[-1].outputs
+        parameter, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        if len(points) > 1:
+            a = points[-2].outputs
+            m, n = a.moves**power, b.moves**power
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * float(frame.unit) else parameter
+
+
+def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
+    """The result in the user's structure."""
+    outputs = [p.outputs for p in path.points]
+    trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
+    n = len(coordinates.names(orbit.q))
+    known = [i for i, p in enumerate(path.points) if p.growing is not None]
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(outputs))
+    critical = [
+        CriticalOrbit(
+            found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.outputs.multipliers,
+        ) for i, p in enumerate(path.points) if p.critical is not None
+    ]  # fmt: skip
+    cast = lambda x: np.asarray(x, tracer.dtype)
+    return OrbitBranch(
+        cast([s.parameter for s in outputs]), cast([s.period for s in outputs]),
+        trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
+        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
+        np.stack([s.multipliers for s in outputs]),
+        np.stack([cast(s.nodes) for s in outputs]), critical, _with_floats(orbit, problem), place, along, first, last,
+        path.status,
+    )  # fmt: skip
+
+
+def _with_floats(orbit, problem) -> PeriodicOrbit:
+    """The orbit with its parameters as floats, as the branch has them."""
+    arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
+    return replace(orbit, arrays=arrays, static=static)

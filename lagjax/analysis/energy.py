@@ -1,0 +1,494 @@
+"""The energy of a motion, and what changed it.
+
+Along any motion of `d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v + Aᵀ λ` the Jacobi integral h = v·p - L changes by
+
+    dh/dt = Q·v - (∂R/∂v)·v + λ·(A v) - ∂L/∂t
+
+one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated separately
+(`energy.py`), without using h, so that the remainder of the balance, the closure, tests the motion, the multipliers and
+the forces together.
+
+Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7.
+
+The work of each force in one motion: powers at its instants, and their integrals between them.
+
+The motion is integrated again, by the same method with the same tolerances, with outputs at the nodes of a quadrature,
+which is refined until it is more accurate than the motion.
+
+Source: Piessens et al., *QUADPACK* (1983), §2.2.
+"""
+
+import warnings
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.display import plots as plot
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
+from lagjax.integrate.trajectory.results import ENDED_WELL, is_among, message
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import is_traced
+from lagjax.mechanics.structure import sees_time
+from lagjax.numerics import quadrature
+from lagjax.system import constraints, coordinates
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import model_of
+from lagjax.system.system import System
+
+FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
+# How often inaccurate intervals are halved, and the most intervals.
+HALVINGS, MOST_INTERVALS = 12, 10_000
+# The outer nodes of an interval are two thousandths of it from its ends.
+APART = 2e3
+
+
+class Work(NamedTuple):
+    """The work that one source does on a motion, at every output.
+
+    `power`, like v: by coordinate, `[L]/[t]`; `work`, like v: its integral from the first output on, `[L]`. Those of
+    explicit time, which belongs to no coordinate, are (T,). `total` (T,): the work summed over the coordinates.
+    """
+
+    power: PyTree[Float[Array, "T ..."]]
+    work: PyTree[Float[Array, "T ..."]]
+    total: Float[Array, " T"]
+
+
+class Motion:
+    """One computed motion, in NumPy arrays: its instants, the phase of each, and the instants of its switches.
+
+    `t`, `q`, `v`, `multipliers`, `phase`: at the outputs, and at the end if it lies `beyond` them. `systems`: those
+    whose forces are accounted for, one per phase; `forward`: 1, or -1 if time decreases. `sources`: by name the size
+    of each power. `switch_times` (S,), and `entered` (S + 1,): the phases in their order.
+    """
+
+    def __init__(self, trajectory: Trajectory, accounted):
+        self.trajectory, self.systems, self.params = trajectory, accounted.phases, trajectory.params
+        # The number of outputs when the motion is integrated again.
+        self.room = 0
+        rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
+        states = [x.reshape(len(x), -1) for x in jax.tree.leaves((rows["q"], rows["v"]))]
+        reached = np.all(np.isfinite(np.concatenate(states, axis=1)), axis=1)
+        if not reached[:1].all():
+            raise ValueError(
+                f"the motion did not get beyond its start: {message(trajectory.result)}\nFix: see traj.result."
+            )
+        count = int(np.argmin(reached)) if not reached.all() else len(reached)
+        rows = jax.tree.map(lambda x: x[:count], rows)
+        self.forward = -1.0 if trajectory.t[-1] < trajectory.t[0] else 1.0
+        self.beyond = bool(self.forward * (end.t - rows["t"][-1]) > 0)
+        if self.beyond:
+            last = {"t": end.t, "q": end.q, "v": end.v, "multipliers": end.multipliers}
+            if isinstance(trajectory, HybridTrajectory):
+                last["phase"] = np.int32(trajectory.last_phase())
+            rows = jax.tree.map(lambda x, y: np.concatenate([x, y[None].astype(x.dtype)]), rows, last)
+        self.t, self.q, self.v, self.multipliers = (rows[name] for name in ("t", "q", "v", "multipliers"))
+        self.phase = rows.get("phase", np.zeros(len(self.t), int))
+        self.switches, self.switch_times, self.entered = None, np.zeros(0), np.zeros(1, int)
+        if isinstance(trajectory, HybridTrajectory):
+            self.switches, count = trajectory.switches, len(trajectory.switches)
+            self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
+            self.entered = np.array([int(trajectory.system.first), *to])
+        self.sources: dict[str, int] = {}
+        self.models = [model_of(system, *self._at(0), self.params) for system in self.systems]
+        for model in self.models:
+            self.sources |= _sources(model)
+
+    def _at(self, row):
+        return jax.tree.map(lambda x: x[row], (self.t, self.q, self.v))
+
+    def energies(self) -> "Energies":
+        """The energies at each instant, by the system of its phase."""
+        return self._energies(self.phase, self.t, self.q, self.v)
+
+    def _energies(self, phase, *state):
+        found = Energies(*(np.full(len(phase), np.nan, self.t.dtype) for _ in Energies._fields))
+        for i in np.unique(phase):
+            values = _energies(self.models[i], *state)
+            found = Energies(*(np.where(phase == i, new, old) for new, old in zip(values, found)))
+        return found
+
+    def works(self, allowed) -> tuple[dict[str, Work], float]:
+        """The work of each source, and the sum of the estimated errors of the integrals, which may exceed `allowed`."""
+        powers = self._powers(self.phase, self.t, self.q, self.v, self.multipliers)
+        works, error = self._integrated(allowed) if len(self.t) > 1 and self.sources else (powers, 0.0)
+        return {name: self._work(name, powers[name], works[name]) for name in self.sources}, error
+
+    def _powers(self, phase, t, q, v, multipliers):
+        """The powers by source, (rows, n)."""
+        powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
+        for i in np.unique(phase):
+            model = self.models[i]
+            # Other phases have other multipliers.
+            of_phase = {name: multipliers[name] for name in model.zero_multipliers()}
+            for name, power in _powers(model, t, q, v, of_phase).items():
+                powers[name] = np.where((phase == i)[:, None], power, powers[name])
+        return powers
+
+    def _integrated(self, allowed):
+        """The works until each instant, (T, n) by source, and the sum of their errors."""
+        knots = self._knots()
+        ends, sums, errors = self.integrals(knots, lambda a, b: self._at_nodes(self.again(a, b)), allowed)
+        order, names = np.argsort(self.forward * ends), list(self.sources)
+        until = np.concatenate([np.zeros((1, sums.shape[1])), np.cumsum(sums[order], axis=0)])
+        place = np.searchsorted(self.forward * ends[order], self.forward * self.t, side="right")
+        columns = np.cumsum([0, *self.sources.values()])
+        works = {name: until[place, low:high] for name, low, high in zip(names, columns, columns[1:])}
+        return works, float(np.sum(errors))
+
+    def _at_nodes(self, rows):
+        powers = self._powers(*rows)
+        return np.concatenate([powers[name] for name in self.sources], axis=1)
+
+    def integrals(self, knots, at_nodes, allowed):
+        """The ends (m,), integrals (m, k) and errors (m,) of the intervals between knots, halved until accurate.
+
+        `at_nodes(a, b)`: the k functions at the nodes of the intervals from a to b, one after the other.
+        """
+        apart = np.abs(np.diff(knots)) > self._shortest()
+        a, b = self._cut(knots[:-1][apart], knots[1:][apart])
+        done, span = [], abs(float(knots[-1] - knots[0]))
+        for halving in range(HALVINGS + 1):
+            rows = at_nodes(a, b)
+            sums, errors, noise = quadrature.integrals(rows.reshape(len(a), len(quadrature.NODES), -1), a, b)
+            good = errors <= np.maximum(allowed * np.abs(b - a) / span, noise)
+            good |= np.abs(b - a) < 2 * self._shortest()
+            if halving == HALVINGS or 2 * np.sum(~good) > MOST_INTERVALS:
+                good[:] = True
+            done.append((b[good], sums[good], errors[good]))
+            if good.all():
+                break
+            middle = 0.5 * (a + b)[~good]
+            a, b = np.concatenate([a[~good], middle]), np.concatenate([middle, b[~good]])
+        return tuple(np.concatenate(x) for x in zip(*done))
+
+    def between(self, t0: float, t1: float):
+        """The instants between two times, these included, and the times at which forces may jump; from t0 to t1."""
+        low, high = sorted((t0, t1))
+        inside = np.unique([low, high, *(t for t in self._knots() if low < t < high)]).astype(self.t.dtype)
+        return inside if t1 >= t0 else inside[::-1]
+
+    def _knots(self):
+        """The instants, and the times between them at which forces may jump."""
+        jumps = self.trajectory.asked.jump_ts
+        jumps = [] if jumps is None else np.asarray(jumps)
+        low, high = sorted((self.t[0], self.t[-1]))
+        more = [t for t in (*self.switch_times, *jumps) if low < t < high]
+        return self.forward * np.unique(self.forward * np.concatenate([self.t, np.asarray(more, self.t.dtype)]))
+
+    def _shortest(self):
+        """The shortest interval whose nodes can be told apart."""
+        return APART * np.finfo(self.t.dtype).eps * np.max(np.abs(self.t))
+
+    def _cut(self, a, b):
+        """Cut the intervals into about as many pieces as the motion had steps, if there are fewer."""
+        steps = int(self.trajectory.stats["num_accepted_steps"])
+        span = np.sum(np.abs(b - a))
+        pieces = np.maximum(1, np.ceil(steps * np.abs(b - a) / span)).astype(int)
+        cuts = [np.linspace(x, y, n + 1) for x, y, n in zip(a, b, pieces)]
+        return np.concatenate([c[:-1] for c in cuts]), np.concatenate([c[1:] for c in cuts])
+
+    def again(self, a, b):
+        """The phases, times, positions, velocities and multipliers at the nodes of intervals, integrated again."""
+        t = quadrature.nodes(a, b).ravel()
+        ts = self._with_others(t)
+        traj, first = self.trajectory, self._at(0)[1:]
+        rtol, atol = (np.asarray(x) for x in traj.tolerance)
+        settings = traj.asked._asdict() | {"rtol": tuple(rtol), "atol": None if atol.ndim == 2 else tuple(atol)}
+        if traj.asked.stepsize_controller is not None:
+            del settings["max_step"], settings["jump_ts"]
+        if isinstance(traj, HybridTrajectory):
+            settings["start"] = traj.system.names[self.entered[0]]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            again = integrate(traj.system, *first, traj.params, ts=ts, throw=False, estimate_error=False, **settings)
+        if not is_among(again.result, ENDED_WELL):
+            raise ValueError(
+                f"the motion could not be integrated again between its outputs: {message(again.result)}\n"
+                "Usual cause: a motion that only just succeeds at its tolerance.\nFix: a tighter or looser rtol."
+            )
+        rows, place = again.rows(), np.searchsorted(self.forward * ts, self.forward * t)
+        rows = jax.tree.map(lambda x: np.asarray(x)[place], {name: rows[name] for name in ("q", "v", "multipliers")})
+        phase = self._phase_of(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
+        return phase, t, rows["q"], rows["v"], rows["multipliers"]
+
+    def _with_others(self, t):
+        """These times in order, the first and last instant, and others: up to a length that one program serves."""
+        self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
+        others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
+        return self.forward * np.unique(self.forward * np.concatenate([t, others]))
+
+    def _phase_of(self, t):
+        """The phase at times other than those of switches."""
+        return self.entered[np.searchsorted(self.switch_times, t, side="right")]
+
+    def switches_until(self, row: int) -> int:
+        """How many switches precede an instant: an output at the time of a switch is before it, an end after it."""
+        side = "right" if self.beyond and row == len(self.t) - 1 else "left"
+        return int(np.searchsorted(self.switch_times, self.t[row], side=side))
+
+    def jumps(self) -> np.ndarray:
+        """The jump of the Jacobi integral at each switch."""
+        if self.switches is None or not len(self.switch_times):
+            return np.zeros(0, self.t.dtype)
+        s = self.switches
+        before, after = jax.tree.map(lambda x: np.asarray(x)[: len(s)], ((s.q, s.v), (s.q_after, s.v_after)))
+        h_before = self._energies(self.entered[:-1], self.switch_times, *before).h
+        return self._energies(self.entered[1:], self.switch_times, *after).h - h_before
+
+    def ways(self) -> tuple[str, ...]:
+        """The phase before and after each switch, in words."""
+        names = () if self.switches is None else [self.switches.names[i] for i in self.entered]
+        return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
+
+    def _work(self, name, power, work):
+        total = np.sum(work, axis=1)
+        if name == TIME:
+            return Work(power[:, 0], total, total)
+        return Work(*(self.models[0].tree(np.asarray(x)) for x in (power, work)), total)
+
+
+class Energies(NamedTuple):
+    """The Jacobi integral, T₂, V = -L at v = 0, and the size of the terms of h, (rows,)."""
+
+    h: np.ndarray
+    kinetic: np.ndarray
+    potential: np.ndarray
+    size: np.ndarray
+
+
+@compiled
+def _energies(model, t, q, v):
+    """The `Energies` at each of a batch of states."""
+
+    def at(t, q, v):
+        x, u = model.vectors(q, v)
+        energy = jax.value_and_grad(model.lagrangian, argnums=2)
+        (value, p), (rest, p_at_rest) = energy(t, x, u), energy(t, x, jnp.zeros_like(u))
+        power = u @ p
+        return power - value, 0.5 * u @ (p - p_at_rest), -rest, abs(power) + abs(value)
+
+    return jax.vmap(at)(t, q, v)
+
+
+def _sources(model) -> dict[str, int]:
+    """The sources of work in a system, and the size of each power."""
+    system, n = model.system, model.n
+    found = {FORCE: n} if system.force is not None else {}
+    found |= {DISSIPATION: n} if system.dissipation is not None else {}
+    found |= {TIME: 1} if sees_time(system.lagrangian, model) else {}
+    return found | {constraint_in_words(name): n for name in system.constraints}
+
+
+@compiled
+def _powers(model, t, q, v, multipliers):
+    """The power of each source at each of a batch of states, (rows, n)."""
+    system, timed = model.system, sees_time(model.system.lagrangian, model)
+
+    def at(t, q, v, multipliers):
+        (x, u), stacked, powers = model.vectors(q, v), model.stacked(multipliers), {}
+        if system.force is not None:
+            powers[FORCE] = model.force(t, x, u, stacked) * u
+        if system.dissipation is not None:
+            powers[DISSIPATION] = -jax.grad(model.dissipation, argnums=2)(t, x, u) * u
+        if timed:
+            powers[TIME] = -jax.grad(model.lagrangian)(t, x, u)[None]
+        rows = constraints.jacobian(model, t, x, u)
+        for name in system.constraints:
+            powers[constraint_in_words(name)] = (jnp.where(model.belongs_to(name), stacked, 0.0) @ rows) * u
+        return powers
+
+    return jax.vmap(at)(t, q, v, multipliers)
+
+
+def constraint_in_words(name: str) -> str:
+    """The name of a constraint among the sources."""
+    return f"constraint '{name}'"
+
+
+# Quadrature may be wrong by this many tolerances of the largest energy.
+QUADRATURE = 3.0
+# Terms that cancel to this, in units of the last place, are equal.
+ROUND_OFFS = 1e3
+
+
+class EnergyLedger(eqx.Module):
+    """The energy of a motion and what changed it; it prints itself as a table and can be plotted.
+
+    - `t` (T,): the outputs that were reached, and the end if it lies beyond them.
+    - `jacobi_integral` (T,): h = v·p - L, `[L]`.
+    - `kinetic`, `potential` (T,): T₂, the part of L of second degree in v, and V = -L at v = 0, with h = T₂ + V; None
+      if L has terms other than up to second degree. In coordinates that move, V contains the centrifugal part,
+      and h is not the energy: on a hoop that turns at ω it is E - ω L_z.
+    - `works`: a `Work` for each source: "force", "dissipation", "explicit time", as far as the system has them.
+    - `constraints`: by name a `Work`, of the force Aᵀ λ. Summed over all coordinates, the work of a constraint that
+      neither moves nor is inhomogeneous in v is zero.
+    - `impacts` (S,): the jump of h at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`: from
+      which phase to which; `impact_total` (T,): the sum of the jumps until each output.
+    - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy, to which it is
+      compared; `allowed`: 100 tolerances.
+    - `quadrature`: the estimated error of the works by quadrature, relative to `scale`.
+
+    Works are integrated along the motion, however far apart its outputs lie; energies, `closure` and `scale` are those
+    at the outputs, so an imbalance that comes and goes between two of them is not seen.
+    """
+
+    t: np.ndarray
+    jacobi_integral: np.ndarray
+    kinetic: np.ndarray | None
+    potential: np.ndarray | None
+    works: dict[str, Work]
+    constraints: dict[str, Work]
+    impact_times: np.ndarray
+    impacts: np.ndarray
+    switches: tuple[str, ...]
+    impact_total: np.ndarray
+    closure: np.ndarray
+    scale: float
+    allowed: float
+    quadrature: float
+
+    @property
+    def relative_closure(self) -> float:
+        """The largest `closure` at the outputs, relative to `scale`."""
+        return float(np.max(np.abs(self.closure)) / self.scale)
+
+    @property
+    def closes(self) -> bool:
+        """Whether the relative closure is no larger than `allowed`."""
+        return self.relative_closure <= self.allowed
+
+    def sources(self) -> Iterator[tuple[str, Work]]:
+        """Yield all sources of work, with their names in words."""
+        yield from self.works.items()
+        yield from ((constraint_in_words(name), work) for name, work in self.constraints.items())
+
+    def plot(self):
+        """Draw the work of each source and the jumps, stacked, against time, with the change of the Jacobi integral.
+
+        **Returns:** a matplotlib `Figure`. **Raises:** `ImportError` without matplotlib.
+        """
+        stacked = {name: work.total for name, work in self.sources()}
+        if len(self.impacts):
+            stacked["impacts"] = self.impact_total
+        return plot.stacked(self.t, stacked, self.jacobi_integral - self.jacobi_integral[0], "change of h")
+
+    def __repr__(self):
+        change = lambda x: [x[-1] - x[0]]
+        rows = [("Jacobi integral h", change(self.jacobi_integral))]
+        if self.kinetic is not None and self.potential is not None:
+            rows += [("  kinetic", change(self.kinetic)), ("  potential", change(self.potential))]
+        names = []
+        for name, work in self.sources():
+            last = jax.tree.map(lambda x: np.asarray(x)[-1], work.work)
+            names = names if name == TIME else coordinates.names(last)
+            parts = [] if name == TIME or len(names) == 1 else coordinates.flatten(last)[0]
+            rows.append((name, [work.total[-1], *parts]))
+        if len(self.impacts):
+            rows.append((_count(len(self.impacts), "switch"), [np.sum(self.impacts)]))
+        heads = ["change", *(f"by {name}" for name in names)] if len(names) > 1 else ["change"]
+        cells = [[self._number(x) for x in numbers] for _, numbers in rows]
+        widths = [max(len(row[i]) for row in [heads, *cells] if i < len(row)) for i in range(len(heads))]
+        width = max(len(name) for name, _ in rows)
+        line = lambda name, cells: "  ".join([f"  {name:<{width}}", *(f"{x:>{w}}" for x, w in zip(cells, widths))])
+        closure = f"{self.relative_closure:.0e} of the largest energy at the outputs, {self.scale:.6g}"
+        verdict = "" if self.closes else f"; DOES NOT CLOSE: above {self.allowed:.0e}"
+        return "\n".join([
+            f"EnergyLedger, t = {self.t[0]:.6g} to {self.t[-1]:.6g}, {len(self.t)} instants",
+            line("", heads),
+            *(line(name, row) for (name, _), row in zip(rows, cells)),
+            f"  {'closure':<{width}}  {closure}{verdict}",
+            *(f"  {note}" for note in self._odd()),
+        ])  # fmt: skip
+
+    def _number(self, x):
+        """Return a number in words; round-off as 0."""
+        return f"{float(x):+.8g}" if abs(x) > ROUND_OFFS * np.finfo(self.t.dtype).eps * self.scale else "0"
+
+    def _odd(self):
+        """Yield notes on sources that behave as they hardly ever should."""
+        noise = self.allowed * self.scale
+        forward = self.t[-1] > self.t[0]
+        given = self.works[DISSIPATION].total[-1] if DISSIPATION in self.works else 0.0
+        if forward and given > noise:
+            yield f"NOTE: the dissipation gave {given:.3g}, but it should only take energy. Is its sign right?"
+
+
+def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None) -> EnergyLedger:
+    """Account for the energy of a motion: what each force, constraint and impact gave to it, and whether that adds up.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> drop = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q, dissipation=lambda t, q, v, params: 0.5 * v**2)
+    >>> traj = lj.integrate(drop, 5.0, 0.0, ts=jnp.array([0.0, 1.0]))
+    >>> ledger = energy_ledger(traj)
+    >>> print(f"{ledger.works['dissipation'].total[-1]:.9f}")
+    -16.809124072
+
+    **Arguments:**
+
+    - `trajectory`: one motion, outside of traced code.
+    - `system`: the system whose forces are accounted for; by default that of the motion. With another one, the closure
+      says whether the motion is also one of that system.
+
+    **Returns:** an `EnergyLedger`. Print it, or `.plot()` it.
+
+    **Raises:** `TypeError` for anything but a trajectory, and for one that is being traced; `ValueError` for a batch,
+    for one that did not get beyond its start, and if the motion cannot be run again.
+
+    The motion is run again, with 15 outputs in each interval, in a program of its own, which takes two to six times the
+    time of the motion.
+
+    Source: Goldstein, Eq. (2.54): dh/dt = -∂L/∂t, with the forces that L does not contain.
+    """
+    if not isinstance(trajectory, Trajectory) or is_traced(trajectory):
+        raise TypeError(
+            f"a ledger needs a motion that was computed, not {_kind(trajectory)}.\n"
+            "Fix: lj.energy_ledger(lj.integrate(...)), outside jax.jit and jax.vmap."
+        )
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError(
+            f"this trajectory is a batch of shape {trajectory.t.shape[:-1]}: account for one lane of it.\n"
+            "Fix: lj.energy_ledger(jax.tree.map(lambda x: x[0], traj))."
+        )
+    accounted = trajectory.system if system is None else system
+    if isinstance(accounted, Hybrid) != isinstance(trajectory, HybridTrajectory):
+        raise TypeError(
+            "a motion in phases is accounted for by a lj.Hybrid, any other one by a lj.System, not "
+            f"{type(accounted).__name__}.\nFix: leave system out, or give one like traj.system."
+        )
+    return _ledger(Motion(trajectory, accounted))
+
+
+def _ledger(motion: Motion) -> EnergyLedger:
+    rtol = float(np.max(np.asarray(motion.trajectory.tolerance[0])))
+    h, kinetic, potential, size = motion.energies()
+    jumps = motion.jumps()
+    scale = max(float(np.max(size)), np.finfo(float).tiny)
+    works, error = motion.works(QUADRATURE * max(rtol, np.finfo(h.dtype).eps) * scale)
+    total = sum((work.total for work in works.values()), np.zeros(len(h)))
+    jumped = np.array([np.sum(jumps[: motion.switches_until(row)]) for row in range(len(h))])
+    split = bool(np.all(np.abs(h - kinetic - potential) <= ROUND_OFFS * np.finfo(h.dtype).eps * size))
+    names = {name: constraint_in_words(name) for system in motion.systems for name in system.constraints}
+    return EnergyLedger(
+        t=motion.t, jacobi_integral=h, kinetic=kinetic if split else None, potential=potential if split else None,
+        works={name: works[name] for name in (FORCE, DISSIPATION, TIME) if name in works},
+        constraints={name: works[words] for name, words in names.items()},
+        impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
+        closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,
+    )  # fmt: skip
+
+
+def _count(n, word):
+    return f"{n} {word}" + ("" if n == 1 else "es")
+
+
+def _kind(x):
+    return "one that JAX is tracing" if isinstance(x, Trajectory) else type(x).__name__

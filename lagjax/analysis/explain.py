@@ -1,0 +1,326 @@
+"""`explain`: what a system amounts to at one state, in words and numbers.
+
+What `lj.explain` says of a motion in phases: the graph of the phases, and each phase.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple, overload
+
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.display import plots as plot
+from lagjax.display.printable import by_line
+from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.solve.programs import nystrom_for
+from lagjax.mechanics.accelerations import accelerations
+from lagjax.mechanics.consistent_state import consistent_state
+from lagjax.mechanics.diagnosis import dependencies, describe, explain_failure, listed
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.projection import departures, to_manifold, within
+from lagjax.mechanics.saddle_point import examined
+from lagjax.mechanics.structure import Structure, are_angles, is_free_of_velocities, structure
+from lagjax.numerics.linalg.rank import independent_rows
+from lagjax.system import coordinates
+from lagjax.system.argument_checks import check_system
+from lagjax.system.check_functions import traced_system
+from lagjax.system.coordinates import State
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import model_of
+from lagjax.system.system import System
+
+
+@dataclass(frozen=True, repr=False)
+class HybridExplanation:
+    """The explanation of a hybrid system at one state; it prints itself and draws its graph.
+
+    - `phases`: by name, the `Explanation` of each phase.
+    - `switches`: for each switch the phase that it ends, the phases to which it leads, the name of its guard, and the
+      value of the guard at the state; None if the state does not belong to that phase.
+    - `unreachable`: phases to which no switch leads, except the first. `final`: phases that no switch leaves.
+
+    >>> import lagjax as lj
+    >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
+    >>> bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, restitution=0.5))
+    >>> found = lj.explain(lj.Hybrid({"flying": ball}, [bounce]), 0.0, 5.0, 0.0)
+    >>> print(list(found.phases), found.final)
+    ['flying'] ()
+    """
+
+    phases: dict
+    switches: tuple[tuple[str, tuple[str, ...], str, float | None], ...]
+    unreachable: tuple[str, ...]
+    final: tuple[str, ...]
+
+    def plot(self):
+        """Draw the phases, with an arrow for each switch; returns a matplotlib `Figure`.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        arrows = [(phase, to, guard) for phase, targets, guard, _ in self.switches for to in targets]
+        return plot.graph(list(self.phases), arrows)
+
+    def __repr__(self):
+        width = max(map(len, self.phases))
+        lines = ["Hybrid"]
+        for name, found in self.phases.items():
+            held = ", ".join(map(repr, found.structure.constraints)) if found.structure is not None else ""
+            count = found.degrees_of_freedom
+            words = [f"{count} degree{'' if count == 1 else 's'} of freedom", *([f"held by {held}"] if held else [])]
+            words += ["no switch leads here"] if name in self.unreachable else []
+            words += ["no switch leaves it"] if name in self.final else []
+            lines.append(f"  {name:<{width}}  {'; '.join(words)}")
+            for _, targets, guard, value in (switch for switch in self.switches if switch[0] == name):
+                now = "" if value is None else f", now {value:.6g}"
+                lines.append(f"  {'':<{width}}    -> {' or '.join(targets)}, when {guard} reaches zero{now}")
+            if found.problem:
+                lines.append(f"  {'':<{width}}    problem: {found.problem.splitlines()[0]}")
+        return by_line("\n".join(lines))
+
+
+def explained(hybrid: Hybrid, phases: dict, state: State) -> HybridExplanation:
+    """Build the explanation of a hybrid from the explanations of its phases at a state."""
+    at = {name: _multipliers(system, phases[name], state) for name, system in zip(hybrid.names, hybrid.systems)}
+    switches = []
+    for switch in hybrid.switches:
+        multipliers = at[switch.phase]
+        value = None if multipliers is None else float(switch.value(*state[:3], multipliers, state.params))
+        targets = (switch.to,) if switch.rest in (None, switch.to) else (switch.to, switch.rest)
+        switches.append((switch.phase, targets, _name(switch.when), value))
+    reached = {to for _, targets, _, _ in switches for to in targets} | {hybrid.names[int(hybrid.first)]}
+    left = {phase for phase, *_ in switches}
+    return HybridExplanation(
+        phases, tuple(switches), tuple(name for name in hybrid.names if name not in reached),
+        tuple(name for name in hybrid.names if name not in left),
+    )  # fmt: skip
+
+
+def _multipliers(system, explanation, state):
+    """The multipliers of a phase; None if the state does not belong to it."""
+    if explanation.problem or any(label == "off the constraints" for label, _ in explanation.rows):
+        return None
+    return accelerations(system, *state)[1] if system.constraints else {}
+
+
+def _name(guard):
+    name = getattr(guard, "__name__", type(guard).__name__.lower())
+    return "its guard" if name == "<lambda>" else name
+
+
+# A state this near to the constraints is taken for a rounded state on them, and moved there.
+ROUNDED = 1e-4
+
+
+@dataclass(frozen=True, repr=False)
+class Explanation:
+    """What a system amounts to at one state; it prints itself.
+
+    - `coordinates`: their names; `equations`: the name of each constraint equation.
+    - `degrees_of_freedom`: velocities left free: coordinates minus independent constraint equations.
+    - `position_freedoms`: positions left free; more than the former if some constraints restrict only velocities.
+    - `dependent`: each dependent equation, followed by those of which it is a combination.
+    - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
+    - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
+    """
+
+    coordinates: tuple[str, ...]
+    equations: tuple[str, ...]
+    degrees_of_freedom: int
+    position_freedoms: int
+    dependent: tuple[tuple[str, ...], ...]
+    mass_matrix: str
+    structure: Structure | None
+    problem: str | None
+    rows: tuple[tuple[str, str], ...]
+
+    def __repr__(self):
+        width = max(len(label) for label, _ in self.rows)
+        return "\n".join(["System", *(by_line(f"  {label:<{width}}  {text}") for label, text in self.rows)])
+
+
+@overload
+def explain(system: System, t, q, v, params=None) -> Explanation:
+    """Explain one system."""
+
+
+@overload
+def explain(system: Hybrid, t, q, v, params=None) -> HybridExplanation:
+    """Explain a motion in phases."""
+
+
+def explain(system, t, q, v, params=None):
+    """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
+
+    >>> import lagjax as lj
+    >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)
+    >>> again = lj.Holonomic(lambda t, q, params: 2.0 * (q["x"] ** 2 + q["y"] ** 2) - 2.0)
+    >>> free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
+    >>> twice = lj.System(free, constraints={"rod": rod, "again": again})
+    >>> explain(twice, 0.0, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 1.0})
+    System
+      at                  t = 0, q = (x = 1, y = 0), v = (x = 0, y = 1)
+      coordinates         2: x, y
+      constraints         'again' (position), 'rod' (position)
+      equations           2, of which 1 independent
+      dependent           'rod' restricts the same motion as 'again'; their multipliers are the shortest
+      degrees of freedom  1
+      mass matrix         positive definite, diagonal, constant
+      cyclic in L         x, y
+      solved              2 accelerations and 2 multipliers by elimination without the zeros
+
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it. A state off the constraints is first
+    moved onto them, as dependent constraints agree only there; the result says so if it was not near.
+
+    **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph.
+
+    **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, or an L that is not scalar.
+
+    Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
+    """
+    check_system(system, t, q, v, params, phases=True)
+    s = coordinates.state(t, q, v, params)
+    if isinstance(system, Hybrid):
+        return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
+    return _explain(system, s)
+
+
+def _explain(system: System, s: coordinates.State) -> Explanation:
+    system = traced_system(system, s)
+    model = model_of(system, *s)
+    place = _on_the_constraints(model, s) if model.m else _Place(s)
+    s = place.state
+    found = examined(model, s)
+    names, equations, holonomic = model.names, model.equation_names, model.holonomic
+    jacobian = found.rows.jacobian
+    independent = int(found.independent.sum())
+    groups = tuple(dependencies(jacobian, found.independent, equations)) if independent < len(equations) else ()
+    problem = place.unreachable or explain_failure(model, s)
+    mass = _definiteness(np.asarray(found.linear.mass), names)
+
+    rows = [("at", f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}")]
+    if place.off:
+        rows.append(("off the constraints", place.off))
+    rows.append(("coordinates", f"{len(names)}: {', '.join(names)}"))
+    if turned := _in_turns(model, s):
+        rows.append(("angles", f"in radians: {turned}; for degrees use jnp.radians(...)"))
+    if equations:
+        kinds = {name: "position" if c.of_positions else "velocity" for name, c in system.constraints.items()}
+        rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
+        rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
+    rows += [("dependent", _in_words(group)) for group in groups]
+    rows.append(("degrees of freedom", f"{len(names) - independent}"))
+    found_structure = structure(model)
+    rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
+    if found_structure is not None:
+        rows += _of_structure(found_structure)
+    rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
+    if (jumps := jumps_found(system, *s)) is not None:
+        rows += [("jumps and kinks", "; ".join(words))] if (words := jumps.in_words()) else []
+        rows += [("not followed", "; ".join(jumps.missed))] if jumps.missed else []
+    rows.append(("solved", _how_solved(equations_of(model, fast=True), found_structure)))
+    if is_free_of_velocities(model):
+        by = type(nystrom_for(model)).__name__
+        rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))
+    if problem:
+        rows.append(("problem", problem.replace("\n", "\n    ")))
+    return Explanation(
+        coordinates=tuple(names),
+        equations=tuple(equations),
+        degrees_of_freedom=len(names) - independent,
+        position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
+        dependent=groups,
+        mass_matrix=mass,
+        structure=found_structure,
+        problem=problem,
+        rows=tuple(rows),
+    )
+
+
+class _Place(NamedTuple):
+    """The state to examine, the constraints that the given one violates, and why no state on them was found."""
+
+    state: coordinates.State
+    off: str = ""
+    unreachable: str | None = None
+
+
+def _on_the_constraints(model, s) -> _Place:
+    """Find the nearest state on the constraints; off them, dependent constraints contradict each other that much."""
+    tolerance = jnp.asarray(ROUNDED, s.t.dtype)
+    equations = equations_of(model)
+    if within(equations, *s[:3], tolerance, tolerance):
+        moved = to_manifold(equations, *s[:3], tolerance, tolerance)
+        return _Place(s._replace(q=moved.q, v=moved.v))
+    off = departures(model, s, ROUNDED, ROUNDED)
+    try:
+        q, v = consistent_state(model.system, *s)
+    except ValueError as error:
+        return _Place(s, f"by {off}, and no state near it is on them", str(error))
+    return _Place(s._replace(q=q, v=v), f"by {off} as given; everything here describes the nearest state on them")
+
+
+def _in_turns(model, s):
+    """List angles of more than a turn, which may have been meant in degrees."""
+    x = np.asarray(model.vector(s.q))
+    large = np.abs(x) > 2 * np.pi
+    if not large.any():
+        return ""
+    found = [(name, float(y)) for name, y, show in zip(model.names, x, large & are_angles(model)) if show]
+    return ", ".join(f"{name} = {y:.6g} is {y / (2 * np.pi):.3g} turns" for name, y in found)
+
+
+def _in_words(group):
+    dependent, *others = group
+    if not others:
+        return f"'{dependent}' restricts nothing"
+    return f"'{dependent}' restricts the same motion as {listed(others)}; their multipliers are the shortest"
+
+
+def _of_mass(found):
+    shape = "diagonal" if all(len(block) == 1 for block in found.blocks) else "dense"
+    if shape == "dense" and len(found.blocks) > 1:
+        shape = "in blocks (" + "), (".join(", ".join(block) for block in found.blocks) + ")"
+    depends = f"depends on {', '.join(found.mass_depends_on)}" if found.mass_depends_on else "constant"
+    return f"{shape}, {depends}"
+
+
+def _of_structure(found):
+    rows = [("time", "explicit")] if found.explicit_time else []
+    if found.cyclic:
+        rows.append(("cyclic in L", ", ".join(found.cyclic)))
+    if found.linear_terms:
+        rows.append(("linear in velocity", f"L has such terms in {', '.join(found.linear_terms)} (gyroscopic forces)"))
+    for name, constraint in found.constraints.items():
+        words = [word for word, holds in (("linear", constraint.linear), ("moving", constraint.moving)) if holds]
+        rows += [(f"constraint '{name}'", ", ".join(words))] if words else []
+    return rows
+
+
+def _how_solved(equations, found):
+    """Say what the compiled program does at each evaluation."""
+    if not equations.are_written or found is None:
+        return str(equations.form)
+    n = sum(map(len, found.blocks))
+    m = equations.form.unknowns - n
+    if n == 1 and not m:
+        return "one division"
+    if m:
+        return f"{n} accelerations and {m} multiplier{'s' * (m > 1)} by elimination without the zeros"
+    once = " before the loop" if not found.mass_depends_on else ""
+    if all(len(block) == 1 for block in found.blocks):
+        return f"{n} divisions{once}"
+    return f"{n} equations by elimination without the zeros"
+
+
+def _definiteness(mass, names):
+    scale = np.sqrt(np.abs(np.diag(mass)))
+    scale = np.where(scale > 0, scale, 1.0)
+    if not np.all(np.isfinite(mass)):
+        return "not finite"
+    values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
+    zero = np.abs(values) <= 1e3 * np.finfo(mass.dtype).eps * np.max(np.abs(values), initial=0.0)
+    negative = int(np.sum(values[~zero] < 0))
+    if zero.any():
+        massless = sorted({names[int(np.argmax(np.abs(vector)))] for vector in vectors.T[zero]})
+        return f"singular in {listed(massless)}"
+    return f"indefinite, {negative} of {len(values)} directions negative" if negative else "positive definite"

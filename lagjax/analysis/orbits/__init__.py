@@ -1,0 +1,1 @@
+"""Motions that come back, and what happens near them."""

@@ -1,0 +1,270 @@
+"""The flow of a system with its tangents: where a state goes, and where neighbouring states go.
+
+With z = (q, v) in vector form and f its rate, a tangent δ of the flow z(t) obeys the variational equation
+
+    z' = f(t, z),        δ' = J δ,        J = ∂f/∂z,
+
+and a frame of tangents, one in each column, is integrated along with z. Both together are one state for the method, so
+that step sizes suit the tangents too: at rest in a driven system only the tangents move.
+
+With constraints c(t, z) = 0 on positions and velocities the equations have reduced index, and the constraint manifold
+is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. The volume of a frame that
+spans it grows by Liouville's formula, with P the orthogonal projection onto the tangent space:
+
+    d/dt log volume = tr P J,        without constraints tr J
+
+Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §I.14; Coddington & Levinson, *Theory of ODEs*, Eq. (3.1.5).
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.mechanics.equations import equations_of
+from lagjax.numerics.methods.runge_kutta import Dopri8
+from lagjax.system import constraints, coordinates
+from lagjax.system.model import Model
+
+# Tight tolerances, because results about a cycle are differences after a whole period.
+TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
+MAX_STEPS = 200_000
+# For `Flow.path`: steps between output points, and the nodes and weights of the classical method of order 4.
+SUBSTEPS, RUNGE_KUTTA = 16, (np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6)
+# A step shorter than this fraction of the span means that the motion is singular there, or NaN.
+SHORTEST = 1e-10
+# The first step as a fraction of the span; the step-size control rejects it if it is too long.
+FIRST = 0.02
+# A constraint row is dependent if at most this fraction of it is independent of the others.
+DEPENDENT_BELOW = 1e-6
+ONTO_CONSTRAINTS = 4
+
+
+class Passage(NamedTuple):
+    """The end of a state z (2n,) and of a frame of tangents (2n, k) after a time.
+
+    `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested.
+    """
+
+    z: Float[Array, " 2n"]
+    frame: Float[Array, "2n k"]
+    growth: Float[Array, ""]
+    steps: Int[Array, ""]
+    ended: Bool[Array, ""]
+
+
+class Changes(NamedTuple):
+    """The change of parameters (a tree of their floats, None elsewhere), start and span with each column, (k, ...)."""
+
+    params: PyTree
+    t0: Float[Array, " k"]
+    span: Float[Array, " k"]
+
+
+class Flow(eqx.Module):
+    """The motion of a system in vector form; `rows` are the indices of independent constraint equations."""
+
+    model: Model
+    rtol: Float[Array, ""]
+    rows: tuple[int, ...] = eqx.field(static=True)
+    in_a_loop: bool = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """The number of coordinates."""
+        return self.model.n
+
+    def state(self, z):
+        """(q, v) in the user's structure."""
+        return self.model.tree(z[: self.size]), self.model.tree(z[self.size :])
+
+    def vector(self, q, v):
+        """The vector z of (q, v)."""
+        return jnp.concatenate(self.model.vectors(q, v))
+
+    def rate(self, t, z):
+        """f(t, z): the velocities and accelerations."""
+        a, _ = equations_of(self.model).accelerations(t, *self.state(z))
+        return jnp.concatenate([z[self.size :], self.model.vector(a)])
+
+    def residual(self, t, z):
+        """c(t, z): the independent constraint equations of positions and velocities."""
+        return _residual(self.model, t, z)[np.array(self.rows, int)]
+
+    def normals(self, t, z, scale):
+        """C = ∂c/∂z, with z in units of `scale`."""
+        return jax.jacfwd(lambda z: self.residual(t, z))(z) * scale[None]
+
+    def onto_constraints(self, t, z, scale):
+        """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
+        if not self.rows:
+            return z
+        newton_step = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
+        return lax.scan(newton_step, z, None, length=ONTO_CONSTRAINTS)[0]
+
+    def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
+        """An orthonormal basis of the tangent space, in units of `scale`."""
+        if not self.rows:
+            return jnp.eye(z.size, dtype=z.dtype)
+        normals = self.normals(t, z, scale)
+        basis = jnp.linalg.svd(lax.stop_gradient(normals))[2][len(self.rows) :].T
+        # This gives the derivative of the basis that rotates as little as possible.
+        return basis - _shortest(normals, normals @ basis)
+
+    def passage(
+        self, t0, z, span, frame, scale, volume=False, differentiable=False, changes: Changes | None = None
+    ) -> Passage:
+        """The state and the frame after a time; errors and the frame are in units of `scale`, (2n,).
+
+        `volume`: whether to compute its growth. `differentiable`: whether to allow derivatives in both modes.
+        `changes`: what else changes with each column of the frame.
+        """
+        arrays, static = eqx.partition((self, t0, z, span, frame, lax.stop_gradient(scale), changes), eqx.is_array)
+        x, fixed = eqx.partition(arrays, eqx.is_inexact_array)
+
+        def solve(x, fixed, adjoint, _):
+            flow, *inputs = eqx.combine(x, fixed, static)
+            forward = isinstance(adjoint, diffrax.ForwardMode)
+            return _passage(flow, *inputs, volume, adjoint if forward else diffrax.RecursiveCheckpointAdjoint()), None
+
+        if not differentiable:
+            return solve(x, fixed, diffrax.ForwardMode(), False)[0]
+        return solve_in_both_modes(solve, x, fixed, recorded=False)
+
+    def path(self, t0, z, span, count, substeps=SUBSTEPS) -> Float[Array, "count+1 2n"]:
+        """States at equal time intervals, by short Runge-Kutta steps: of low accuracy, but quick to compile."""
+        h = span / (count * substeps)
+
+        def step(z, t):
+            def stage(rates, c_and_b):
+                c, b = c_and_b
+                rate, total = rates
+                rate = self.rate(t + c * h, z + c * h * rate)
+                return (rate, total + b * rate), None
+
+            zero_rate = jnp.zeros_like(z)
+            (_, total), _ = lax.scan(stage, (zero_rate, zero_rate), tuple(x.astype(z.dtype) for x in RUNGE_KUTTA))
+            return z + h * total, z
+
+        times = t0 + h * jnp.arange(count * substeps, dtype=z.dtype)
+        last, path = lax.scan(step, z, times)
+        return jnp.concatenate([path[::substeps], last[None]])
+
+
+def flow_of(model: Model, rtol, rows=None, in_a_loop=True) -> Flow:
+    """The flow of a system; `rows` come from `independent_rows_of`, by default all."""
+    return Flow(model, jnp.asarray(rtol, model.form.dtype), all_rows(model) if rows is None else rows, in_a_loop)
+
+
+def scale_of(z, period):
+    """The size of each coordinate and velocity at z for a motion of this period; never zero.
+
+    A coordinate that is zero with its velocity takes the largest size of the others; if all are zero, the user's unit.
+    """
+    rate = 2 * np.pi / period
+    x, u = jnp.split(jnp.abs(lax.stop_gradient(z)), 2)
+    sizes = jnp.maximum(x, u / rate)
+    largest = jnp.max(sizes)
+    sizes = jnp.where(sizes > 1e-6 * largest, sizes, jnp.where(largest > 0, largest, 1.0))
+    return lax.stop_gradient(jnp.concatenate([sizes, sizes * rate]))
+
+
+def independent_rows_of(model: Model, s: coordinates.State) -> tuple[int, ...] | None:
+    """The indices of independent constraint equations near a state; None, for all, where JAX is tracing."""
+    if not model.m:
+        return ()
+    if not is_eager() or is_traced(s):
+        return None
+    rows, chosen = np.asarray(_normals(model, s)), []
+    for i, row in enumerate(rows):
+        rest = row
+        if chosen:
+            rest = row - rows[chosen].T @ np.linalg.lstsq(rows[chosen].T, row, rcond=None)[0]
+        if np.linalg.norm(rest) > DEPENDENT_BELOW * np.linalg.norm(row):
+            chosen.append(i)
+    return tuple(chosen)
+
+
+@compiled
+def _normals(model, s):
+    return jax.jacfwd(lambda z: _residual(model, s.t, z))(jnp.concatenate(model.vectors(s.q, s.v)))
+
+
+def all_rows(model: Model) -> tuple[int, ...]:
+    """The indices of all constraint equations, of positions and of velocities."""
+    return tuple(range(int(model.holonomic.sum()) + model.m))
+
+
+def _residual(model, t, z):
+    x, u = jnp.split(z, 2)
+    return jnp.concatenate([constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)])
+
+
+def _shortest(rows, residual):
+    """The shortest δ with `rows @ δ = residual`."""
+    return rows.T @ jnp.linalg.solve(rows @ rows.T, residual)
+
+
+def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passage:
+
+    # Jitted so that it is traced only once, although diffrax traces the body of its loop three times.
+    @eqx.filter_jit
+    def field(part, y, args):
+        flow, t0, span, scale, changes = args
+        t = t0 + span * part
+        rate = lambda z: span * flow.rate(t, z * scale) / scale
+        if changes is not None:
+            motion, frame_motion = _with_changes(flow, part, y, t0, span, scale, changes)
+            return {"z": motion, "frame": frame_motion, "growth": jnp.zeros_like(span)}
+        if not frame.size:
+            return {"z": rate(y["z"]), "frame": jnp.zeros_like(frame), "growth": jnp.zeros_like(span)}
+        motion, push = jax.linearize(rate, y["z"])
+        if not volume:
+            return {"z": motion, "frame": jax.vmap(push, 1, 1)(y["frame"]), "growth": jnp.zeros_like(span)}
+        jacobian = jax.vmap(push, 1, 1)(jnp.eye(z.size, dtype=z.dtype))
+        growth = jnp.trace(jacobian)
+        if flow.rows:
+            normal = jnp.linalg.qr(flow.normals(t, y["z"] * scale, scale).T)[0]
+            growth = growth - jnp.sum(normal * (jacobian @ normal))
+        return {"z": motion, "frame": jacobian @ y["frame"], "growth": growth}
+
+    # The variable is the elapsed fraction of the span, so that the span is differentiated like a parameter.
+    y0 = {"z": z / scale, "frame": frame, "growth": jnp.zeros_like(span)}
+    zero, one, first = (jnp.asarray(x, z.dtype) for x in (0.0, 1.0, FIRST))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        Dopri8(in_a_loop=flow.in_a_loop),
+        zero,
+        one,
+        first,
+        y0,
+        (flow, t0, span, scale, changes),
+        stepsize_controller=diffrax.PIDController(rtol=flow.rtol, atol=flow.rtol, dtmin=SHORTEST, force_dtmin=False),
+        adjoint=adjoint,
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    y = jax.tree.map(lambda x: x[-1], solution.ys)
+    ended = solution.result == diffrax.RESULTS.successful
+    return Passage(y["z"] * scale, y["frame"], y["growth"], solution.stats["num_steps"], ended)
+
+
+def _with_changes(flow, part, y, t0, span, scale, changes):
+    """The rates of the state and its frame if parameters and times change with the columns."""
+    floats, rest = eqx.partition(flow.model.params, eqx.is_inexact_array)
+
+    def rate(z, floats, t0, span):
+        now = replace(flow, model=flow.model.of(eqx.combine(floats, rest)))
+        return span * now.rate(t0 + span * part, z * scale) / scale
+
+    motion, push = jax.linearize(rate, y["z"], floats, t0, span)
+    return motion, jax.vmap(push, (1, 0, 0, 0), 1)(y["frame"], *changes)

@@ -1,0 +1,221 @@
+"""`periodic_orbit`: a motion that comes back to its start, from a guess.
+
+analyse the system  ->  one compiled search (`shooting.py`)  ->  raise or warn about what went wrong
+"""
+
+import difflib
+import warnings
+from collections.abc import Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, PyTree
+
+from lagjax.analysis.orbits import shooting
+from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular, tolerance_of
+from lagjax.analysis.orbits.result import PeriodicOrbit
+from lagjax.analysis.orbits.shooting import OrbitRequest
+from lagjax.integrate.solve.harvest import Report, reported
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.jaxtools.packed import pack
+from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
+from lagjax.jaxtools.trees import stop_gradient
+from lagjax.mechanics.diagnosis import listed
+from lagjax.system import coordinates
+from lagjax.system.system import System
+
+# A driven system may change from one period to the next by this fraction of what it does in one.
+SAME = 1e-5
+
+
+class OrbitWarning(UserWarning):
+    """A search for a periodic orbit did not converge; its best candidate is returned."""
+
+
+def periodic_orbit(
+    system: System,
+    start: tuple[PyTree[ArrayLike], PyTree[ArrayLike]],
+    period: ArrayLike,
+    params: PyTree = None,
+    *,
+    t: ArrayLike = 0.0,
+    hold: str | Iterable[str] | None = None,
+    turns: Mapping[str, int] | None = None,
+    relative: str | Iterable[str] = (),
+    parts: int = 1,
+    rtol: ArrayLike | None = None,
+    most: int = shooting.MOST,
+) -> PeriodicOrbit:
+    """Find a motion that comes back to its start, near a guess: Newton's method on the flow.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> orbit = periodic_orbit(pendulum, (2.0, 0.0), 6.0, {"g": 1.0})
+    >>> print(orbit.period.round(9), orbit.q.round(6))
+    8.349752927 2.0
+
+    **Main arguments:**
+
+    - `system`, `params`: a `System`, with or without constraints, and its parameters.
+    - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. With constraints it is replaced by the nearest state
+      that satisfies them.
+    - `period`: the approximate period, `[t]`. If the system depends on time, the period is kept, and must be a multiple
+      of that of the drive; otherwise it is found with the orbit.
+    - `t`: the time of the start, `[t]`, for a system that depends on it.
+    - `hold`: what the orbit keeps of the guess, where orbits form a family: `"energy"` (the Jacobi integral; the
+      default where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`,
+      `"r[0]"`, `"v.theta"`; `"q"` and `"v"` for a single coordinate. Give several as a tuple. `()` holds nothing and
+      finds the orbit nearest to the guess.
+
+    **Other arguments:**
+
+    - `turns`: the whole turns that angles make in a period, by name. By default those of the guess, rounded. (A
+      coordinate is an angle if it appears only in sines and cosines.)
+    - `relative`: coordinates that need not come back, for relative periodic orbits; the system must not depend on them.
+    - `parts`: into how many parts the period is divided, with unknown states at all their ends (multiple shooting); for
+      orbits so unstable that a guess does not come near its start again.
+    - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: the largest number of
+      flows to try.
+
+    **Returns:** a `PeriodicOrbit`; the best candidate where the search did not converge. Both modes differentiate `q`,
+    `v`, `period` and `nodes` by `params` and by what is held.
+
+    **Raises:**
+
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for unknown names, for quantities that cannot
+      be held, and where a driven system is not the same after `period`.
+    - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and `vmap` check `converged`.
+
+    Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
+    """
+    q, v = _pair(start)
+    problem = problem_of(system, t, q, v, params)
+    s = problem.state
+    dtype, names = s.t.dtype, coordinates.names(s.q)
+    asked = _asked(problem, names, hold, relative)
+    rtol, period = tolerance_of(rtol, dtype), numpy_of(period).asarray(period, dtype)
+    if not is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
+        raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
+    given_turns = None if turns is None else _turns(turns, names, dtype)
+    eager = is_eager() and not is_traced((s, period))
+    search = lambda state, period: shooting.closed(
+        problem.system, state, period, rtol, asked, problem.rows, parts, given_turns, most
+    )
+    if eager:
+        found = search(s, period)
+        _raise_or_warn(found, float(period), problem)
+    else:
+        state = coordinates.state(*s)
+        given = stop_gradient((problem.system, state, jnp.asarray(period)))
+        found = shooting.closed(*given, rtol, asked, problem.rows, parts, given_turns, most)
+        found = shooting.implicit(problem.system, state, rtol, asked, problem.rows, found)
+    orbit = _orbit(problem, found, asked)
+    report_of = lambda orbit: Report(
+        jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),
+        orbit.iterations, jnp.zeros((), dtype), orbit.residual,
+    )  # fmt: skip
+    return reported(orbit, report_of)
+
+
+def _pair(start):
+    if not (isinstance(start, (tuple, list)) and len(start) == 2):
+        raise TypeError(
+            f"start must be a pair (q, v), not {type(start).__name__}.\n"
+            "Fix: lj.periodic_orbit(system, (q, v), period, params)."
+        )
+    return start
+
+
+def _asked(problem, names, hold, relative) -> OrbitRequest:
+    driven = not problem.reasons.autonomous
+    all_names = [*names, *(_velocity(name) for name in names)]
+    wanted = {relative} if isinstance(relative, str) else set(relative)
+    unknown = sorted(wanted - set(names))
+    if unknown:
+        raise ValueError(_no_such("relative", unknown[0], names))
+    depended_on = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
+    if depended_on:
+        raise ValueError(
+            f"'{depended_on[0]}' is named in relative, but the system depends on it: its value changes the motion.\n"
+            "Fix: leave it out; whole turns of an angle are counted anyway."
+        )
+    mask = tuple(name in wanted for name in names)
+    if driven:
+        if hold is not None and hold != "period" and tuple(hold) not in ((), ("period",)):
+            raise ValueError(
+                f"the system depends on time, so the orbit has the period of the drive and cannot also hold={hold!r}.\n"
+                "Fix: leave hold out."
+            )
+        return OrbitRequest(False, False, False, (), mask, problem.is_angle)
+    if hold is None:
+        hold = ("energy",) if problem.reasons.energy else ()
+    hold = (hold,) if isinstance(hold, str) else tuple(hold)
+    entries = [name for name in hold if name not in ("energy", "period")]
+    if len(all_names) == 2:
+        all_names = ["q" if names[0] == "q" else names[0], all_names[1]]
+    for name in entries:
+        if name not in all_names:
+            raise ValueError(_no_such("hold", name, ["energy", "period", *all_names]))
+    if "energy" in hold and not problem.reasons.energy:
+        raise ValueError(
+            "the Jacobi integral is not conserved here, so the orbit cannot hold that of the guess.\n"
+            "Usual cause: a force or dissipation; cycles are then isolated.\n"
+            "Fix: hold=(), or leave hold out."
+        )
+    held = tuple(all_names.index(name) for name in entries)
+    return OrbitRequest("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
+
+
+def _velocity(name):
+    return f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}"
+
+
+def _no_such(argument, name, names):
+    near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
+    return f"{argument} names '{name}', and there are {listed(names)}.\nFix: {argument}=\"{near}\"."
+
+
+def _turns(turns, names, dtype):
+    unknown = sorted(set(turns) - set(names))
+    if unknown:
+        raise ValueError(_no_such("turns", unknown[0], names))
+    return np.array([turns.get(name, 0) for name in names], dtype)
+
+
+def _raise_or_warn(found, period, problem):
+    if float(found.apart) > SAME:
+        raise ValueError(
+            f"the system is not the same after period = {period:.9g}: its accelerations change.\n"
+            "Usual cause: a rounded period, or one that is not a period of the drive.\n"
+            'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
+        )
+    if not np.isfinite(float(found.evaluation.size)):
+        refuse_singular(problem)
+    if not bool(found.converged):
+        warnings.warn(
+            f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "
+            f"to {float(found.evaluation.size):.2g} of its size, with the period {float(found.candidate.period):.9g}. "
+            "The best candidate is returned.\n"
+            "Usual cause: a guess too far away, a family that does not reach the held energy or coordinate, a state of "
+            "rest, or an orbit so unstable that the guess leaves it.\n"
+            "Fix: another start or period; hold=...; parts=8 for an unstable one.",
+            OrbitWarning,
+            stacklevel=3,
+        )
+
+
+def _orbit(problem, found, asked) -> PeriodicOrbit:
+    s, xp = problem.state, numpy_of(found)
+    if xp is np:
+        found = jax.tree.map(np.asarray, found)
+    like = lambda x: coordinates.like(s.q, x)
+    z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
+    shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
+    arrays, static = pack((problem.system, coordinates.state(*s).params))
+    return PeriodicOrbit(
+        xp.asarray(s.t), like(z[:n]), like(z[n:]), found.candidate.period, like(found.guess.turns),
+        like(shift), found.evaluation.size, found.converged, found.iterations, found.candidate.nodes, arrays, static,
+        asked,
+    )  # fmt: skip

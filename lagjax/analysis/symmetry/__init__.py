@@ -1,0 +1,1 @@
+"""Symmetries and what they conserve."""

@@ -1,0 +1,177 @@
+"""Read fits from files, with the functions that the user passes again."""
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from inspect import signature
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax.display.printable import printable
+from lagjax.files import npz
+from lagjax.files.table import Table
+from lagjax.files.tree_json import NotGiven, Reader
+from lagjax.fit.problem.initial_states import unflatten_of
+from lagjax.fit.result.result import Fit
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.trajectory.load import described_system, same_system
+from lagjax.jaxtools.cache import kinds
+from lagjax.mechanics.diagnosis import listed
+from lagjax.system.hybrid import Hybrid, replace_fields
+from lagjax.system.signature import UnknownSystem
+from lagjax.system.system import System
+
+
+def load_fit(
+    path: str | os.PathLike,
+    system: System | Hybrid | None = None,
+    observe: Callable | None = None,
+    *,
+    classes: Iterable[type] = (),
+    **options,
+) -> Fit:
+    """Read a fit that `found.save(path)` has written, bit for bit.
+
+    A file is data: reading it imports nothing, runs nothing of it and writes nothing, whoever has written it.
+
+    >>> import os
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import lagjax as lj
+    >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    >>> t = np.linspace(0.0, 1.0, 6)
+    >>> found = lj.fit(fall, lj.Record(t, q=3.0 * t - 5.0 * t**2 + 1e-3 * np.cos(9.0 * t), sigma=1e-3), {"g": 9.0})
+    >>> path = os.path.join(tempfile.mkdtemp(), "fall.npz")
+    >>> found.save(path)
+    >>> again = lj.load_fit(path, fall)
+    >>> print(again.names, bool(again.sd == found.sd), again.motion().q.shape)
+    ('g',) True (6,)
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `system`, `observe`: the fitted system and function, which are not in the file; `options`: those of `lj.fit` that
+      contain functions, such as `events=`. `motion()`, `log_likelihood` and `laplace()` need them; without them these
+      raise an error that names what is missing, and the estimates, their uncertainties and the residuals are available.
+    - `classes`: your own classes of which it holds objects, as in `lj.load_trajectory`.
+
+    **Returns:** the `Fit`.
+
+    **Raises:**
+
+    - `FileNotFoundError` if the file does not exist.
+    - `ValueError` for a file that is damaged, holds something else, or was written by a newer lagjax or a version that
+      stores fits in another form; for a `system` other than the fitted one; for a float64 file while JAX works in
+      float32; for objects of a class that was not passed.
+    - `TypeError` for functions that the fit did not have.
+    """
+    known = {"system": system, "observe": observe} | {f"options.{name}": x for name, x in options.items()}
+    known = {role: x for role, x in known.items() if x is not None}
+    table = Table(classes)
+    with npz.opened(path, "fit") as (contents, array):
+        reader, asked = Reader(array, table=table), contents["functions"]
+        if not isinstance(asked, list) or not all(isinstance(role, str) for role in asked):
+            raise ValueError("its list of functions is not one that lagjax writes.")
+        said, unflatten = reader.up(contents["known"]), unflatten_of(kinds(reader.up(contents["q"])))
+        described = described_system(said)
+        given: dict[str, Any] = {"system": described, "first": described, "unflatten": unflatten}
+        reader.given = lambda role: given[role] if role in given else NotGiven(_short(role))
+        found = reader.up(contents["fit"])
+        if described.starts is None:
+            raise ValueError("it does not say where its motions start.")
+        check_shapes(found, described)
+    if unknown := sorted(set(known) - set(asked)):
+        raise TypeError(
+            f"this fit has no {', '.join(_short(role) for role in unknown)} to be passed again.\n"
+            f"It has {', '.join(printable(_short(role)) for role in asked)}."
+        )
+    return _with(found, known, described, path)
+
+
+def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> Fit:
+    """A fit with the functions that the user passes again."""
+    problem, fields = found.problem, {}
+    if "observe" in known:
+        fields["observe"] = known["observe"]
+    if "system" in known:
+        system: Any = same_system(known["system"], described, path)
+        if described.phase is not None:
+            if not isinstance(system, Hybrid) or not 0 <= described.phase < len(system.systems):
+                raise ValueError(f"{path} starts in phase {described.phase}, which this system does not have.")
+            system = replace_fields(system, first=np.asarray(described.phase, np.int32))
+        fields |= {"system": system, "first": system.first_phase}
+    options = {name: known.get(f"options.{name}", x) for name, x in problem.options.items()}
+    training = found.training
+    if training is not None and training.held_back is not None:
+        training = replace(training, held_back=_with(training.held_back, known, described, path))
+    return replace(found, problem=replace(problem, options=options, **fields), training=training)
+
+
+def check_shapes(found: Fit, described: UnknownSystem) -> None:
+    """Raise `ValueError` if the numbers of a fit do not belong together."""
+    problem = found.problem
+    numbers, windows, starts = problem.found, problem.windows, problem.starts
+    p, (count, times), n = len(numbers.names), windows.ts.shape, np.size(problem.unit) // 2
+    k, searched = starts.unknowns, found.unknowns
+
+    def check(name, kinds, *expected, lead=False):
+        for x, shape in expected:
+            here = np.shape(x)[: len(shape)] if lead else np.shape(x)
+            if not isinstance(x, (np.ndarray, np.generic, jax.Array)) or here != shape or x.dtype.kind not in kinds:
+                raise ValueError(f"{name} of shape {np.shape(x)} does not belong to {p} numbers in {count} windows.")
+
+    of_numbers = (numbers.start, numbers.low, numbers.high, numbers.mean, numbers.sd, searched.shared)
+    check("found", "f", *((x, (p,)) for x in of_numbers), (searched.local, (count, k)))
+    check("windows", "f", (windows.ts, (count, times)))
+    check("windows", "b", (windows.real, (count, times)), (windows.seam, (count,)))
+    check("windows", "iu", (windows.sample, (count, times)), (windows.last, (count,)), (windows.record, (count,)))
+    check("starts", "f", *((chart.guess, (count, n)) for chart in starts), (problem.unit, (2 * n,)))
+    check("starts", "f", *((chart.along, (count, n, k)) for chart in starts))
+    check("starts", "f", *((chart.across, (count, n, chart.across.shape[-1])) for chart in starts))
+    check("the search", "f", (found.cost, ()), (found.costs, (found.costs.size,)), (problem.spread_in_sigmas, ()))
+    check("the search", "b", (found.rested, ()), (found.misfit.doubtful, ()))
+    check("the search", "iu", (found.steps, ()))
+    channels, columns = jax.tree.leaves(problem.measured), 0
+    check("misfit", "f", (found.misfit.times, (len(channels),)))
+    check("misfit", "b", *((x, (len(channels),)) for x in (found.misfit.large, found.misfit.curved)))
+    for kind, tree in problem.measured.items():
+        rows = (count,) if kind == "end" else (count, times)
+        for x, sigma in zip(jax.tree.leaves(tree), jax.tree.leaves(problem.sigma[kind]), strict=True):
+            check(kind, "f", (x, rows), (sigma, rows), lead=True)
+            check(kind, "f", (sigma, x.shape))
+            columns += math.prod(x.shape[1:])
+    records, order = len(windows.first), np.diff(windows.record, prepend=-1)
+    if described.starts is not None:
+        (q, v), (q_slopes, v_slopes) = described.starts
+        for tree, slopes in ((q, q_slopes), (v, v_slopes)):
+            leaves = jax.tree.leaves(tree)
+            for x, slope in zip(leaves, jax.tree.leaves(slopes), strict=True):
+                check("starts", "f", (x, (records,)), lead=True)
+                check("starts", "f", (slope, (*x.shape, p + k)))
+            if sum(x[0].size for x in leaves) != n or jax.tree.structure(tree) != jax.tree.structure(slopes):
+                raise ValueError(f"its starts do not have {n} coordinates.")
+    if windows.record[0] != 0 or order.min() < 0 or order.max() > 1 or not 0 <= windows.last.min() <= times:
+        raise ValueError("its windows are not in the order of its records.")
+    if (at := found.evaluation) is not None:
+        of, determined = at.covariance, at.determined
+        check("covariance", "f", (of.shared, (p, p)), (of.local, (count, k, k)), (of.local_shared, (count, k, p)))
+        check("determined", "b", (determined.shared, (p,)), (determined.local, (count, k)))
+        check("rows", "f", (at.rows, (count, columns)))
+        check("combinations", "f", (at.combinations, (p, p)), (at.singular_values, (p,)))
+        check("chi2", "f", (at.chi2, ()), (at.freedom, ()))
+    leaves = jax.tree.leaves(numbers.params)
+    sizes = [np.size(leaves[number]) if places is None else len(places) for number, places in numbers.leaves]
+    inside = all(0 <= i < np.size(leaves[number]) for number, places in numbers.leaves for i in places or ())
+    if unknown := set(problem.options) - set(signature(integrate).parameters):
+        raise ValueError(f"its options are not those of lj.integrate: {listed(sorted(unknown))}.")
+    if sum(sizes) != p or not inside:
+        raise ValueError(f"its parameters do not hold {p} numbers.")
+    if found.training is not None and found.training.held_back is not None:
+        check_shapes(found.training.held_back, replace(described, starts=None))
+
+
+def _short(role):
+    return role.removeprefix("options.")

@@ -1,0 +1,326 @@
+"""The start of each run, or window of a run: a guess, and the directions in which the start may differ from it.
+
+Without constraints a start is the guess plus unknown deviations. With constraints it is written in coordinates of the
+tangent space at the guess,
+
+    q = q_guess + N s + C c(s, params),        g(t, q, params) = 0,
+
+with the columns of N along the constraints, those of C across them, and c found by Newton's method; neither changes a
+known coordinate. Velocities likewise, with `phi(t, q, v, params) = 0`.
+
+Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (tangent space parametrization).
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from itertools import combinations
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lagjax.fit.problem.records import Record, Windows, spread
+from lagjax.integrate.integrate import integrate
+from lagjax.jaxtools.cache import kinds
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import is_traced, numpy_of
+from lagjax.jaxtools.trees import stop_gradient
+from lagjax.mechanics.consistent_state import free_coordinates
+from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.projection import departures, within
+from lagjax.numerics.linalg.rank import null_space
+from lagjax.system import constraints, coordinates
+from lagjax.system.check_functions import traced_system
+from lagjax.system.coordinates import State
+from lagjax.system.model import Model, model_of
+
+# Position and velocity are read off a parabola through this many samples.
+SAMPLES = 7
+# This many of them must agree; a sample is an outlier if it deviates this many times more than these, and by this
+# fraction of the data's spread. (Samples far apart on a curve that is not a parabola reach 30 times.)
+MOST, FAR_OFF, OF_SPREAD = 5, 100.0, 0.3
+# The largest number of Newton iterations for c; they end when the residual no longer falls.
+ITERATIONS = 12
+# The largest violation of the constraints after that, in displacements relative to the state.
+OFF = 1e-6
+
+
+class Chart(NamedTuple):
+    """Directions at a guess: `along` the constraints (n, k), one for each unknown, and `across` them (n, r)."""
+
+    guess: Float[Array, " n"]
+    along: Float[Array, "n k"]
+    across: Float[Array, "n r"]
+
+    def at(self, s: Float[Array, " k"], residual: Callable, problem):
+        """The vector y with `residual(problem, y) = 0`, which is differentiable in `s` and in `problem`."""
+        y = self.guess + self.along @ s
+        if self.across.shape[-1] == 0:
+            return y
+
+        def step(problem, y):
+            """A step towards the constraints; of least squares if there are more equations than directions."""
+            rows = jax.jacfwd(lambda y: residual(problem, y))(y) @ self.across
+            return -self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
+
+        fixed = stop_gradient(problem)
+        size = lambda y: jnp.max(jnp.abs(residual(fixed, y)))
+
+        def iterate(state):
+            i, y, _ = state
+            nearer = y + step(fixed, y)
+            return i + 1, nearer, size(nearer) < 0.5 * size(y)
+
+        start = stop_gradient(y)
+        _, near, _ = lax.while_loop(lambda state: (state[0] < ITERATIONS) & state[2], iterate, (0, start, True))
+        # The value of `near`; one more step, with a constant matrix, gives the derivative of the solution.
+        y = near + (y - start)
+        rows = jax.jacfwd(lambda y: residual(fixed, y))(near) @ self.across
+        return y - self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
+
+
+class Starts(NamedTuple):
+    """The starts of all windows: charts of coordinates and of velocities, each with a leading axis W."""
+
+    q: Chart
+    v: Chart
+
+    @property
+    def unknowns(self) -> int:
+        """The number of unknowns in a window's start."""
+        return self.q.along.shape[-1]
+
+    def vectors(self, s: Float[Array, " k"], r: Float[Array, " k"], model: Model, t):
+        """Coordinates at `s` and velocities at `r` of one window, where `self` holds this window's entries."""
+        x = self.q.at(s, lambda problem, x: constraints.position_residual(*problem, x), (model, t))
+        return x, self.v.at(r, lambda problem, u: constraints.velocity_residual(*problem, u), (model, t, x))
+
+
+def starts(
+    system, records: Sequence[Record], windows: Windows, params_of: Callable, options
+) -> tuple[Starts, Callable, State]:
+    """The guessed starts of all windows, the function from a vector of coordinates to a pytree, and one start."""
+    guesses = []
+    for r, record in enumerate(records):
+        here = np.flatnonzero(windows.record == r)
+        first = _guess(system, record, r, params_of(r))
+        guesses.append(first)
+        read = [_state_from_samples(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
+        structure = jax.tree.structure((first.q, first.v))
+        later = [state for state in read if jax.tree.structure(state) == structure]
+        if len(later) < len(read):
+            later = _states_along_motion(system, first, windows.ts[here, 0], options)
+        for w, (q, v) in zip(here[1:], later):
+            guesses.append(_state(windows.ts[w, 0], q, v, first.params))
+    system, charts = traced_system(system, guesses[0]), []
+    for w, (r, guess) in enumerate(zip(windows.record, guesses)):
+        held = (records[r].hold_q, records[r].hold_v) if w in windows.first else (False, False)
+        charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
+    q, v = zip(*charts)
+    k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
+    return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q)), guesses[0]
+
+
+def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
+    """Charts stacked to one shape; `before` other unknowns precede those of this kind."""
+    guesses, n = [chart.guess for chart in charts], len(charts[0].guess)
+    along = np.zeros((len(charts), n, k), charts[0].along.dtype)
+    across = np.zeros((len(charts), n, max(chart.across.shape[1] for chart in charts)), along.dtype)
+    for w, chart in enumerate(charts):
+        along[w, :, before : before + chart.along.shape[1]] = chart.along
+        across[w, :, : chart.across.shape[1]] = chart.across
+    return Chart(numpy_of(guesses).stack(guesses), along, across)
+
+
+def _state(t, q, v, params) -> State:
+    """A state; one made of numbers stays numbers, even while a program is traced."""
+    if is_traced((q, v, params)):
+        return coordinates.given_state(t, q, v, params)
+    with jax.ensure_compile_time_eval():
+        s = coordinates.given_state(t, q, v, params)
+    return s._replace(q=jax.tree.map(np.asarray, s.q), v=jax.tree.map(np.asarray, s.v))
+
+
+def _vector(tree):
+    """All coordinates in one vector, a NumPy array unless they are traced."""
+    xp = numpy_of(tree)
+    return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+@lru_cache
+def unflatten_of(of_kinds) -> Callable:
+    """The function that turns a vector into coordinates of these `kinds`."""
+    structure, *arrays = of_kinds
+    with jax.ensure_compile_time_eval():
+        return coordinates.flatten(jax.tree.unflatten(structure, [np.zeros(*array) for array in arrays]))[1]
+
+
+def _guess(system, record, r, params) -> State:
+    q, v = record.q0, record.v0
+    if q is None or v is None:
+        read_q, read_v = _state_from_samples(record, np.arange(len(record.t)))
+        q, v = (read_q if q is None else q), (read_v if v is None else v)
+        if q is None or v is None:
+            raise ValueError(
+                f"record {r} has no guess of its start, and no measured coordinates to read it from.\n"
+                "Fix: lj.Record(..., q0=..., v0=...), in the structure that lj.integrate takes."
+            )
+        if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
+            v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
+    if is_traced((q, v, params)):
+        if system.constraints:
+            raise TypeError(
+                "the start of a constrained system is being traced, but its free directions depend on its values.\n"
+                "Fix: give q0 and v0 of the record, and params, as numbers; measurements may be traced."
+            )
+        return _state(record.t[0], q, v, params)
+    guess = _state(record.t[0], q, v, params)
+    if record.q0 is None and isinstance(q, dict):
+        try:
+            traced_system(system, guess)
+        except ValueError as error:
+            raise ValueError(
+                f"{error}\nThe start of record {r} was read off what it measures, {listed(list(q))}; give "
+                "a guess of all coordinates with lj.Record(..., q0=..., v0=...)."
+            ) from error
+    return guess
+
+
+def _state_from_samples(record, samples):
+    """(q, v) at the first of some samples, from parabolas through the first measured ones; None if not measured."""
+    t = record.t[samples] - record.t[samples[0]]
+
+    def parabolas(kind):
+        tree = record.measured.get(kind)
+        pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x, samples), tree)
+        return [jax.tree.map(lambda x, pair, i=i: pair[i], tree, pairs) for i in (0, 1)]
+
+    (q, slopes), (v, _) = parabolas("q"), parabolas("v")
+    if isinstance(slopes, dict) and isinstance(v, dict):
+        return q, slopes | v
+    return q, slopes if v is None else v
+
+
+def _parabola(t, x, samples):
+    """Value and slope at the first of some samples, at t = 0, of a parabola through the first that are not missing.
+
+    Outliers do not count: among the parabolas through three samples each, the one nearest to most other samples decides
+    which samples agree, and a parabola is fitted to these.
+
+    Source: Rousseeuw, *J. Am. Stat. Assoc.* 79 (1984) 871 (least median of squares).
+    """
+    xp, shape = numpy_of(x), x.shape[1:]
+    t = xp.asarray(t)
+    count = min(SAMPLES, len(t))
+    threes = _threes(count)
+    values, slopes = [], []
+    for column in x.reshape(len(x), -1).T:
+        far_off, column = OF_SPREAD * spread(column), column[samples]
+        first = xp.argsort(~xp.isfinite(column), stable=True)[:count]
+        y, known = column[first], xp.isfinite(column[first])
+        scale = xp.max(xp.where(known, t[first], 0.0))
+        scale = xp.where(scale > 0, scale, 1.0)
+        powers = (t[first] / scale)[:, None] ** np.arange(3)[None]
+        near, y = known, xp.where(known, y, 0.0)
+        # Not while tracing, where it would be compiled for each window.
+        if count == SAMPLES and xp is np:
+            through = xp.linalg.solve(powers[threes], y[threes][..., None])
+            off = xp.abs(y - (powers @ through)[..., 0])
+            typical = xp.sort(off, axis=1)[:, MOST - 1]
+            best = xp.argmin(typical)
+            near = known & (~xp.all(known) | (off[best] <= xp.maximum(FAR_OFF * typical[best], far_off)))
+        coefficients = xp.linalg.lstsq(powers * near[:, None], xp.where(near, y, 0.0))[0]
+        values.append(coefficients[0])
+        slopes.append(coefficients[1] / scale)
+    return tuple(xp.stack(part).reshape(shape) for part in (values, slopes))
+
+
+@lru_cache
+def _threes(count):
+    """All choices of three among `count` samples."""
+    return np.array(list(combinations(range(count), 3)))
+
+
+def _states_along_motion(system, first, ts, options):
+    """The states at the starts of a record's later windows, along the motion from its guessed start."""
+    known = {name: value for name, value in options.items() if name not in ("event", "events")}
+    motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
+    # If the motion from the guess does not reach a window, the start replaces the missing state.
+    xp = numpy_of((motion.q, motion.v, first.q, first.v))
+    fill = lambda x, x0: xp.where(xp.isfinite(x), x, x0[None])
+    q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
+    return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]
+
+
+def _free(q, hold):
+    if isinstance(hold, bool):
+        return np.full(len(coordinates.names(q)), not hold)
+    return free_coordinates(q, hold)
+
+
+def _charts(system, s: State, free_q, free_v, r) -> Starts:
+    x, u = _vector(s.q), _vector(s.v)
+    if not system.constraints:
+        nothing = np.zeros((len(free_q), 0))
+        return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
+    with jax.ensure_compile_time_eval():
+        model = model_of(system, *s)
+
+        def charts(x, u, of_q, of_v):
+            return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))
+
+        near = charts(x, u, *_rows(model, s.t, x, u))
+        moved = _move_onto_constraints(near, model, s.t)
+        if not moved.holds:
+            nearest = State(s.t, model.tree(moved.x), model.tree(moved.u), s.params)
+            raise ValueError(
+                f"the start of record {r} cannot be moved onto the constraints: at the nearest state found, "
+                f"{departures(model, nearest, OFF, OFF)}.\n"
+                "Usual cause: a guess too far off, or too many coordinates held.\n"
+                "Fix: q0, v0 = lj.consistent_state(system, t[0], q0, v0, params), and hold less."
+            )
+        # The directions at the guess after it was moved onto the constraints.
+        return charts(moved.x, moved.u, moved.of_q, moved.of_v)
+
+
+def _chart(y, rows, free):
+    """The chart at y of equations with these rows; only free entries of y change."""
+    rows = np.asarray(rows)[:, free]
+    along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))
+    if len(rows) and free.any():
+        inner = null_space(rows, 1e-9)
+        normal = null_space(inner.T) if inner.shape[1] else np.eye(len(inner))
+        along, across = np.zeros((len(free), inner.shape[1])), np.zeros((len(free), normal.shape[1]))
+        along[free], across[free] = inner, normal
+    elif free.any():
+        along[free] = np.eye(int(free.sum()))
+    return Chart(np.asarray(y), along.astype(y.dtype), across.astype(y.dtype))
+
+
+class Moved(NamedTuple):
+    """A guess moved onto the constraints, their rows there, and whether it satisfies them."""
+
+    x: Float[np.ndarray, " n"]
+    u: Float[np.ndarray, " n"]
+    of_q: Float[np.ndarray, "p n"]
+    of_v: Float[np.ndarray, "m n"]
+    holds: Bool[np.ndarray, ""]
+
+
+@partial(compiled, in_numpy=True)
+def _move_onto_constraints(near: Starts, model: Model, t) -> Moved:
+    nothing = (jnp.zeros(chart.along.shape[1], t.dtype) for chart in near)
+    x, u = near.vectors(*nothing, model, t)
+    holds = within(equations_of(model), t, model.tree(x), model.tree(u), OFF, OFF)
+    return Moved(x, u, *_rows(model, t, x, u), holds)
+
+
+@partial(compiled, in_numpy=True)
+def _rows(model, t, x, u):
+    of_q = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
+    of_v = jax.jacfwd(lambda u: constraints.velocity_residual(model, t, x, u))(u)
+    return of_q, of_v

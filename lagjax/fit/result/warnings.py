@@ -1,0 +1,124 @@
+"""Warnings about a fit, in words: each says what happened, the usual cause, and what to do."""
+
+import jax
+import numpy as np
+
+from lagjax.fit.problem.records import channel_name
+from lagjax.fit.result.result import Fit
+from lagjax.fit.uncertainty.identifiable import rank_of
+from lagjax.mechanics.diagnosis import listed
+
+# A search has gone astray if a number ends this many times as large as its guess.
+ASTRAY = 1e6
+
+
+def caveats(fit: Fit) -> list[str]:
+    """What a user has to know about a fit, the most serious first."""
+    words = [_search_caveat(fit), _training_caveat(fit), _astray_caveat(fit), _sigma_caveat(fit) or _curve_caveat(fit)]
+    if fit.evaluation is not None:
+        words += [_parameters_caveat(fit), _motion_caveat(fit)]
+        words += [] if fit.problem.absolute else [_freedom_caveat(fit)]
+    if at := fit.at_bounds():
+        words.append(f"{listed(at)} ended at a bound, where uncertainties mean nothing.")
+    return [caveat for caveat in words if caveat]
+
+
+def _search_caveat(fit):
+    if bool(fit.rested):
+        return ""
+    if fit.training is not None:
+        return (
+            f"training ended after {int(fit.steps)} steps while the residuals were still getting smaller.\n"
+            "Fix: more iterations=; or params=found.params, to go on from here. found.training.plot() shows it."
+        )
+    return (
+        f"the search stopped after {int(fit.steps)} steps without converging; this is its best point.\n"
+        "Usual cause: a guess too far off, parameters that the data hardly determine, noise in the motion itself.\n"
+        "Fix: look at found.plot(); try restarts=8, a shorter window=, or iterations=1000."
+    )
+
+
+def _training_caveat(fit):
+    training = fit.training
+    if training is None or not (int(training.failed) or int(training.skipped)):
+        return ""
+    return (
+        f"in training {int(training.failed)} of {int(training.motions)} motions stopped early, and "
+        f"{int(training.skipped)} of {int(training.steps)} steps had no finite gradient. "
+        "These changed nothing.\n"
+        "Usual cause: steps that are too long, a nearly singular mass matrix, windows that are too long.\n"
+        "Fix: a smaller learning rate, optax.clip_by_global_norm, a shorter window=; lj.learned.positive_definite."
+    )
+
+
+def _astray_caveat(fit):
+    if fit.training is not None:
+        return ""
+    guesses = zip(fit.names, np.asarray(fit.problem.found.start), np.asarray(fit.values))
+    for name, guess, x in guesses:
+        if guess and abs(x) > ASTRAY * abs(guess):
+            return (
+                f"the search went astray: '{name}' was guessed to be {guess:.4g}, and ended at {x:.4g}.\n"
+                "Usual cause: a guess too far off, outliers, angles wrapped to one turn.\n"
+                f'Fix: bounds={{"{name}": (low, high)}}, a better guess, a shorter window=, or loss="cauchy".'
+            )
+    return ""
+
+
+def _parameters_caveat(fit):
+    if rank_of(np.asarray(fit.evaluation.singular_values)) == len(fit.names):
+        return ""
+    return (
+        f"the data do not determine all parameters.\n{fit.identifiability}\n"
+        "An undetermined parameter has no uncertainty, and stays near its guess.\n"
+        "Fix: leave some out of free=, give priors=, or measure more."
+    )
+
+
+def _motion_caveat(fit):
+    failed = np.flatnonzero(~np.asarray(fit.evaluation.well))
+    if not failed.size:
+        return ""
+    record = int(fit.problem.windows.record[failed[0]])
+    return (
+        f"at the estimates the motion of record {record} stops early; samples after that count as large residuals.\n"
+        f"Fix: found.motion({record}).result says why; give a better guess, or bounds=."
+    )
+
+
+def _sigma_caveat(fit):
+    large = [name for name, large in zip(_channels(fit), np.asarray(fit.misfit.large)) if large]
+    if not large:
+        return ""
+    times = float(np.nanmax(fit.misfit.times))
+    return (
+        f"the residuals of {listed(large)} are {times:.2g} times as large as sigma says, so the ± mean nothing.\n"
+        "Usual cause: a wrong minimum, something that the system leaves out, outliers, or too small a sigma.\n"
+        'Fix: look at found.plot(); try a shorter window=, restarts=30, loss="cauchy".'
+    )
+
+
+def _freedom_caveat(fit):
+    if float(fit.freedom) > 0:
+        return ""
+    return (
+        "there are as many unknowns as measurements, so their uncertainties cannot be estimated.\n"
+        "Fix: measure more, free fewer, or say how large the errors are: lj.Record(..., sigma=0.01)."
+    )
+
+
+def _curve_caveat(fit):
+    missed = [name for name, curved in zip(_channels(fit), np.asarray(fit.misfit.curved)) if curved]
+    if not missed:
+        return ""
+    return (
+        f"the residuals of {listed(missed)} are not measurement errors: they are large and follow a curve.\n"
+        "Usual cause: a wrong minimum, or something that the system leaves out.\n"
+        "Fix: look at found.plot(); try a better guess, restarts=30, a shorter window=."
+    )
+
+
+def _channels(fit):
+    """The names of what was measured, in the order of a `Misfit`."""
+    paths = {kind: jax.tree_util.tree_leaves_with_path(tree) for kind, tree in fit.problem.measured.items()}
+    return [channel_name(kind, path) for kind, leaves in paths.items() for path, _ in leaves]

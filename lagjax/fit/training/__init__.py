@@ -1,0 +1,1 @@
+"""Training with optimisers of optax."""

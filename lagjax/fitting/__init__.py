@@ -1,1 +1,0 @@
-"""Fits: parameters, initial states and learned terms from measured motion."""

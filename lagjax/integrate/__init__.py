@@ -1,0 +1,1 @@
+"""One motion in time."""

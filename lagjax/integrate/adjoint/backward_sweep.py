@@ -1,0 +1,282 @@
+"""The loop back over the recorded steps of a motion; `replay.py` has the derivation.
+
+It goes through the steps in pieces of as many steps as there are rows. The rows of the last piece, which comes first,
+are at hand; earlier pieces are run again, each from a checkpoint. In a batch one step of all lanes is pulled back at
+once, so that the cotangents of shared arrays are summed inside matrix products. Lanes have different numbers of steps:
+each begins with its own last one, and idles when it has finished.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array, Int, PyTree
+
+from lagjax.integrate.adjoint.step_record import Recorded, RecordRows, StepProblem, StepRecord, recorded_again
+from lagjax.integrate.stepping.projected_solver import ProjectedSolver
+from lagjax.jaxtools.fuse_cpu import PRODUCT
+from lagjax.jaxtools.jaxpr import length
+from lagjax.jaxtools.trees import like
+from lagjax.numerics.methods.nystrom import Nystrom, evaluations_a_step
+from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
+
+# Up to so many operations of a step pulled back, each stage gets a copy of the right-hand side instead of a loop. What
+# is not one machine function goes through memory at each turn of a loop, large matrices and their cotangents included:
+# with copies, gradients by a network of twenty thousand numbers, or in 64 lanes, take a fifth less. Compiling takes
+# longer.
+COPIES = 1000
+
+
+class Lanes(NamedTuple):
+    """A batch: the number of lanes, and which operands have one row per lane."""
+
+    count: int
+    batched: tuple[bool, ...]
+
+    def each(self, function, more=0):
+        """Map `function` over the lanes; it takes the operands and `more` arguments that are all batched."""
+        return jax.vmap(function, [0 if b else None for b in self.batched] + [0] * more, axis_size=self.count)
+
+
+@dataclass(frozen=True, eq=False)
+class BackwardMotion:
+    """A motion as a function of its arrays, each of which occurs once; everything else is stored here."""
+
+    structure: Any
+    places: tuple[int, ...]
+    static: PyTree
+    max_steps: int | None
+    checked: bool
+    bent: bool
+    results: Callable
+    # The structure of the record, filled when it has been traced.
+    found: list
+
+    def problem(self, leaves) -> StepProblem:
+        """The problem with these arrays."""
+        return eqx.combine(jtu.tree_unflatten(self.structure, [leaves[i] for i in self.places]), self.static)
+
+    def recorded(self, arrays) -> Recorded:
+        """The record with these arrays."""
+        structure, others = self.found[0]
+        return eqx.combine(jtu.tree_unflatten(structure, arrays), others)
+
+    @property
+    def size(self) -> int:
+        """How many arrays there are."""
+        return max(self.places) + 1
+
+    @property
+    def robust(self) -> bool:
+        """Whether some steps may have used the robust solve instead of the written-out equations."""
+        solver = self.static.solver
+        return solver.fast is not None and solver.equations.fallback
+
+    @property
+    def where(self) -> StepProblem:
+        """The problem with the index of each array in its place."""
+        return jtu.tree_unflatten(self.structure, self.places)
+
+
+class BackwardSweep(NamedTuple):
+    """The state of the loop back: the next step `k`, and the rows of the piece `number`.
+
+    `y`: the cotangent of the state at the end of step k, without that of an output there; `moved`: the cotangents of
+    the arrays so far; `output`: the last output not passed yet.
+    """
+
+    k: Int[Array, ""]
+    number: Int[Array, ""]
+    rows: RecordRows
+    y: PyTree
+    moved: list
+    output: Int[Array, ""]
+
+
+def swept_back(leaves, found: Recorded, asked, *, motion: BackwardMotion, moved, lanes: Lanes | None):
+    """The cotangents of the arrays with indices `moved`, from those of the outputs, the last time and the last state.
+
+    The first of several outputs at one time has the cotangents of all of them: see `together`.
+    """
+    of_outputs, of_t, of_y = asked
+    way = _Way(leaves, motion, moved, lanes, found.record, of_outputs)
+    total = [jnp.zeros_like(leaves[i]) for i in moved]
+    if way.of_times:
+        total = way.added(total, way.where.controller.ts, way.at_time(found.t, of_t))
+    k = found.record.count - 1
+    output = way.at(way.first, found.record.saved - 1)
+    s = BackwardSweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output)
+    s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), way.piece, s)
+    # Outputs at the start are the first state.
+    y, total = jax.tree.map(jnp.add, s.y, way.at(of_outputs, jnp.zeros_like(k))), s.moved
+    for i, ct in zip(jtu.tree_leaves(way.where.y0), jtu.tree_leaves(y)):
+        total = way.added(total, i, ct)
+    return total
+
+
+def together(leaves, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
+    """The cotangents of outputs, with those of all outputs at one time added to the first of these."""
+    _, first = _outputs(leaves, motion, lanes)
+    summed = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
+    summed = summed if lanes is None else jax.vmap(summed)
+    return jax.tree.map(lambda ct: summed(first, ct), of_outputs)
+
+
+def filled(leaves, moved, chosen):
+    """The arrays, with those at the indices `moved` replaced by `chosen`."""
+    every = list(leaves)
+    for i, x in zip(moved, chosen):
+        every[i] = x
+    return every
+
+
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """The constants of the way back, for one lane or for all lanes."""
+
+    leaves: list
+    motion: BackwardMotion
+    moved: tuple[int, ...]
+    lanes: Lanes | None
+    record: StepRecord
+    of_outputs: PyTree
+
+    @cached_property
+    def where(self) -> Any:
+        return self.motion.where
+
+    @cached_property
+    def of_times(self) -> bool:
+        """Whether the cotangents of times are wanted."""
+        return bool({self.where.t0, self.where.controller.ts} & set(self.moved))
+
+    @property
+    def many(self) -> int:
+        """The number of rows."""
+        return self.record.rows.t0.shape[-1]
+
+    @property
+    def ts(self):
+        return _outputs(self.leaves, self.motion, self.lanes)[0]
+
+    @property
+    def first(self):
+        return _outputs(self.leaves, self.motion, self.lanes)[1]
+
+    def is_lane(self, i) -> bool:
+        """Whether the i-th array has a row for each lane."""
+        return self.lanes is not None and self.lanes.batched[i]
+
+    def at(self, tree, i):
+        """The i-th rows."""
+        of = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+        return of(tree, i) if self.lanes is None else jax.vmap(of)(tree, i)
+
+    def each(self, function: Callable, more: int) -> Callable:
+        """Turn `function(problem, ...)` into one of the arrays and `more` arguments, mapped over the lanes."""
+        of = lambda *x: function(self.motion.problem(x[: len(x) - more]), *x[len(x) - more :])
+        return of if self.lanes is None else self.lanes.each(of, more)
+
+    def safe(self, tree):
+        """Values per lane; lanes without steps get the longest lane's, since zero times their own may be NaN."""
+        if self.lanes is None:
+            return tree
+        idle, longest = self.record.count == 0, jnp.argmax(self.record.count)
+        return jax.tree.map(lambda x: jnp.where(like(idle, x), x[longest][None], x), tree)
+
+    def added(self, total, i, ct):
+        """The cotangents of the arrays, with `ct` added to that of the i-th, if it is wanted."""
+        if i not in self.moved:
+            return total
+        ct = jnp.sum(ct, axis=0) if self.lanes is not None and not self.is_lane(i) else ct
+        return [x + ct if j == i else x for j, x in zip(self.moved, total)]
+
+    def at_time(self, t, ct):
+        """The cotangent of a time as that of the equal end of a step."""
+        of = lambda ts, t, ct: jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
+        ends = self.where.controller.ts
+        of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
+        return of(self.leaves[ends], t, ct)
+
+    def pulled(self, t0, t1, y, ct):
+        """The cotangents of the arrays, of both times (None if not wanted) and of the state at a step's start."""
+        leaves = [self.safe(x) if self.is_lane(i) else x for i, x in enumerate(self.leaves)]
+        chosen = [leaves[i] for i in self.moved]
+        start = (chosen, t0, t1, y) if self.of_times else (chosen, y)
+
+        def end(by, chosen, *start):
+            start = start if self.of_times else (t0, t1, *start)
+            step = lambda problem, *start: by(self.copied(problem.solver, *start), *start)
+            return self.each(step, 3)(*filled(leaves, self.moved, chosen), *start)
+
+        _, pull, valid = jax.vjp(partial(end, ProjectedSolver.again), *start, has_aux=True)
+        if self.motion.robust:
+            # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
+            robustly = lambda ct: jax.vjp(partial(end, ProjectedSolver.again_robustly), *start)[1](ct)
+            pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
+        of_arrays, *of_start = pull(ct)
+        return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
+
+    def copied(self, solver: ProjectedSolver, t0, t1, y) -> ProjectedSolver:
+        """The solver with its right-hand side copied to each stage, if that is worthwhile."""
+        method = solver.solver
+        if solver.fast is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
+            return solver
+        if self.lanes is None and all(x.size <= PRODUCT for x in self.leaves):
+            return solver
+        program = jax.make_jaxpr(lambda t, y: solver.terms.vf(t, y, None))(t0, y)
+        if length(program.jaxpr) * (evaluations_a_step(method) or 0) > COPIES:
+            return solver
+        return replace(solver, solver=replace(method, in_a_loop=False))
+
+    def is_on(self, s: BackwardSweep):
+        """Whether the next step belongs to this piece."""
+        return (s.k >= s.number * self.many) & (s.k >= 0)
+
+    def turn(self, s: BackwardSweep) -> BackwardSweep:
+        """Pull back one step."""
+        on = self.is_on(s)
+        t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
+        here = on & (t1 > t0)
+        output = jnp.maximum(s.output, 0)
+        time = self.at(self.ts, output)
+        hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
+        only = lambda condition, tree: jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
+        ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
+        of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct))
+        total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
+        if self.of_times:
+            first, ends = here & (s.k == 0), self.where.controller.ts
+            total = self.added(total, self.where.t0, only(first, of_t0))
+            total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
+            total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
+        y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
+        return BackwardSweep(
+            s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output)
+        )
+
+    def piece(self, s: BackwardSweep) -> BackwardSweep:
+        """Pull back one piece."""
+        number = jnp.where(s.k >= 0, s.k // self.many, -1)
+        # The piece before this one ends where this one begins.
+        end, further = self.at(s.rows.t0, jnp.zeros_like(number)), number < s.number
+
+        def again():
+            rows = self.safe(self.each(recorded_again, 3)(*self.leaves, self.record, number, end))
+            return jax.tree.map(lambda x, old: jnp.where(like(further, x), x, old), rows, s.rows)
+
+        rows = lax.cond(eqxi.unvmap_any(further), again, lambda: s.rows)
+        return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
+
+
+def _outputs(leaves, motion, lanes):
+    """The output times, and the first output at each of them, for one lane or for all."""
+    of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
+    return of(*leaves) if lanes is None else lanes.each(of)(*leaves)

@@ -1,0 +1,333 @@
+"""The checks that `integrate` makes of its arguments before it starts, with messages in the user's terms."""
+
+from functools import lru_cache
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate.solve.error_estimate import ROUND_OFFS
+from lagjax.integrate.trajectory.error_report import account_of, warning_of
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.trajectory import AccuracyWarning
+from lagjax.jaxtools.tracing import is_traced, numpy_of
+from lagjax.mechanics.projection import departures
+from lagjax.system import coordinates
+from lagjax.system.coordinates import State
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import Model
+from lagjax.system.system import System
+from lagjax.system.warn import warn
+
+# Tolerances that each dtype reaches with a margin.
+DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
+# The prefix with which a user writes a method, by the package that defines it.
+PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
+# Steps are counted in 32 bits where x64 is off.
+MOST_STEPS = 2**31 - 1
+# The least span of a motion in round-offs of its times: a step ends at some of the times that can be told apart.
+RESOLVED = 1024
+# Results of starts that cannot be integrated for a reason in the equations.
+REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradictory)
+
+
+def check_method(method: Any):
+    """Raise unless `method` is None or an instance of a diffrax solver for a whole state."""
+    if method is None:
+        return
+    if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
+        raise TypeError(
+            f"method must be a solver instance, and {method.__name__} is the class.\n"
+            "Usual cause: missing brackets.\n"
+            f"Fix: method={PACKAGES.get(method.__module__.split('.')[0], '')}{method.__name__}()."
+        )
+    if not isinstance(method, diffrax.AbstractSolver):
+        raise TypeError(
+            f"method must be a diffrax solver, not {type(method).__name__}.\n"
+            "Usual cause: a method given by its name, as in SciPy.\n"
+            "Fix: method=lj.Dopri8(), any of diffrax's, or leave it out."
+        )
+    if method.term_structure is not diffrax.AbstractTerm:
+        raise TypeError(
+            f"{type(method).__name__} needs a vector field of a special form, and the accelerations of a general "
+            "Lagrangian depend on q and v together.\nFix: method=diffrax.Dopri8(), or any method for one ODETerm."
+        )
+
+
+def check_jumps(jumps: Any) -> str:
+    """Return `jumps`; raise unless it is one of its two values."""
+    if jumps not in ("found", "ignored"):
+        raise ValueError(
+            f"jumps must be 'found' or 'ignored', not {jumps!r:.60}.\n"
+            "Usual cause: times of jumps, which are jump_ts=.\n"
+            'Fix: leave jumps out (they are found), or jumps="ignored".'
+        )
+    return jumps
+
+
+def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
+    """Raise if an adjoint cannot differentiate the motion; `recorded`: whether lagjax can record its steps."""
+    if adjoint is not None and not isinstance(adjoint, diffrax.AbstractAdjoint | Replay):
+        raise TypeError(
+            f"adjoint must be lj.Replay() or an adjoint of diffrax, not {_kind(adjoint)}.\n"
+            "Usual cause: missing brackets, or an adjoint given by its name.\n"
+            "Fix: leave adjoint out (both modes then work), or adjoint=diffrax.RecursiveCheckpointAdjoint()."
+        )
+    if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
+        raise ValueError(
+            "lj.Replay(memory=...) limits a record of steps, and none is kept with a stepsize_controller, a condition "
+            "for diffrax in event, or progress: reverse mode then uses diffrax's own checkpoints.\n"
+            "Fix: leave these out; or adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=100)."
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and jump_ts is not None:
+        raise ValueError(
+            "BacksolveAdjoint integrates backwards with steps of its own, which do not end at jump_ts.\n"
+            "Fix: leave adjoint out (both modes then work)."
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) and drift == "project":
+        raise ValueError(
+            "BacksolveAdjoint integrates backwards without returning to the constraints, so its gradients would "
+            'be wrong.\nFix: leave adjoint out (both modes then work), or drift="none".'
+        )
+
+
+def check_max_steps(max_steps: Any):
+    """Raise unless max_steps is None or a positive whole number."""
+    if max_steps is None or isinstance(max_steps, int | np.integer) and 0 < max_steps <= MOST_STEPS:
+        return
+    if isinstance(max_steps, int | np.integer) and max_steps > MOST_STEPS:
+        raise ValueError(
+            f"max_steps = {max_steps} is more than can be counted: the steps are counted up to {MOST_STEPS:,}.\n"
+            "Fix: max_steps=None, for no limit."
+        )
+    raise ValueError(
+        f"max_steps must be a whole number above zero, not {max_steps!r}.\n"
+        "Usual cause: 1e6, which is a float.\n"
+        "Fix: max_steps=10**6, or leave it out."
+    )
+
+
+def _kind(thing):
+    return f"the class {thing.__name__}" if isinstance(thing, type) else type(thing).__name__
+
+
+def check_drift(drift: Any, system: System | Hybrid) -> str:
+    """Return the drift control to use; raise if it is unknown."""
+    constrained = any(phase.constraints for phase in system.phases)
+    if drift is None:
+        return "project" if constrained else "none"
+    if drift not in ("project", "baumgarte", "none"):
+        raise ValueError(
+            f'drift must be "project", "baumgarte" or "none", not {drift!r}.\nFix: leave it out, or drift="project".'
+        )
+    return drift if constrained else "none"
+
+
+def check_controller(controller: Any, max_step: Any, jump_ts: Any):
+    """Raise if the user's stepsize_controller is no controller, or max_step or jump_ts are given beside it."""
+    if controller is None:
+        return
+    if not isinstance(controller, diffrax.AbstractStepSizeController):
+        raise TypeError(
+            f"stepsize_controller must be a controller of diffrax, not {_kind(controller)}.\n"
+            "Usual cause: missing brackets, or a controller given by its name.\n"
+            "Fix: leave it out, or stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9)."
+        )
+    for name, given, fix in (
+        ("max_step", max_step, "stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9, dtmax=0.1)"),
+        ("jump_ts", jump_ts, "stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)"),
+    ):
+        if given is not None:
+            raise ValueError(
+                f"{name} limits the steps that lagjax chooses, and stepsize_controller replaces that choice.\n"
+                f"Fix: leave stepsize_controller out, or {fix}."
+            )
+
+
+def vector_of_times(ts: Any):
+    """Return `ts` as an array of two or more numbers, or raise."""
+    given, ts = ts, numpy_of(ts).asarray(ts)
+    real = jnp.issubdtype(ts.dtype, jnp.floating) or jnp.issubdtype(ts.dtype, jnp.integer)
+    if real and ts.ndim == 1 and not isinstance(ts.shape[0], int):
+        raise ValueError(
+            f"the number of output times must be known when a motion is exported, and is {ts.shape[0]}.\n"
+            "Fix: as many times as are ever needed, jax.ShapeDtypeStruct((1000,), float)."
+        )
+    if not real or ts.ndim != 1 or len(ts) < 2:
+        actual = f"has shape {ts.shape}" if real else f"is {given!r:.60}"
+        raise ValueError(
+            f"ts must be a vector of at least two times, and {actual}.\n"
+            "Usual cause: only the last time was given; the motion starts at ts[0] with (q0, v0).\n"
+            "Fix: ts=jnp.linspace(0.0, 10.0, 101)."
+        )
+    return ts
+
+
+def times(ts: Any, dtype):
+    """Return a vector of times in `dtype`; raise unless it increases or decreases throughout."""
+    ts = ts.astype(dtype)
+    if not is_traced(ts):
+        if not np.all(np.isfinite(ts)):
+            raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
+        backward = bool(ts[-1] < ts[0])
+        wrong = ts[1:] >= ts[:-1] if backward else ts[1:] <= ts[:-1]
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise ValueError(
+                f"ts must {'decrease' if backward else 'increase'} throughout, as from its first time to its last, but "
+                f"ts[{i + 1}] = {float(ts[i + 1]):.9g} follows ts[{i}] = {float(ts[i]):.9g}.\n"
+                "Usual cause: times out of order, a repeated time, or times closer than "
+                f"{dtype} can tell apart.\n"
+                "Fix: ts=jnp.unique(ts), and ts=jnp.unique(ts)[::-1] to run backward in time."
+            )
+        resolved = RESOLVED * np.finfo(dtype).eps * float(np.max(np.abs(ts)))
+        if abs(float(ts[-1]) - float(ts[0])) <= resolved:
+            raise ValueError(
+                f"ts go from {float(ts[0]):.17g} to {float(ts[-1]):.17g}, and {dtype} tells apart only "
+                f"{max(1, round(abs(float(ts[-1]) - float(ts[0])) / float(np.spacing(np.max(np.abs(ts))))))} times "
+                "on the way: there is no room for steps.\n"
+                "Fix: count time from the start, ts - ts[0], with the start's time in params."
+            )
+    return ts
+
+
+def step_length(value: Any, name: str, dtype):
+    """Return `dt0` or `max_step` as a number of `dtype`, or None if not given; raise unless it is positive."""
+    if value is None:
+        return None
+    if not is_traced(value) and not (_is_number(value) and float(value) > 0):
+        fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
+        raise ValueError(
+            f"{name} must be one positive number, not {value!r}.\n"
+            "Usual cause: a negative step where ts decreases; it is a length in both directions.\n"
+            f"Fix: leave {name} out{fixed}."
+        )
+    return numpy_of(value).asarray(value, dtype)
+
+
+def jumps(jump_ts: Any, dtype):
+    """Return the times at which a force jumps, (J,) of `dtype`, or None without any; raise unless they are a vector."""
+    if jump_ts is None:
+        return None
+    jump_ts = jnp.stack([*jump_ts]) if _holds_traced(jump_ts) else jump_ts
+    kind, shape = (jump_ts if hasattr(jump_ts, "dtype") else np.asarray(jump_ts)).dtype, np.shape(jump_ts)
+    if len(shape) > 1 or not np.issubdtype(kind, np.number) or np.issubdtype(kind, np.complexfloating):
+        raise ValueError(
+            f"jump_ts must be a vector of times, and has dtype {kind} and shape {shape}.\n"
+            "Fix: jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink."
+        )
+    if not is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
+        raise ValueError("jump_ts contains NaN or infinity.\nFix: give finite times.")
+    return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
+
+
+def _is_number(value):
+    return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
+
+
+def _holds_traced(times):
+    return isinstance(times, (list, tuple)) and is_traced(times)
+
+
+def tolerance(value: Any, name: str, dtype):
+    """Return the tolerances of coordinates and of velocities, (2,) of `dtype`; raise if `dtype` cannot reach them."""
+    dtype = np.dtype(dtype)
+    value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
+    if isinstance(value, (tuple, list)) and is_traced(value):
+        value = jnp.stack([jnp.asarray(x, dtype) for x in value])
+    is_text = isinstance(value, str) or not isinstance(value, jax.Array) and np.asarray(value).dtype.kind not in "fiu"
+    if is_text or np.ndim(value) and np.shape(value) != (2,):
+        actual = f"is {value!r:.40}" if is_text else f"has shape {np.shape(value)}"
+        raise ValueError(
+            f"{name} must be one number, or two: for coordinates and for velocities. It {actual}.\n"
+            f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
+        )
+    if is_traced(value):
+        return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
+    return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
+
+
+@lru_cache(maxsize=64)
+def _tolerance(value, name, dtype):
+    _check_tolerance(np.min(value), name, dtype)
+    _check_tolerance(np.max(value), name, dtype)
+    return np.full(2, value, dtype)
+
+
+def _check_tolerance(value, name, dtype):
+    if value == np.inf:
+        raise ValueError(
+            f"{name} is infinite, which allows any error in a step: nothing would choose the steps.\n"
+            "Fix: a finite tolerance; or, for steps of a fixed length, "
+            "stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01."
+        )
+    if not value >= 0:
+        raise ValueError(f"{name} must be a number >= 0, not {value}.\nFix: {name}=1e-9, or leave it out.")
+    floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
+    if name == "rtol" and value < floor:
+        single = dtype == np.dtype("float32")
+        cause = "Usual cause: JAX works in float32 unless told otherwise.\n" if single else ""
+        remedy = 'jax.config.update("jax_enable_x64", True) before the first array, or ' if single else ""
+        raise ValueError(
+            f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
+            f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
+        )
+
+
+def check_finite(s: State):
+    """Raise if a coordinate or velocity of the initial state is not finite."""
+    for which, tree in (("q0", s.q), ("v0", s.v)):
+        values = np.asarray(coordinates.flatten(tree)[0])
+        for name, value in zip(coordinates.names(tree), values):
+            if not np.isfinite(value):
+                raise ValueError(
+                    f"coordinate '{name}' of {which} is {value}.\n"
+                    "Usual cause: a division by zero, or a missing measurement.\n"
+                    "Fix: start from finite numbers."
+                )
+
+
+def off_constraints(model: Model, s: State, rtol, atol) -> str:
+    """Say which constraints the initial state violates."""
+    check_finite(s)
+    violated = departures(model, s, rtol, atol) or departures(model, s, 0.0, 0.0)
+    if any(f"= {word}" in violated for word in ("nan", "inf", "-inf")):
+        return (
+            f"constraints are not finite at the initial state: {violated}.\n"
+            "Usual cause: NaN or infinity in params, or a constraint evaluated outside its domain.\n"
+            "Fix: look at lj.constraint_residual(system, ts[0], q0, v0, params), and at params."
+        )
+    return (
+        f"the initial state is off the constraints: {violated}, which must be 0.\n"
+        "Usual cause: a coordinate or velocity computed for other parameters, or rounded.\n"
+        "Fix: q0, v0 = lj.consistent_state(system, ts[0], q0, v0, params) for a consistent state near it."
+    )
+
+
+def warn_of_inaccuracy(trajectory):
+    """Warn if the error, or the change of a constant of the motion, exceeds what the tolerance lets expect."""
+    if float(trajectory.scaled_error) <= 1:
+        return
+    estimated = trajectory.error is not None and account_of(trajectory) is not None
+    words = warning_of(trajectory) if estimated else _of_drift(trajectory)
+    warn(words, AccuracyWarning)
+
+
+def _of_drift(trajectory):
+    drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
+    span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
+    dtype, how = np.asarray(trajectory.t).dtype, trajectory.static.how.steps
+    fix = f"rtol={max(rtol / 1e3, 1e2 * float(np.finfo(dtype).eps)):.0e}"
+    if how in ("fixed", "controller"):
+        fix = "shorter steps" if how == "fixed" else "tighter tolerances of the stepsize_controller"
+    elif rtol < 1e3 * np.finfo(dtype).eps:
+        fix = "a shorter span" + (", or float64" if dtype == np.dtype("float32") else "")
+    off = f", and a constraint is off by {float(trajectory.residual()):.1g}" if trajectory.system.constraints else ""
+    return (
+        f"over a time of {span:.6g} ({steps} steps) the Jacobi integral, which should stay constant, changed by "
+        f"{drift:.1g} of its size{off}, at the outputs, at rtol = {rtol:.1g}.\n"
+        f"Fix: {fix}. What caused it, estimate_error=True says."
+    )

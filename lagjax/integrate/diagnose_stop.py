@@ -1,0 +1,396 @@
+"""Say why an integration stopped before its last output: where, how fast it went on, and what is large there.
+
+If steps collapse or `max_steps` is used up, some more steps are taken from where the motion ended, one by one. A cause
+is said only where one of these numbers shows it, and with the number; otherwise the facts stand alone:
+
+- The rate of progress at the end, not the average rate, tells how many steps are missing.
+- Velocities or accelerations that have grown a millionfold, or that grow while steps shrink, approach a singularity.
+- An acceleration that changes within the shortest rejected step, and did not along the accepted ones, jumps. With only
+  time, position or velocity on the other side, it is seen which of them the jump depends on.
+- Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
+  stability of an explicit method (a stiff system), imaginary ones as frequencies to be resolved.
+
+This takes a compilation and some seconds, and is done only after a failure. `benchmarks/advice.py` applies each fix.
+
+Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.integrate.diagnose_guard import rejected_by_guards
+from lagjax.integrate.solve.one_motion import method_alone
+from lagjax.integrate.solve.programs import method_of
+from lagjax.integrate.stepping.projected_solver import Field
+from lagjax.integrate.stepping.tolerances import tolerances_at
+from lagjax.integrate.trajectory.error_report import of_a_step
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.jaxtools.without_lapack_batches import jitted
+from lagjax.mechanics.consistent_state import unreachable_ahead
+from lagjax.mechanics.diagnosis import describe, explain_failure
+from lagjax.mechanics.equations import equations_of
+from lagjax.system import coordinates
+from lagjax.system.coordinates import State
+
+# The number of steps that are examined, and the first of these, which only find their length.
+LOOKED_AT, SETTLED = 160, 40
+# diffrax's constants for the choice of the next step.
+SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
+# A jump: an acceleration that changes by this share within a rejected step this much shorter than the accepted ones,
+JUMP, SHORT = 0.05, 1e-2
+# or than this part of the time so far; more than so many times what its rate explains; in one of so many steps.
+NO_TIME, UNEXPLAINED, TRIED = 1e-7, 10.0, 12
+# A step times an eigenvalue that limits it; and the ratio of eigenvalues from which the larger one is fast.
+LIMITED, FAST = 0.3, 30.0
+# The same product for the stability of an explicit method, which ends at two to six.
+UNSTABLE = 1.5
+# Velocities or accelerations grew and steps shrank by these factors; growth that is a singularity in any case.
+GREW, SHRANK, BLOWN_UP = 3.0, 0.3, (1e4, 1e6)
+# Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
+TOO_MANY, MANY_TIMES = 1e8, 10
+
+
+class Steps(NamedTuple):
+    """The steps from where a motion ended: for each its start, its length, and whether it was accepted."""
+
+    t: np.ndarray
+    y: list
+    h: np.ndarray
+    accepted: np.ndarray
+    left: float
+
+    @property
+    def rate(self) -> float:
+        """The progress per step, counting rejected ones, after the first steps have found their length."""
+        settled = slice(SETTLED if len(self.h) > 2 * SETTLED else 0, None)
+        return abs(float(np.sum((self.h * self.accepted)[settled]))) / len(self.h[settled])
+
+    @property
+    def missing(self) -> float:
+        """How many steps are missing to the end."""
+        return len(self.h) + (self.left / self.rate if self.rate > 0 else np.inf)
+
+    @property
+    def kept(self) -> np.ndarray:
+        """The indices of the accepted steps, except the first, whose length was guessed."""
+        return np.flatnonzero(self.accepted)[1:]
+
+
+def stopped_early(trajectory, settings, guards: str = "") -> str:
+    """Say where and why an integration stopped before its last output; `guards`: these, in words."""
+    end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
+    share = 100 * (float(end.t) - t0) / (t1 - t0)
+    accepted, rejected = (int(trajectory.stats[f"num_{kind}_steps"]) for kind in ("accepted", "rejected"))
+    what = (
+        f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
+        f"{accepted} accepted and {rejected} rejected steps"
+    )
+    reason = explain_failure(trajectory.model, State(end.t, end.q, end.v, trajectory.params))
+    if reason := reason or unreachable_ahead(trajectory):
+        return f"{what}: {reason}"
+    last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
+    if bool(trajectory.result == RESULTS.max_steps_reached):
+        return f"{what}: max_steps = {settings.max_steps} is used up. {last} " + _used_up(trajectory, settings, guards)
+    said = f"{what}: {RESULTS[trajectory.result]} {last}"
+    if settings.controller is not None:
+        return f"{said}\nFix: {_of_controller(trajectory, settings)}."
+    steps, path = last_steps(trajectory, settings), _Path(trajectory)
+    found = _singularity(path, steps) or _jump(path, steps) or _undefined(path, steps)
+    if found:
+        return _with_cause(said, found)
+    return (
+        f"{said} {path.largest(steps)}\nFix: look at lj.accelerations at trajectory.end, with throw=False; or end the "
+        'motion before, with events={"near": lj.Crossing(...)}.'
+    )
+
+
+def _with_cause(said, found):
+    cause, fix = found
+    return f"{said}\nCause: {cause}." + (f"\nFix: {fix}." if fix else "")
+
+
+def _used_up(trajectory, settings, guards):
+    """The rate of progress, what keeps the steps short, and what to do."""
+    end, taken = trajectory.end, int(trajectory.stats["num_steps"])
+    if settings.controller is not None or not taken:
+        rate = abs(float(end.t - trajectory.t[0])) / max(1, taken)
+        missing = abs(float(trajectory.t[-1] - end.t)) / rate if rate > 0 else np.inf
+        found, facts, otherwise = None, "", "longer steps"
+    else:
+        steps, path = last_steps(trajectory, settings), _Path(trajectory)
+        rate, missing, rejected = steps.rate, steps.missing, int(np.sum(~steps.accepted))
+        if said := rejected_by_guards(guards, trajectory.stats, rejected / len(steps.h)):
+            return said
+        method = method_of(settings, trajectory.model)
+        implicit = isinstance(method, diffrax.AbstractImplicitSolver)
+        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
+        facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
+        otherwise = "a looser rtol and atol"
+    if not missing < TOO_MANY:
+        said = f"At the rate of its last steps ({rate:.2g} each) it does not arrive.{facts}"
+        return _with_cause(said, found) if found else f"{said}\nFix: {otherwise}, or ts that end before."
+    said = f"At the rate of its last steps ({rate:.2g} each) it needs {missing:.2g} more.{facts}"
+    # Half as many again, since the rate is that of one place.
+    more = f"max_steps={_rounded_up(taken + 1.5 * missing)}"
+    if not found or not found[1]:
+        return _with_cause(said, (found[0], more)) if found else f"{said}\nFix: {more}, or {otherwise}."
+    fix = f"{found[1]}; else {more}" if missing > MANY_TIMES * taken else f"{more}, or {found[1]}"
+    return _with_cause(said, (found[0], fix))
+
+
+def _of_controller(trajectory, settings):
+    """The fix for steps of a user's controller: whether a shorter one can be taken from where it failed."""
+    if settings.dt0 is None or not isinstance(settings.controller, diffrax.ConstantStepSize):
+        return "leave stepsize_controller out: failed steps are then repeated, shorter"
+    attempt, _, (t, y), direction = _attempts(trajectory, settings)
+    for part in (2, 4, 8, 16, 32):
+        h = float(settings.dt0) / part
+        after, _ = attempt(t, t + direction * h, y)
+        if np.all(np.isfinite(coordinates.flatten(after)[0])):
+            return f"dt0={h:.3g}, which succeeds there; or leave stepsize_controller out"
+    return f"leave stepsize_controller out: there even a step of dt0 / 32 = {float(settings.dt0) / 32:.3g} fails"
+
+
+def _rounded_up(count):
+    """A count rounded up to two digits."""
+    unit = 10 ** max(0, int(np.log10(count)) - 1)
+    return int(-(-count // unit) * unit)
+
+
+def _attempts(trajectory, settings):
+    """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
+    model, params, end = trajectory.model, trajectory.params, trajectory.end
+    method = method_alone(settings, method_of(settings, model))
+    terms = diffrax.ODETerm(Field(equations_of(model)))
+    # Tolerances from the start: near a singularity sizes differ from those at the start.
+    first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
+    at_start = _on_path(model, first.t, (first.q, first.v), jnp.zeros(3))
+    tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
+
+    def attempt(t0, t1, y):
+        return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
+
+    order = float(method.error_order(terms))
+    return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
+
+
+def last_steps(trajectory, settings) -> Steps:
+    """Continue the motion from where it ended, and return each step."""
+    attempt, order, (t, y), direction = _attempts(trajectory, settings)
+    last = float(trajectory.t[-1])
+    size = abs(t - float(trajectory.t[0])) / max(1, int(trajectory.stats["num_accepted_steps"]))
+    size = size or 1e-3 * abs(last - t)
+    taken_steps = []
+    while len(taken_steps) < LOOKED_AT and abs(last - t) > 0:
+        # The last step ends exactly at the last time.
+        size = min(size, abs(last - t), float(settings.max_step))
+        after, error = attempt(t, t + direction * size, y)
+        error = float(error)
+        taken_steps.append((t, y, direction * size, error < 1))
+        if error < 1:
+            t, y = (last if size == abs(last - t) else t + direction * size), after
+        factor = SAFETY * error ** (-1 / order) if error > 0 else LONGEST
+        size *= np.clip(factor if np.isfinite(error) else 0.0, *((1.0, LONGEST) if error < 1 else (SHORTEST, SAFETY)))
+        if size < 4 * np.finfo(float).eps * max(abs(t), 1e-300):
+            break
+    ts, ys, h, accepted = zip(*taken_steps)
+    return Steps(np.array(ts), list(ys), np.array(h), np.array(accepted), abs(last - t))
+
+
+@jitted
+def _attempt(method, terms, t0, t1, y, params, tolerance):
+    """One step, and its error in units of the tolerance."""
+    after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
+    rows = lambda tree: jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
+    allowed = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
+    largest = jnp.max(rows(error) / jnp.where(allowed > 0, allowed, 1.0))
+    return after, jnp.where((result == diffrax.RESULTS.successful) & jnp.isfinite(largest), largest, jnp.inf)
+
+
+class _Path:
+    """Velocities and accelerations along the motion and along the parabola through a state."""
+
+    def __init__(self, trajectory):
+        self.model, self.names = trajectory.model, trajectory.model.names
+        self.in_dict = isinstance(trajectory.end.q, dict)
+        t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+        self.span = abs(float(trajectory.end.t - trajectory.t[0]))
+        # The largest velocity and acceleration that the start and the way so far account for.
+        a, u = np.max(np.abs(self.at(t, y, 0.0))), np.max(np.abs(self.velocity(y)))
+        x, x1 = (np.asarray(coordinates.flatten(part)[0]) for part in (y[0], trajectory.end.q))
+        moved = np.max(np.abs(x1 - x))
+        pace = max(u, np.sqrt(a * moved), moved / self.span if self.span > 0 else 0.0)
+        self.usual = pace, max(a, pace**2 / max(np.max(np.abs(x)), moved, 1e-300))
+
+    def at(self, t, y, s):
+        """The acceleration at q + s v + s² a/2, v + s a; t, q, v are taken at s, or at s[0], s[1], s[2]."""
+        s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
+        return np.asarray(_on_path(self.model, jnp.asarray(t), y, s))
+
+    def velocity(self, y):
+        """The velocities of a state, (n,)."""
+        return np.asarray(coordinates.flatten(y[1])[0])
+
+    def rates(self, t, y):
+        """The eigenvalues of d(v, a)/d(q, v)."""
+        return np.linalg.eigvals(np.asarray(_jacobian(self.model, jnp.asarray(t), y)))
+
+    def largest(self, steps):
+        """What is large at the last of the steps, in words."""
+        a, v = np.abs(self.at(steps.t[-1], steps.y[-1], 0.0)), np.abs(self.velocity(steps.y[-1]))
+        if not a.size or not np.all(np.isfinite(a)):
+            return ""
+        i, k = int(np.argmax(v)), int(np.argmax(a))
+        return (
+            f"The largest velocity there is that of '{self.names[i]}', {v[i]:.2g}, the largest acceleration that of "
+            f"'{self.names[k]}', {a[k]:.2g}."
+        )
+
+
+@jitted
+def _on_path(model, t, y, s):
+    q, v = y
+    a, _ = equations_of(model).accelerations(t, q, v)
+    by = lambda scale, x, dx: jax.tree.map(lambda x, dx: x + scale * dx, x, dx)
+    place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
+    return model.vector(equations_of(model).accelerations(t + s[0], place, velocity)[0])
+
+
+@jitted
+def _jacobian(model, t, y):
+    def rates(z):
+        u = z[model.n :]
+        a, _ = equations_of(model).accelerations(t, model.tree(z[: model.n]), model.tree(u))
+        return jnp.concatenate([u, model.vector(a)])
+
+    return jax.jacfwd(rates)(jnp.concatenate(model.vectors(*y)))
+
+
+def _singularity(path, steps):
+    """Velocities or accelerations that have grown without bound, or that grow while steps shrink."""
+    kept = steps.kept if steps.kept.size else np.array([0])
+    sizes = lambda i: (np.abs(path.velocity(steps.y[i])), np.abs(path.at(steps.t[i], steps.y[i], 0.0)))
+    first, last, limit = sizes(kept[0]), sizes(kept[-1]), steps.t[kept[-1]]
+    if not all(np.all(np.isfinite(x)) and x.size for x in last):
+        return None
+    lengths = np.abs(steps.h[kept])
+    shrinks = len(kept) >= 6 and lengths[-1] < SHRANK * lengths[0] and np.mean(np.diff(lengths) < 0) > 0.8
+    grows = [np.max(x) > GREW * np.max(x0) for x, x0 in zip(last, first)]
+    blown_up = [np.max(x) > many * usual > 0 for x, many, usual in zip(last, BLOWN_UP, path.usual)]
+    if not (any(blown_up) or shrinks and any(grows)):
+        return None
+    if shrinks:
+        # Steps in a geometric series converge to its limit.
+        ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
+        limit += np.sign(steps.h[kept[-1]]) * lengths[-1] / (1 - ratio)
+    of_velocity = blown_up[0] or not any(blown_up) and grows[0]
+    which = last[0] if of_velocity else last[1]
+    i = int(np.argmax(which))
+    what = "velocity" if of_velocity else "acceleration"
+    usual = path.usual[0 if of_velocity else 1]
+    return (
+        f"a singularity of the motion: the {what} of '{path.names[i]}' grows without bound as t -> {limit:.6g}; it is "
+        f"{which[i]:.2g} already, where the start and the way so far have {usual:.2g}",
+        f"ts that end before {limit:.6g}" + (_event(path, i, usual) if of_velocity else ""),
+    )
+
+
+def _event(path, i, usual):
+    """An event where a velocity has grown a hundred times, in the user's names."""
+    name = path.names[i]
+    if not (path.in_dict and name.isidentifier() or name == "q" or name.startswith("q[")):
+        return ""
+    entry = f'v["{name}"]' if path.in_dict else f"v{name[1:]}"
+    guard = f"lambda t, q, v, params: {100 * usual:.2g} - abs({entry})"
+    return f', or an event on the way there, events={{"near": lj.Crossing({guard})}}'
+
+
+def _jump(path, steps):
+    """A change of the acceleration, within one of the shortest rejected steps, that its rate does not explain."""
+    rejected, lengths = np.flatnonzero(~steps.accepted), np.abs(steps.h)
+    longest = max(SHORT * np.max(lengths[steps.kept], initial=0.0), NO_TIME * path.span)
+    for i in rejected[np.argsort(lengths[rejected])][:TRIED]:
+        found = _jump_in(path, steps.t[i], steps.y[i], float(steps.h[i])) if lengths[i] < longest else None
+        if found:
+            cause, fix = found
+            return f"{cause}; {len(rejected)} of {len(lengths)} steps were rejected", fix
+    return None
+
+
+def _jump_in(path, t, y, h):
+    before, soon, after = (path.at(t, y, share * h) for share in (0.0, 1e-3, 1.0))
+    if not np.all(np.isfinite([before, after])):
+        return None
+    change, explained = np.abs(after - before), 1e3 * np.abs(soon - before)
+    which = int(np.argmax(change))
+    sizes = np.abs(before), np.abs(after)
+    if not change[which] > max(JUMP * np.max(sizes), UNEXPLAINED * explained[which]):
+        return None
+    # With only t, q or v on the other side of the jump.
+    alone = [path.at(t, y, np.where(np.arange(3) == k, h, 0.0))[which] for k in range(3)]
+    by = int(np.argmax(np.abs(alone - before[which])))
+    name, speed = path.names[which], path.velocity(y)[which]
+    return (
+        f"the acceleration of '{name}' changes from {before[which]:.3g} to {after[which]:.3g} within {abs(h):.1g} of "
+        f"t = {t:.9g}, with the {('time', 'position', 'velocity')[by]}",
+        'jumps="found", the default, which reads a comparison off the force itself; or '
+        + (
+            f"name the times at which it does, jump_ts=jnp.array([{t:.9g}, ...])",
+            'a lj.Hybrid with a switch at that position, lj.Switch("before", to="after", when=...)',
+            f"a lj.Hybrid with a switch where the velocity of '{name}' is {speed:.6g}, and, where both sides push back "
+            "to it, a phase that holds it there, when=lj.sticks(...)",
+        )[by],
+    )
+
+
+def _undefined(path, steps):
+    """Accelerations that are not finite just beyond the last state."""
+    t, y, h = steps.t[-1], steps.y[-1], float(steps.h[-1])
+    beyond = path.at(t, y, h)
+    if np.all(np.isfinite(beyond)) or not np.all(np.isfinite(path.at(t, y, 0.0))):
+        return None
+    name = path.names[int(np.argmax(~np.isfinite(beyond)))]
+    return (
+        f"the acceleration of '{name}' is {beyond[~np.isfinite(beyond)][0]} at t = {t + h:.9g}, {abs(h):.1g} beyond",
+        "an L that is defined there (a root or a logarithm of what becomes negative); or ts, or an event, that end "
+        "before",
+    )
+
+
+def _fast(path, steps, implicit):
+    """Find eigenvalues that are large compared with one over a step; decay does not limit an implicit method."""
+    kept = steps.kept
+    if not kept.size:
+        return None
+    t, y, step = steps.t[kept[-1]], steps.y[kept[-1]], float(np.median(np.abs(steps.h[kept])))
+    # Backward in time, decay turns into growth.
+    rates = np.sign(steps.h[kept[-1]]) * path.rates(t, y)
+    if not np.all(np.isfinite(rates)) or np.max(np.abs(rates)) * step < LIMITED:
+        return None
+    fastest = rates[np.argmax(np.abs(rates))]
+    if -fastest.real > abs(fastest.imag):
+        if implicit or -fastest.real * step < UNSTABLE:
+            return None
+        return (
+            f"a stiff system: something decays at a rate of {-fastest.real:.2g} per unit of time, and an explicit "
+            "method needs steps as short as that even after the decay is over",
+            "method=lj.Radau5(), whose steps follow the motion alone",
+        )
+    if fastest.real > abs(fastest.imag):
+        return (
+            f"a motion that grows at a rate of {fastest.real:.2g} per unit of time",
+            "a shorter span, or a looser rtol",
+        )
+    period = 2 * np.pi / abs(fastest.imag)
+    cause = f"an oscillation of period {period:.3g}, of which {steps.left / period:.2g} are left"
+    if not np.any(np.abs(rates) < abs(fastest) / FAST):
+        return cause, "a looser rtol and atol"
+    return (
+        f"{cause}: a stiff spring, or another high frequency on top of the motion",
+        "a constraint in place of the stiff spring, or, where that oscillation does not matter, "
+        "method=lj.Radau5(step_powers=(0, 1)), which does not follow it",
+    )

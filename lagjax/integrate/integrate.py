@@ -1,0 +1,211 @@
+"""The main entry: a trajectory from a system and an initial state.
+
+    check the arguments  ->  one compiled solve by diffrax  ->  say what went wrong, if anything did
+
+Values are examined only outside the compiled program (`integrate/solve/programs.py`), so that it can be cached,
+batched and differentiated.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, PyTree
+
+from lagjax.integrate import arguments
+from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate.dense_output import at
+from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
+from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
+from lagjax.integrate.failure import raise_at_run_time, raise_failure
+from lagjax.integrate.input_warnings import warn_of_odd_dissipation
+from lagjax.integrate.solve.backward_time import in_either_direction, runs_backward
+from lagjax.integrate.solve.error_estimate import steps_to_repeat
+from lagjax.integrate.solve.harvest import patient, report
+from lagjax.integrate.solve.over_jumps import warn_of_lost
+from lagjax.integrate.solve.phases import phases_in, refuse_beside_switches, traced_phases
+from lagjax.integrate.solve.programs import Settings
+from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
+from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
+from lagjax.integrate.trajectory.trajectory import BY_INTEGRATION, Trajectory
+from lagjax.jaxtools.tracing import SILENT, WATCHED, is_traced
+from lagjax.system import coordinates
+from lagjax.system.argument_checks import by_name, check_system
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.system import System
+
+BY_INTEGRATION["at"] = at
+
+
+@by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
+def integrate(
+    system: System | Hybrid,
+    q0: PyTree[ArrayLike],
+    v0: PyTree[ArrayLike],
+    params: PyTree = None,
+    *,
+    ts: Array | np.ndarray | Sequence[float],
+    rtol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    atol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    method: diffrax.AbstractSolver | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: ArrayLike | None = None,
+    max_step: ArrayLike | None = None,
+    jump_ts: ArrayLike | Sequence[float] | None = None,
+    jumps: str = "found",
+    events: Mapping[str, Crossing] | None = None,
+    event: diffrax.Event | None = None,
+    adjoint: diffrax.AbstractAdjoint | Replay | None = None,
+    max_steps: int | None = 2**20,
+    throw: bool = True,
+    progress: bool | None = None,
+    drift: str | None = None,
+    estimate_error: bool | None = None,
+    start: str | ArrayLike | None = None,
+) -> Trajectory:
+    """Integrate Lagrange's equations from (q0, v0) at `ts[0]`, with outputs at `ts`.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+    >>> traj = integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=jnp.array([0.0, 0.2, 0.5]))
+    >>> print(traj.q.round(9))
+    [0.   0.4  0.25]
+
+    **Main arguments:**
+
+    - `system`: the `System`; or a `Hybrid`, a motion in phases.
+    - `q0`, `v0`: initial coordinates and velocities, any pytree of numbers and arrays, alike; `[q]`, `[q]/[t]`. Whole
+      numbers become floats. A list is a pytree, not a vector; angles are in radians. A start that is off the
+      constraints by no more than about the tolerance is moved onto them.
+    - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
+    - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
+      method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
+    - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
+      by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
+      (`lagjax/integrate/stepping/tolerances.py`): at a zero crossing by its size at the end of the step, at rest by
+      its change in a step, and a decaying one over three decades. Give `atol` if small numbers do not matter, such as
+      the stretching of a stiff spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. The
+      size of an angle (a coordinate that enters only through sines and cosines) counts at most as one turn.
+
+    **Other arguments:**
+
+    - `method`: any diffrax solver. By default `lj.Nystrom12()` if there are no constraints and accelerations do not
+      depend on velocities (`lj.explain` says so), `lj.Nystrom8()` if L has a network in it, else `lj.Dopri8()`: the
+      fastest way to an error between 1e-4 and 1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`).
+      With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, as they
+      also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours; diffrax's other methods take 2
+      to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast, and
+      `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter.
+    - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
+    - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
+    - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
+      or a thin barrier, without a warning. No step is longer than this, nor than the time between two outputs.
+    - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0,
+      ...)`, `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the
+      motion across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored"
+      takes forces as they come. See `docs/forces-that-jump.md`.
+    - `jump_ts` (J,): times at which a force jumps or has a kink, in any order, `[t]`, that cannot be read off its
+      program. They become ends of steps, and each step stays on one side of them; derivatives with respect to these
+      times are right.
+    - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
+      ending the motion. Crossings are also found inside steps, several in one, and located to round-off: such a step
+      is taken in parts that end there, but its controller sees it as one. A value that jumps over zero at a switch of
+      a `Hybrid`, as a velocity does in an impact, does not cross it.
+    - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
+      like `events`, under the name "event".
+    - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,
+      which says how much memory reverse mode may use.
+    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events.
+    - `throw`: raise if the integration fails. With `throw=False` the trajectory carries the reason in
+      `result` and NaN from there on.
+    - `progress`: True shows a progress meter. By default only the wait for the compiler is shown, if someone may look.
+    - `estimate_error`: whether to integrate a second time, more precisely, to say in `traj.error` how wrong the motion
+      may be. The default is to do so if nothing is traced, steps are chosen by lagjax or fixed, and there are at most
+      20,000. It then compiles nothing and costs 1.2 to 2 times the solve; inside `jit`, `vmap`, a sweep and derivatives
+      it is one more solve in the program, which is not differentiated. It cannot see what a method damps in both runs
+      alike, as `lj.Radau5(step_powers=(0, 1))` damps fast oscillations.
+    - `start`: the phase of a `Hybrid` in which the motion starts, its name or its number in the order of the phases; by
+      default the first one. A number may be traced, so that each lane of a `vmap`, or each point of a sweep over
+      numbers, starts in its own phase.
+    - `drift`: `"project"` (return to the constraints after every step; the default if there are any),
+      `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
+
+    **Returns:** a `Trajectory`; of a `Hybrid` a `HybridTrajectory`, with the phases and switches.
+
+    **Raises:**
+
+    - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that is not monotonic; a
+      tolerance below the dtype's resolution.
+    - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
+    - `RuntimeError` if the integration stops early: `max_steps` reached, or a step size that collapsed.
+    - Warns (`lj.AccuracyWarning`) if `scaled_error` is above 1: if the estimated error is more than 10,000 tolerances
+      or leaves fewer than three digits; without an estimate, if the Jacobi integral must be constant and changed by
+      1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. For batches look at
+      `scaled_error` yourself.
+    - Warns of what is hardly ever intended: a `dissipation` that is odd in v, as a force is; once in a process
+      (`lj.PrecisionWarning`), float32 that is used only because nothing else was requested.
+
+    Order and accuracy: those of `method`; `tests/integrate/test_orders.py` measures them.
+
+    Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
+    """
+    check_system(system, q0, v0, params, phases=True)
+    arguments.check_method(method)
+    arguments.check_controller(stepsize_controller, max_step, jump_ts)
+    arguments.check_max_steps(max_steps)
+    ts = arguments.vector_of_times(ts)
+    state = coordinates.prepared(ts[0], q0, v0, params)
+    dtype = state.t.dtype
+    system = traced_phases(system.starting(start), state)
+    for phase in system.phases:
+        warn_of_odd_dissipation(phase.dissipation, state)
+    if isinstance(system, Hybrid):
+        refuse_beside_switches(system, state, ts, adjoint, event)
+        guards = phases_in(system, state, crossings_of(events, event))
+    else:
+        guards = guards_of(crossings_of(events, event), system, state)
+    drift, left = arguments.check_drift(drift, system), left_to_diffrax(event)
+    arguments.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
+    settings = Settings(
+        method=method,
+        controller=stepsize_controller,
+        event=left,
+        adjoint=None if isinstance(adjoint, Replay) else adjoint,
+        memory=adjoint.memory if isinstance(adjoint, Replay) else None,
+        rtol=arguments.tolerance(rtol, "rtol", dtype),
+        atol=arguments.tolerance(rtol if atol is None else atol, "rtol" if atol is None else "atol", dtype),
+        by_size=atol is None,
+        dt0=arguments.step_length(dt0, "dt0", dtype),
+        max_step=arguments.step_length(np.inf if max_step is None else max_step, "max_step", dtype),
+        jump_ts=arguments.jumps(jump_ts, dtype),
+        apart=any(isinstance(tol, (tuple, list)) or jnp.ndim(tol) > 0 for tol in (rtol, atol) if tol is not None),
+        max_steps=patient(max_steps),
+        drift=drift,
+        progress=progress,
+        jumps=arguments.check_jumps(jumps),
+        shares=np.array(WHOLE_STEPS, dtype),
+        repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
+    )
+    ts, backward = arguments.times(ts, dtype), runs_backward(ts)
+    trajectory = in_either_direction(system, state.q, state.v, state.params, ts, guards, settings, backward)
+    trajectory = report(trajectory)
+    if throw:
+        trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings, guards)
+    return trajectory
+
+
+def _raise_or_warn(trajectory, start, settings, guards):
+    """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
+    if is_traced(trajectory):
+        # A caller that watches learns the result from the report.
+        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
+    result = trajectory.result
+    if not is_among(result, ENDED_WELL):
+        raise_failure(trajectory, start, settings, guards)
+    if not warn_of_missed_end(trajectory, guards):
+        arguments.warn_of_inaccuracy(trajectory)
+    warn_of_events(trajectory, guards)
+    warn_of_lost(trajectory)
+    return trajectory

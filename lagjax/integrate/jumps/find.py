@@ -1,0 +1,399 @@
+"""The jumps of a system, found in the programs of L, the force and the dissipation.
+
+In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all three are smooth. `found` traces them once,
+on shapes, and gives the smooth system, the guard of each mode, and the times of jumps that depend on t alone.
+
+The times at which a force jumps because of t alone: a pulse, a relay, a square wave.
+
+Where the program compares t itself with a number (`t < off`), that number is the time. All other comparisons of
+functions of t are evaluated on a fine grid, and each change is bisected; Newton's formula then gives the last digits,
+and the derivatives. The times become ends of steps.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.jaxtools.jaxpr import outputs_of, run
+from lagjax.jaxtools.open_jumps import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps
+from lagjax.system.coordinates import State
+from lagjax.system.function_arguments import OF_STATE, takes_of
+from lagjax.system.model import model_of
+from lagjax.system.system import System
+
+# More modes than this are not followed: each adds to the program that watches the motion.
+MOST = 24
+NAMES = {"lagrangian": "Lagrangian", "force": "force", "dissipation": "dissipation"}
+ROLES = tuple(NAMES)
+
+
+class Given(NamedTuple):
+    """The parameters, and the modes (n,): what the functions of the smooth system take as `params`.
+
+    `slides` (n,): along which of the jumps the motion slides. `free`: whether the comparisons decide themselves, as in
+    the user's own functions.
+    """
+
+    params: PyTree
+    modes: Float[Array, " n"]
+    slides: Bool[Array, " n"]
+    free: Bool[Array, ""]
+
+
+class Smooth(eqx.Module):
+    """One of the user's functions as a function of the state and of `Given`; or a number from its program."""
+
+    function: Callable
+    program: Any = eqx.field(static=True)
+    shape: Any = eqx.field(static=True)
+    takes: tuple[str, ...] = eqx.field(static=True)
+    # The shapes of multipliers by name, for a number that does not depend on them but whose program takes them.
+    multipliers: tuple = eqx.field(static=True, default=())
+
+    def __call__(self, *arguments):
+        *state, given = arguments
+        if self.multipliers:
+            state = [*state, {name: jnp.zeros(shape, state[0].dtype) for name, shape in self.multipliers}]
+        leaves = leaves_of(self.function, (*state, given.params))
+        return jtu.tree_unflatten(self.shape, run(self.program, [*leaves, given.modes, given.free]))
+
+
+class OfParams(eqx.Module):
+    """A user's function that no jump was found in, or looked for, as a function of `Given`."""
+
+    function: Callable
+
+    @property
+    def takes(self):
+        return takes_of(self.function)
+
+    def __call__(self, *arguments):
+        *state, given = arguments
+        return self.function(*state, given.params)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedFunction:
+    """The opened program of one function: its results, then the guards, the modes beyond and the differences.
+
+    `places`: for each mode of the system whose guard this program gives, its number.
+    """
+
+    program: Any
+    shape: Any
+    takes: tuple[str, ...]
+    places: tuple[int, ...]
+    multipliers: tuple
+    # For each jump in t alone, the first of its results in the program, and what is known of it.
+    of_time: tuple[tuple[int, Timed], ...]
+
+    def zeros(self, dtype):
+        """Zero multipliers by name."""
+        return {name: jnp.zeros(shape, dtype) for name, shape in self.multipliers}
+
+    def no_modes(self, dtype):
+        """Modes that do not count, since the comparisons are free."""
+        return jnp.zeros(self.program.in_avals[-2].shape, dtype), jnp.asarray(True)
+
+
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """What was found in a system: the slots of its modes, in order, and the traced functions by role.
+
+    `missed`: what is not followed, in words.
+    """
+
+    slots: tuple[Slot, ...]
+    traced: dict[str, OpenedFunction]
+    missed: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """The number of modes."""
+        return sum(int(np.prod(slot.shape)) for slot in self.slots)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether there are jumps that depend on t alone."""
+        return any(traced.of_time for traced in self.traced.values())
+
+    def in_words(self) -> list[str]:
+        """What was found, in words, and in which function."""
+        of_state = [
+            f"{'a comparison' if slot.kind in COMPARISONS else slot.kind} of "
+            f"{', '.join(x for x in 'tqv' if x in slot.depends)} "
+            f"in the {' and the '.join(NAMES[role] for role in ROLES if role in slot.roles)}"
+            for slot in self.slots
+        ]
+        of_time = [f"t in the {NAMES[role]}" for role, traced in self.traced.items() for _ in traced.of_time]
+        counts = Counter(of_state + of_time)
+        return [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
+
+    def each(self) -> list[Slot]:
+        """The slot of each mode."""
+        return [slot for slot in self.slots for _ in range(int(np.prod(slot.shape)))]
+
+    def smooth(self, system: System) -> System:
+        """The system as a function of `Given` in place of its parameters."""
+        return system.map(self._smooth)
+
+    def _smooth(self, function, role):
+        if role not in self.traced:
+            return OfParams(function)
+        traced = self.traced[role]
+        program = outputs_of(traced.program, range(traced.shape.num_leaves))
+        return Smooth(function, program, traced.shape, traced.takes)
+
+    def numbers(self, system: System, which: int) -> list[Callable]:
+        """For each mode a function of (t, q, v, given): its guard (0), the mode beyond (1), the difference (2)."""
+        found: list[Any] = [None] * self.count
+        for role, traced in self.traced.items():
+            for k, place in enumerate(traced.places):
+                output = traced.shape.num_leaves + 4 * k + which
+                program = outputs_of(traced.program, [output])
+                function, one = getattr(system, role), jtu.tree_structure(0)
+                found[place] = Smooth(function, program, one, OF_STATE, traced.multipliers)
+        return found
+
+    def modes(self, system: System, *state) -> Float[Array, " n"]:
+        """The modes at a state, as the user's comparisons say."""
+        *_, params = state
+        dtype = jnp.result_type(state[0])
+        free = Given(params, jnp.zeros(self.count, dtype), jnp.zeros(self.count, bool), jnp.asarray(True))
+        return jnp.stack([f(*state[:-1], free).astype(dtype) for f in self.numbers(system, 3)])
+
+
+def found(system: System, t, q, v, params) -> Jumps | None:
+    """The jumps and kinks of a system; None if there are none. Only shapes of the state count."""
+    state = State(t, q, v, params)
+    programs = {role: _traced(getattr(system, role), system, state) for role in ROLES if getattr(system, role)}
+    programs = {role: traced for role, traced in programs.items() if has_jumps(traced.program.jaxpr)}
+    if not programs:
+        return None
+    table = JumpTable()
+    for role, traced in programs.items():
+        _opened(traced, role, table, lambda key, actual: actual)
+    missed = list(table.missed)
+    sizes = {key: int(np.prod(slot.shape)) for key, slot in table.slots.items()}
+    if sum(sizes.values()) > MOST:
+        missed.append(f"{sum(sizes.values())} comparisons, of which at most {MOST} are followed")
+        sizes = {}
+    slots = {key: table.slots[key] for key in sizes}
+    starts = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist()))
+    count, defined, opened = sum(sizes.values()), set(), {}
+    for role, traced in programs.items():
+        opened[role] = _with_modes(traced, role, table, starts, count, defined)
+    known = Jumps(tuple(slots.values()), opened, tuple(missed))
+    return known if known.count or known.in_time or known.missed else None
+
+
+class _Program(NamedTuple):
+    program: Any
+    inputs: list[tuple[tuple, frozenset]]
+    shape: Any
+    takes: tuple[str, ...]
+    multipliers: tuple
+
+
+def _traced(function, system, state: State) -> _Program:
+    """The program of a function, with the numbers of its inputs, and on what of the state each depends."""
+    takes = takes_of(function)
+    zeros = model_of(system, *state).zero_multipliers() if "multipliers" in takes else {}
+    given = state._asdict() | {"multipliers": zeros}
+    arguments = tuple(given[name] for name in takes)
+    shapes = []
+
+    def of_leaves(*leaves):
+        filled = iter(leaves)
+        arrays, static = eqx.partition((function, arguments), eqx.is_array)
+        arrays = jtu.tree_map(lambda _: next(filled), arrays)
+        function_, arguments_ = eqx.combine(arrays, static)
+        result, shape = jtu.tree_flatten(function_(*arguments_))
+        shapes.append(shape)
+        return result
+
+    leaves = leaves_of(function, arguments)
+    program = jax.make_jaxpr(of_leaves)(*leaves)
+    inputs = [(("function", id(function), i), frozenset()) for i in range(len(leaves_of(function, ())))]
+    for name, argument in zip(takes, arguments):
+        depends = frozenset() if name == "params" else frozenset({name})
+        inputs += [((name, i) if name != "t" else ("t",), depends) for i in range(len(leaves_of(None, argument)))]
+    multipliers = tuple((name, x.shape) for name, x in zeros.items())
+    return _Program(program, inputs, shapes[0], takes, multipliers)
+
+
+def _opened(traced: _Program, role, table, mode):
+    """Walk over a program on shapes: the walk."""
+    walks = []
+
+    def walk(*leaves):
+        walks.append(JumpOpening(table, role, mode))
+        known = [KnownValue(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
+        return [x.value for x in walks[-1].run(traced.program, known)]
+
+    jax.eval_shape(walk, *traced.program.in_avals)
+    return walks[-1]
+
+
+def _with_modes(traced: _Program, role, table, starts, count, defined) -> OpenedFunction:
+    dtype = next(x.dtype for x in traced.program.in_avals if jnp.issubdtype(x.dtype, jnp.floating))
+    places, of_time = [], []
+
+    def walk(*leaves):
+        *leaves, modes, free = leaves
+
+        def mode(key, actual):
+            if key not in starts:
+                return actual
+            known = modes[starts[key] : starts[key] + actual.size].reshape(actual.shape)
+            return jnp.where(free, actual, known)
+
+        opening = JumpOpening(table, role, mode)
+        known = [KnownValue(x, table.number(*key), depends) for x, (key, depends) in zip(leaves, traced.inputs)]
+        results = [x.value for x in opening.run(traced.program, known)]
+        for key, inside in opening.inside.items():
+            if key not in starts or key in defined:
+                continue
+            defined.add(key)
+            for i in range(inside.guard.size):
+                places.append(starts[key] + i)
+                results += [jnp.ravel(x)[i] for x in (inside.guard, inside.beyond, inside.raw, inside.actual)]
+        for timed in opening.timed.values():
+            of_time.append((len(results), timed._replace(actual=None, x=None, at=timed.at is not None, table=None)))
+            given = (timed.actual, timed.x) if timed.at is None else (timed.at,)
+            results += [jnp.ravel(x) for x in given]
+            results += [] if timed.table is None else [timed.table]
+        return results
+
+    modes = jax.ShapeDtypeStruct((count,), dtype), jax.ShapeDtypeStruct((), bool)
+    program = jax.make_jaxpr(walk)(*traced.program.in_avals, *modes)
+    return OpenedFunction(program, traced.shape, traced.takes, tuple(places), traced.multipliers, tuple(of_time))
+
+
+def leaves_of(function, arguments):
+    """The arrays in a function and its arguments."""
+    return jtu.tree_leaves(eqx.filter((function, arguments), eqx.is_array))
+
+
+# Functions of t are evaluated at so many times of a motion; and the most of their jumps that are followed.
+SAMPLES, ROOM = 4096, 256
+BISECTIONS, NEWTON = 60, 2
+# A step of Newton's formula beyond this part of the motion says that the number jumps, and has no zero there.
+SMALL = 1e-9
+
+
+class Results(NamedTuple):
+    """The comparisons of functions of t at a time: their modes, the numbers that are compared, and the value of these
+    at which the mode changes."""
+
+    modes: Array
+    x: Array
+    changes_at: Array
+
+
+def with_jumps_in_time(jumps: Jumps, jump_ts, system, q, v, params, ts):
+    """The times of the jumps that the user named, and of those that were found, in no order; and whether there are too
+    many of the latter, which are then left out."""
+    found, sought, too_many = [] if jump_ts is None else [jump_ts], [], jnp.asarray(False)
+    for role, traced in jumps.traced.items():
+        arguments = {"q": q, "v": v, "params": params, "multipliers": traced.zeros(ts.dtype)}
+        of_role = traced, getattr(system, role), arguments
+        found += [jnp.ravel(x) for x in _at(ts[0], [place for place, timed in traced.of_time if timed.at], *of_role)]
+        sought += [of_role] if any(not timed.at for _, timed in traced.of_time) else []
+    if sought:
+        times, too_many = _sought(sought, ts)
+        found.append(times)
+    return jnp.concatenate([x.astype(ts.dtype) for x in found]), too_many
+
+
+def _at(t, outputs, traced: OpenedFunction, function, arguments):
+    """Some results of the program at a time; jumps in t alone do not depend on the rest of the state."""
+    if not outputs:
+        return []
+    state = tuple((arguments | {"t": t})[name] for name in traced.takes)
+    modes, free = traced.no_modes(t.dtype)
+    return run(outputs_of(traced.program, outputs), [*leaves_of(function, state), modes, free])
+
+
+def _results(roles, t, before=None, after=None) -> Results:
+    """All comparisons of all roles at a time, and where those whose modes are `before` and `after` it change."""
+    modes, x, at, start = [], [], [], 0
+    for traced, function, arguments in roles:
+        listed = [(place, timed) for place, timed in traced.of_time if not timed.at]
+        places = [place + i for place, timed in listed for i in range(3 if timed.rule == "place" else 2)]
+        values = iter(_at(t, places, traced, function, arguments))
+        for _, timed in listed:
+            mode, number = (jnp.ravel(next(values)) for _ in range(2))
+            table = next(values) if timed.rule == "place" else None
+            here = slice(start, start + mode.size)
+            modes, x, start = [*modes, mode], [*x, number], start + mode.size
+            if before is None or after is None:
+                at.append(mode)
+            else:
+                at.append(_between(timed.rule, before[here], after[here], table))
+    return Results(*(jnp.concatenate(y).astype(t.dtype) for y in (modes, x, at)))
+
+
+def _between(rule, before, after, table):
+    """The number at which a mode changes."""
+    if rule == "above":
+        return jnp.zeros_like(before)
+    if rule == "place":
+        return table[jnp.maximum(before, after).astype(int) - 1]
+    if rule == "floor":
+        return jnp.maximum(before, after)
+    if rule == "ceil":
+        return jnp.minimum(before, after)
+    if rule == "round":
+        return 0.5 * (before + after)
+    return jnp.where(jnp.abs(after) > jnp.abs(before), after, before)
+
+
+def _sought(roles, ts):
+    fixed = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, (roles, ts))
+    roles_fixed, (first, last) = fixed[0], (fixed[1][0], fixed[1][-1])
+    modes_at = lambda t: _results(roles_fixed, t).modes
+    grid = first + (last - first) * jnp.linspace(0.0, 1.0, SAMPLES + 1, dtype=ts.dtype)
+    modes = jax.vmap(modes_at)(grid)
+    changes = modes[1:] != modes[:-1]
+    count = changes.shape[1]
+    number = jnp.where(changes, jnp.arange(changes.size).reshape(changes.shape), changes.size)
+    # The first ones, in order of time.
+    number = jnp.sort(jnp.ravel(number))[:ROOM]
+    too_many = jnp.sum(changes) > ROOM
+    there, number = (number < changes.size) & ~too_many, jnp.minimum(number, changes.size - 1)
+    low, high = grid[number // count], grid[number // count + 1]
+    mine = lambda modes: jnp.take_along_axis(modes, (number % count)[:, None], axis=1)[:, 0]
+    each = jax.vmap(modes_at)
+    before = mine(each(low))
+
+    def halve(_, ends):
+        low, high = ends
+        middle = 0.5 * (low + high)
+        same = mine(each(middle)) == before
+        return jnp.where(same, middle, low), jnp.where(same, high, middle)
+
+    low, high = lax.fori_loop(0, BISECTIONS, halve, (low, high))
+    before, after = each(low), each(high)
+
+    def difference(t, component, before, after):
+        found = _results(roles, t, before, after)
+        return (found.x - found.changes_at)[component]
+
+    along = lambda t, *rest: jax.jvp(lambda t: difference(t, *rest), (t,), (jnp.ones_like(t),))
+    t = high
+    for _ in range(NEWTON):
+        g, rate = jax.vmap(along)(t, number % count, before, after)
+        step = -g / jnp.where(rate != 0, rate, 1.0)
+        near = (jnp.abs(step) <= SMALL * (last - first)) & (rate != 0)
+        t = t + jnp.where(near, step, 0.0)
+    return jnp.where(there, t, ts[-1]), too_many

@@ -1,0 +1,474 @@
+"""Integrate one motion from its start to its end, event or failure: start, diffrax's loop, outputs, result.
+
+No Python code here branches on values: a start that cannot be integrated is refused inside the program, which then
+ends within a few rejected steps, and the lane keeps the reason in its result.
+
+Stepping through a motion by diffrax's loop, with outputs at given times and with guards followed on the way.
+"""
+
+import importlib.util
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, PyTree
+
+from lagjax.integrate.adjoint.replay import Replay, replayed
+from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, with_room
+from lagjax.integrate.events.brackets import Sight
+from lagjax.integrate.events.detect import EventController
+from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
+from lagjax.integrate.solve.error_estimate import ROUND_OFFS
+from lagjax.integrate.stepping.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
+from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
+from lagjax.integrate.stepping.tolerances import (
+    AsNothing,
+    PerCoordinateTolerance,
+    Scales,
+    Tolerances,
+    rounding,
+    scales_of,
+    shared,
+    span_of,
+    tolerances_at,
+)
+from lagjax.integrate.trajectory.results import RESULTS, ended_well
+from lagjax.integrate.trajectory.trajectory import Snapshot, worst_drift
+from lagjax.jaxtools.fuse_cpu import calls_host, one_function
+from lagjax.jaxtools.trees import like, stop_gradient
+from lagjax.mechanics.equations import Equations, all_finite, equations_of
+from lagjax.mechanics.projection import returned, within, worst_residual
+from lagjax.mechanics.structure import are_angles, conserves_jacobi_integral
+from lagjax.numerics.methods.nystrom import Nystrom
+from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
+from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
+from lagjax.system import coordinates
+from lagjax.system.coordinates import State
+from lagjax.system.model import model_of
+
+# Packages whose checks at run time are known to pass, since `solve` examines their subjects itself.
+CHECKED_PACKAGES = {"lagjax", "diffrax", "optimistix"}
+# Baumgarte's feedback decays a violation by e this many times over the time span.
+BAUMGARTE_DECAYS = 50.0
+
+
+class Solution(NamedTuple):
+    """The result of the loop: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
+
+    `located`: where guards are zero; None without guards. `record`: that of the steps, if they can be replayed.
+    """
+
+    reached: Float[Array, " T"]
+    outputs: PyTree[Float[Array, "T ..."]]
+    end: tuple[Float[Array, " 1"], PyTree[Float[Array, "1 ..."]]]
+    stats: dict[str, Array]
+    result: diffrax.RESULTS
+    located: Located | None
+    record: Recorded | None = None
+
+
+def solution_of(
+    equations: Equations, start: State, y0, refused, scales: Scales | None, ts, guards, settings, adjoint
+) -> Solution:
+    """Step through a motion by diffrax; if `refused`, end within a few steps. Without `scales` by `atol` alone."""
+    problem = (equations, start, y0, refused, scales)
+    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
+        return _loop(*problem, settings, ts, adjoint, guards)
+    # In reverse mode diffrax differentiates only outputs: crossings, once their times are known, become outputs.
+    first = _loop(*stop_gradient((*problem, settings, ts)), diffrax.ForwardMode(), stop_gradient(guards))
+    end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
+    times = jnp.concatenate([ts, first.located.t])
+    times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
+    order = jnp.argsort(times)
+    without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
+    second = _loop(*problem, without, times[order], adjoint, repeated=True)
+    place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
+    of_outputs, of_crossings = (
+        jax.tree.map(lambda x: x[place[part]], second.outputs) for part in (slice(ts.size), slice(ts.size, None))
+    )
+    return first._replace(
+        reached=jnp.where(jnp.isfinite(second.reached[place[: ts.size]]), first.reached, jnp.inf),
+        outputs=of_outputs,
+        end=second.end,
+        located=at_known_times(guards, equations, resolution(ts), first.located, of_crossings, bent),
+    )
+
+
+def _possible_adjoint(adjoint, settings):
+    """Return the adjoint; diffrax's own instead of a `Replay` if a motion is not stepped from output to output."""
+    replayable = _arriving(settings) and not settings.progress
+    return diffrax.RecursiveCheckpointAdjoint() if isinstance(adjoint, Replay) and not replayable else adjoint
+
+
+def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
+    adjoint = _possible_adjoint(adjoint, settings)
+    feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
+    fast, written = None, equations.written
+    if written is not None and feedback is None:
+        unrolled = written.equations.length <= settings.unroll_up_to
+        fast = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
+    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and outputs but no separate end.
+    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))
+    controller = _controller(equations, start, ts, settings, scales, bare, repeated)
+    terms = diffrax.ODETerm(Field(equations, feedback) if fast is None else FastField(equations))
+    if bare:
+        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
+    else:
+        solver = _solver(equations, fast, feedback, refused, settings, adjoint)
+        subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
+        saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
+    if guards is not None:
+        controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
+    arguments = (
+        terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
+    )  # fmt: skip
+    solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
+    calls_python = lambda: _user_calls_python(equations, terms, start, guards, settings, controller)
+    if isinstance(adjoint, Replay):
+        assert isinstance(controller, StepToOutputs)
+        first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
+        problem = StepProblem(
+            terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
+        )  # fmt: skip
+        problem = with_room(problem, settings.memory)
+        return _replayed(replayed(problem, settings.max_steps, not calls_python(), adjoint), ts)
+    # Reverse mode needs the operations inside, so the solve is then not wrapped.
+    if isinstance(adjoint, diffrax.ForwardMode):
+        reached, outputs, *rest = one_function(solve, *arguments, checked=not calls_python(), in_blocks=True)
+    else:
+        reached, outputs, *rest = solve(*arguments)
+    assert reached is not None and outputs is not None
+    if bare:
+        end = jax.tree.map(lambda x: x[-1:], (reached, outputs))
+    else:
+        (reached, end_t), (outputs, end_y) = reached, outputs
+        end = end_t, end_y
+    return Solution(reached, outputs, end, *rest)
+
+
+def _replayed(found: Recorded, ts) -> Solution:
+    end = found.t[None], jax.tree.map(lambda x: x[None], found.y)
+    return Solution(jnp.where(found.reached, ts, jnp.inf), found.outputs, end, found.stats, found.result, None, found)
+
+
+def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
+    solution = diffrax.diffeqsolve(
+        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
+        event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
+    )  # fmt: skip
+    watching = isinstance(controller, EventController)
+    located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
+    return solution.ts, solution.ys, solution.stats, solution.result, located
+
+
+def _user_calls_python(equations, terms, start, guards, settings, controller):
+    """Whether the user's functions, method or controller may call Python at run time, if only to check something.
+
+    If not, only diffrax's checks are left. They concern the times and the first step, which `solve` examines itself.
+    """
+    parts = (settings.method, settings.controller)
+    if any(part is not None and type(part).__module__.split(".")[0] not in CHECKED_PACKAGES for part in parts):
+        return True
+    (t, q, v, params), written = start, equations.written
+    if written is None:
+        traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
+    else:
+        traced = []
+        if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
+            return True
+    if guards is not None:
+        multipliers = equations.model.zero_multipliers()
+        traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
+    conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
+    given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
+    given |= dict(saveat=None, stepsize_controller=controller)
+    for condition in conditions:
+        traced.append(jax.make_jaxpr(lambda t, y, condition=condition: condition(t, y, params, **given))(t, (q, v)))
+    return any(calls_host(program.jaxpr) for program in traced)
+
+
+def method_alone(settings, method):
+    """Return a method as it steps a motion on equations that are not written out."""
+    return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
+
+
+def _with_root_finder(settings, scales):
+    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
+    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
+    if scales is not None and isinstance(method, Radau5):
+        as_nothing = AsNothing(scales, settings.rtol)
+        ours = isinstance(method.root_finder, SimplifiedNewton)
+        tolerances = settings.rtol[0], as_nothing if ours else as_nothing(jnp.zeros_like(scales.first))
+    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
+        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
+    return with_tolerances(method, *tolerances)
+
+
+def _solver(equations, fast, feedback, refused, settings, adjoint):
+    return ProjectedSolver(
+        solver=_in_a_loop(settings.method, adjoint),
+        equations=equations,
+        fast=fast,
+        feedback=feedback,
+        refused=refused,
+        tolerances=Tolerances(settings.rtol, settings.atol),
+        controlled=settings.controller is None,
+        project=settings.drift == "project",
+        arriving=_arriving(settings),
+        jump_ts=settings.jump_ts,
+    )
+
+
+def _in_a_loop(method, adjoint):
+    """Return the method with a loop over its stages, of the kind that the derivative needs."""
+    if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
+        return replace(method, in_a_loop=True)
+    # A subclass may have a tableau of its own, which diffrax's implementation does not know.
+    ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
+    method = method.shipped if ours else method
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint | Replay):
+        return forward_differentiable(method)
+    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
+
+
+def _arriving(settings):
+    # A user's controller chooses its steps itself; a condition for diffrax may read the controller's tolerances.
+    return settings.controller is None and settings.event is None
+
+
+def _controller(equations, start, ts, settings, scales, bare, repeated):
+    if settings.controller is not None:
+        return settings.controller
+    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
+    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
+    controller = diffrax.PIDController(
+        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
+        force_dtmin=False,
+    )  # fmt: skip
+    angle = tuple(are_angles(equations.model).tolist())
+    if not bare and (scales is not None or settings.apart or any(angle)):
+        controller = PerCoordinateTolerance(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
+    arriving = _arriving(settings) and not bare
+    if settings.jump_ts is None and not repeated:
+        return StepToOutputs(controller, ts, settings.shares) if arriving else controller
+    jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
+    return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
+
+
+def resolution(ts):
+    """Return the smallest difference of two times that can be told apart."""
+    return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+
+
+def _by_position(event):
+    """Return the user's event with `args` by position: diffrax passes it by name, but a user may call it `params`."""
+    if event is None:
+        return None
+    wrap = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
+    return diffrax.Event(jax.tree.map(wrap, event.cond_fn, is_leaf=callable))
+
+
+def _progress_meter(progress):
+    if not progress:
+        return diffrax.NoProgressMeter()
+    if importlib.util.find_spec("tqdm") is None:
+        return diffrax.TextProgressMeter()
+    return diffrax.TqdmProgressMeter()
+
+
+# A start may be off the constraints by this many tolerances; it is then moved onto them.
+START_TOLERANCES = 100.0
+# A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
+DRIFT_TOLERANCES = 1e3
+# That change times the number of steps is about twenty times the phase shift in radians; 0.01 rad is allowed.
+PHASE_STEPS = 0.2
+# With fixed steps no tolerance says what change to expect.
+FIXED_STEPS_ALLOW = 1e-5
+# Results that the robust solve would give as well.
+UNAFFECTED = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
+# diffrax's results and the names of ours that replace them.
+TRANSLATED = {
+    "nonfinite_input": "not_finite",
+    "nonlinear_divergence": "unsolved_step",
+    "nonlinear_max_steps_reached": "unsolved_step",
+}
+
+
+def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=None):
+    """Return the fields of the trajectory of one system by name, with `settled`: whether the robust solve would agree.
+
+    `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
+    """
+    ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
+    # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
+    fast = ours and settings.event is None
+    equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
+    if guards is not None and equations.users is not None:
+        guards = guards.in_numbers(equations.users.tree)
+    q, v = equations.inside(q0), equations.inside(v0)
+    start = _start(equations, q, v, ts, settings, sizes_so_far)
+    settings = replace(settings, atol=start.atol)
+    solution = _stepped(equations, start, ts, guards, settings, adjoint)
+    outputs = _outputs(equations, start, solution, ts, settings)
+    fields = _result(equations, start, solution, outputs, guards, settings)
+    rows = jax.vmap(equations.outside)
+    end, events = fields["end"], fields["events"]
+    return fields | {
+        "record": solution.record,
+        "q": rows(fields["q"]),
+        "v": rows(fields["v"]),
+        "end": end._replace(q=equations.outside(end.q), v=equations.outside(end.v)),
+        "events": {name: found.with_states(rows(found.q), rows(found.v)) for name, found in events.items()},
+    }
+
+
+class Start(NamedTuple):
+    """The first state, moved onto the constraints; `against`: which reasons to refuse it hold, by names of `RESULTS`.
+
+    `atol`: as given, or by the state's size; `scales`: those of the motion, if tolerances are relative to its size.
+    """
+
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    against: dict[str, Bool[Array, ""]]
+    refused: Bool[Array, ""]
+    atol: Float[Array, " 2"]
+    scales: Scales | None
+
+
+class Outputs(NamedTuple):
+    """The motion at the outputs and, as the last row, at its end; which outputs were `reached`; which are finite.
+
+    At outputs that were not reached it is the start's state.
+    """
+
+    motion: Snapshot
+    reached: Bool[Array, " T"]
+    sound: Bool[Array, " T"]
+
+
+def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
+    """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
+    t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
+    if settings.drift == "project":
+        q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
+    a, _, finite, singular, contradictory, mass = stop_gradient(equations.verdict(t, q, v))
+    tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
+    if equations.model.m:
+        off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
+        if settings.drift == "project" and not equations.are_taken_for_regular:
+            off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
+    scales = scales_of(mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))) if settings.by_size else None
+    if scales is not None and sizes_so_far is not None:
+        scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
+    too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
+    lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
+    against = {
+        "start_singular": singular,
+        "start_not_finite": ~finite,
+        "contradictory": contradictory,
+        "start_off_constraints": off_constraints,
+        "tolerance_too_small": jnp.asarray(too_small),
+        "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
+    }
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), atol, scales)
+
+
+def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
+    y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+    first = State(ts[0], start.q, start.v, equations.model.params)
+    if settings.dt0 is not None:
+        # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
+        settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
+    solution = solution_of(equations, first, y0, start.refused, start.scales, ts, guards, settings, adjoint)
+    if solution.located is None:
+        return solution
+    end = end_of(guards, solution.located, *solution.end)
+    # The step in which the event ended the motion goes on beyond the event.
+    return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
+
+
+def _outputs(equations, start, solution, ts, settings) -> Outputs:
+    # Outputs not reached get the start state and are masked afterwards: NaN times zero would poison gradients.
+    reached = jnp.isfinite(solution.reached) & ~start.refused
+    states = jax.tree.map(lambda x, x0: jnp.where(like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
+    if settings.jump_ts is not None:
+        states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
+    # One compiled evaluation for the outputs and the end together.
+    t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
+    sound = jax.vmap(all_finite)((q, v))[:-1]
+    return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached, sound)
+
+
+def _result(equations, start, solution, outputs, guards, settings):
+    """The fields of the trajectory: NaN at outputs that it did not reach, and the reason."""
+    (motion, reached, sound), located = outputs, solution.located
+    result = RESULTS.promote(solution.result)
+    for reported, ours in TRANSLATED.items():
+        result = RESULTS.where(result == getattr(RESULTS, reported), getattr(RESULTS, ours), result)
+    # An output is a step of its own, and can fail although the steps of the solve did not.
+    known = jnp.all(sound)
+    regular = equations.are_taken_for_regular
+    if regular:
+        known = known & jnp.all(jnp.isfinite(coordinates.flatten(motion.multipliers)[0]))
+        known = known if located is None else known & all_known(located)
+    result = RESULTS.where(ended_well(result) & ~known, RESULTS.unsolved_step, result)
+    for name, holds in start.against.items():
+        result = RESULTS.where(holds, getattr(RESULTS, name), result)
+    stats = {name: jnp.asarray(count) for name, count in solution.stats.items() if name != "max_steps"}
+    change = _scaled_error(stop_gradient(equations), *stop_gradient((motion.t, motion.q, motion.v)), stats, settings)
+    # Nothing is known from the first failed output on; the motion then ends at the output before it.
+    up_to = jnp.cumsum(~sound) == 0
+    masked = jax.tree.map(lambda x: jnp.where(like(reached & up_to, x), x[:-1], jnp.nan), motion)
+    last = jnp.where(jnp.all(up_to), sound.size, jnp.maximum(jnp.sum(up_to) - 1, 0))
+    end = jax.tree.map(lambda x: jnp.where(start.refused, jnp.nan, x[last]), motion)._replace(t=motion.t[last])
+    return {
+        "q": masked.q,
+        "v": masked.v,
+        "multipliers": masked.multipliers,
+        "end": end,
+        "stats": stats,
+        "tolerance": (settings.rtol, _absolute(stop_gradient((motion.q, motion.v)), start.scales, settings)),
+        "scaled_error": jnp.where(ended_well(result), change, jnp.inf),
+        "result": result,
+        "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
+        "events": {} if located is None else by_name(guards, located, end.t[None], ~start.refused),
+    }
+
+
+def _absolute(states, scales, settings):
+    """The given `atol`; or, if tolerances follow the motion's own size, what was as good as zero on it, (2, n)."""
+    if scales is None:
+        return settings.atol
+    sizes = [coordinates.flatten(jax.tree.map(lambda x: jnp.max(jnp.abs(x), axis=0), y))[0] for y in states]
+    return rounding(shared(scales, jnp.stack(sizes)))
+
+
+def _scaled_error(equations, t, q, v, stats, settings):
+    """The change of quantities that must stay constant, at the outputs, in units of what the tolerance lets expect.
+
+    An error of the Jacobi integral that grows steadily shifts the phase by about its size per radian, so over very
+    many steps less of it is allowed. If the tolerance does not choose the steps, only the change itself counts.
+    """
+    model, drift, residual = equations.model, jnp.zeros_like(t[0]), jnp.zeros_like(t[0])
+    if conserves_jacobi_integral(model):
+        drift = worst_drift(model, t, q, v)
+    if model.m and settings.drift != "project":
+        residual = worst_residual(model, t, q, v)
+    if settings.controller is not None:
+        return jnp.maximum(drift, residual) / FIXED_STEPS_ALLOW
+    rtol = jnp.maximum(settings.rtol[0], jnp.finfo(t.dtype).eps)
+    phase = drift * stats["num_accepted_steps"] / PHASE_STEPS
+    return jnp.maximum(jnp.maximum(drift, residual) / (DRIFT_TOLERANCES * rtol), phase)
+
+
+def _among(result, others):
+    return jnp.any(jnp.stack([result == other for other in others]))

@@ -1,0 +1,325 @@
+"""A motion over the jumps and kinks of its forces: one solve after another, each in one mode (`jumps/find.py`).
+
+In a mode the equations are smooth, and each leg ends where the guard of one of its comparisons is zero. There the mode
+changes and the state does not; the time and the state carry their derivatives (`event_times.py`) into the next leg,
+so that derivatives of all orders get the jump: with the flows φ₋ and φ₊ of both sides and the time τ at which a
+neighbouring motion crosses, the neighbour goes on from φ₊(-τ) φ₋(τ). If both sides push the motion back it goes along
+the jump (`integrate/jumps/sliding.py`), until a share of the mixture leaves [0, 1].
+
+After very many jumps, and where a mode turns out to be wrong, the rest of the motion is integrated with the comparisons
+as they are, which is right too, with more steps and without the jumps' part of the derivatives; `stats["lost_jumps"]`
+says so.
+
+Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`integrate/jumps/find.py`).
+
+Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.integrate.events.brackets import uneven
+from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
+from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
+from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
+from lagjax.integrate.solve.one_motion import resolution, solved
+from lagjax.integrate.solve.segments import AT_ONCE, NOT_BELOW, ROWS, nothing, reached, sizes_of, with_those_of
+from lagjax.integrate.stepping.tolerances import DIED_OUT
+from lagjax.integrate.trajectory.results import RESULTS, ended_well
+from lagjax.integrate.trajectory.trajectory import Snapshot
+from lagjax.jaxtools.fuse_cpu import apart
+from lagjax.jaxtools.open_jumps import IN_TIME
+from lagjax.jaxtools.trees import like, stop_gradient, where
+from lagjax.system.model import model_of
+from lagjax.system.system import System
+from lagjax.system.warn import warn
+
+# The most jumps that are followed in a motion.
+MOST_JUMPS = 1000
+
+
+class JumpWarning(UserWarning):
+    """A force jumps or has a kink where the motion is not followed across it: derivatives may lack a part."""
+
+
+def warn_of_missed(missed: Sequence[str]):
+    """Say which jumps are not followed."""
+    warn(
+        f"not followed across its jumps or kinks: {'; '.join(dict.fromkeys(missed))}.\n"
+        "The motion is right to its tolerance, but takes more steps, and where such a number changes its branch, "
+        "derivatives lack the part that is due to the change.\n"
+        "Usual cause: a network with relu, a comparison inside lax.scan, a force with a comparison in a phase.\n"
+        "Fix: a smooth function in its place (jax.nn.softplus, jnp.tanh), the comparison outside of the loop, or "
+        'jumps="ignored" if it does not matter.',
+        JumpWarning,
+    )
+
+
+def with_lost(stats, too_many):
+    """The statistics of a motion, with jumps in time that were too many to be followed."""
+    known = {"num_jumps": jnp.asarray(0), "lost_jumps": jnp.asarray(False)} | stats
+    return known | {"lost_jumps": known["lost_jumps"] | too_many}
+
+
+def warn_of_lost(trajectory):
+    """Say that a motion could not be followed across all its jumps."""
+    if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
+        count = int(trajectory.stats["num_jumps"])
+        why = f"after {count} jumps" if count else "at all, or not across those in time, more than 256"
+        warn(
+            f"the motion was not followed across the jumps of its forces {why}; there forces were taken as they come: "
+            "the motion is right to its tolerance, and derivatives lack the part that is due to those jumps.\n"
+            "Usual cause: a comparison at the end of a function's domain (arccos, sqrt), a control that chatters, a "
+            "long table of times.\n"
+            'Fix: jumps="ignored" if the comparison only guards against NaN; a shorter time span.',
+            JumpWarning,
+        )
+
+
+class ModeGuard(eqx.Module):
+    """The guard of one mode, (t, q, v, given) -> a number above zero as long as the mode lasts.
+
+    A motion that slides along jump `number` has α (1 - α) in its place.
+    """
+
+    guard: Smooth
+    sliding: Sliding | None
+    number: int = eqx.field(static=True)
+
+    def __call__(self, t, q, v, given: Given):
+        value = self.guard(t, q, v, given)
+        if self.sliding is not None:
+            share = self.sliding.mixture(t, q, v, given).shares[self.sliding.which.index(self.number)]
+            value = jnp.where(given.slides[self.number], share * (1 - share), value)
+        return jnp.where(given.free, 1.0, value)
+
+
+class Piecewise(eqx.Module):
+    """A system in a mode: its `smooth` equations, the mixtures, and for each mode its guard and the mode beyond.
+
+    `pauses`: whether guards may jump with time, so that legs end where forces do.
+    """
+
+    smooth: System
+    sliding: Sliding | None
+    guards: tuple[ModeGuard, ...]
+    beyond: tuple[Smooth, ...]
+    pauses: bool = eqx.field(static=True)
+
+
+def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
+    """The smooth system with its guards; motions slide in `small` systems."""
+    smooth, guards, sliding = jumps.smooth(system), jumps.numbers(system, 0), None
+    which = slidable(jumps, system) if small else ()
+    if which:
+        differences = jumps.numbers(system, 2)
+        sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
+        smooth = System(smooth.lagrangian, smooth.constraints, Mixed(smooth.force, sliding), smooth.dissipation)
+    of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
+    guards = tuple(of(i, guard) for i, guard in enumerate(guards))
+    pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
+    return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
+
+
+class ModeWay(NamedTuple):
+    """How far the legs have come, as in `segments.py`; `modes`, `slides`, `free` as in `Given`; `count` of all
+    jumps."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    modes: Float[Array, " n"]
+    slides: Bool[Array, " n"]
+    free: Bool[Array, ""]
+    count: Int[Array, ""]
+    continues: Bool[Array, ""]
+    rows: dict[str, Any]
+    events: dict[str, Crossings]
+    end: Snapshot
+    stats: dict[str, Array]
+    sizes_so_far: Array
+    least: Array
+    scaled_error: Float[Array, ""]
+    settled: Bool[Array, ""]
+    result: Any
+
+
+def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, settings, adjoint):
+    """Return the fields of the trajectory, like `one_solve.solved`."""
+    model = model_of(system, ts[0], q0, v0, params)
+    small = model.n + model.m <= 24
+    piecewise = piecewise_of(jumps, system, small)
+    modes = stop_gradient(jumps.modes(system, ts[0], q0, v0, params))
+    both = _together(piecewise, guards)
+    first = _first(model, q0, v0, ts, guards, modes, settings)
+
+    def next_leg(way: ModeWay) -> ModeWay:
+        return _leg(piecewise, both, guards, way, params, ts, settings, adjoint)
+
+    turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
+    if isinstance(adjoint, diffrax.ForwardMode):
+        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
+        way = lax.while_loop(lambda way: way.continues & (way.count <= MOST_JUMPS), next_leg, first)
+    else:
+        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
+        way, _ = lax.scan(step, first, None, length=turns)
+    return {
+        **way.rows,
+        "end": way.end,
+        "stats": way.stats | {"num_jumps": way.count, "lost_jumps": way.free},
+        "tolerance": (settings.rtol, way.least),
+        "scaled_error": way.scaled_error,
+        "result": way.result,
+        "settled": way.settled,
+        "events": way.events,
+    }
+
+
+def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
+    """The guards of the modes, and then those of the user's events."""
+    long = any(len(f.guard.program.jaxpr.eqns) > LONG for f in piecewise.guards) or piecewise.sliding is not None
+    of_mode = partial(
+        EventKind, direction=-1, terminal=True, most=1, takes_multipliers=False, holds=True, may_rest=True
+    )
+    kinds = tuple(of_mode(f"mode {i}", long=long) for i in range(len(piecewise.guards)))
+    if guards is None:
+        return Guards(piecewise.guards, kinds)
+    return Guards((*piecewise.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
+
+
+def _first(model, q0, v0, ts, guards, modes, settings) -> ModeWay:
+    dtype, many = ts.dtype, ts.shape[0]
+    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
+    of_rows = lambda tree: jax.tree.map(lambda x: nan((many, *x.shape)), tree)
+    multipliers = {name: nan(x.shape) for name, x in model.zero_multipliers().items()}
+    rows = {"q": of_rows(q0), "v": of_rows(v0), "multipliers": of_rows(multipliers)}
+    sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
+    # A motion that rests at zero, held by friction, has round-off alone to tell its size.
+    sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
+    names = () if guards is None else [kind.name for kind in guards.kinds]
+    return ModeWay(
+        t=ts[0], q=q0, v=v0, modes=modes, slides=jnp.zeros(modes.shape, bool), free=jnp.asarray(False), count=zero,
+        continues=jnp.asarray(True), rows=rows, events=nothing(guards, names, q0, v0, multipliers),
+        end=Snapshot(ts[0], q0, v0, multipliers),
+        stats={name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")},
+        sizes_so_far=sizes, least=jnp.zeros_like(sizes) if settings.by_size else settings.atol,
+        scaled_error=jnp.zeros((), dtype), settled=jnp.asarray(True), result=RESULTS.successful,
+    )  # fmt: skip
+
+
+def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, ts, settings, adjoint) -> ModeWay:
+    """Return the way after one more leg."""
+    # Past outputs would cost a step each: those ahead come first, padded with the last.
+    place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
+    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    times = jnp.where(here, ahead, way.t)
+    if piecewise.pauses and settings.jump_ts is not None:
+        # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
+        # derivative is one half for an output at that time.
+        pause = _next(settings.jump_ts, way.t, resolution(ts))
+        times = jnp.where(times > pause, pause, times)
+    given = Given(params, way.modes, way.slides, way.free)
+    found = apart(solved, piecewise.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
+    crossings = [found["events"][kind.name] for kind in guards.kinds]
+    when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
+    ending = apart(_ending, piecewise, guards, found["result"], found["end"], when, way, given, ts, settings)
+    end, onward = ending.end, here & ending.onward
+    paused = here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (end.t < ts[-1])
+    # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
+    modes, slides = apart(_beyond, piecewise, ending.first, found["end"], given)
+    moves = onward | paused
+    # What a leg found whose mode was wrong does not count.
+    counts = here & ~ending.wrong
+    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
+    known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), all, new)
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
+    again = here & ending.wrong
+    further = way._replace(
+        t=jnp.where(moves, end.t, way.t), q=where(moves, end.q, way.q), v=where(moves, end.v, way.v),
+        modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
+        free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
+        continues=again | (moves & (end.t < ts[-1])), rows=put(way.rows, rows),
+        events=where(counts, with_those_of(found["events"], way.events), way.events), end=where(counts, end, way.end),
+        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
+        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
+        scaled_error=jnp.where(counts, jnp.maximum(way.scaled_error, found["scaled_error"]), way.scaled_error),
+        settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
+    )  # fmt: skip
+    return where(here, further, way)
+
+
+def _next(jump_ts, t, resolution):
+    """The next of the times of jumps."""
+    return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
+
+
+class ModeEnding(NamedTuple):
+    """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated
+    with the comparisons as they are."""
+
+    onward: Bool[Array, ""]
+    wrong: Bool[Array, ""]
+    first: Int[Array, ""]
+    end: Snapshot
+    result: Any
+
+
+def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay, given, ts, settings) -> ModeEnding:
+    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
+    count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
+    # An event of the user's that ends the motion at the time of a jump comes first.
+    ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
+    when = when[:count]
+    by_event = jnp.any(ends <= jnp.min(when) + at_one_time)
+    onward = (result == RESULTS.event_occurred) & ~by_event
+    at_once = onward & (end.t - way.t <= at_one_time)
+    # A jump at once happens where the leg begins, so that its time has the derivatives of that.
+    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    end = Snapshot(t, q, v, end.multipliers)
+    # Where a force jumps in time, the side of which a guard is belongs to the next leg.
+    whole = end.t >= last
+    below = ended_well(result) & ~onward & whole & _is_below(end, given, guards, count, settings.rtol)
+    wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
+    result = RESULTS.where(onward, RESULTS.successful, result)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return ModeEnding(onward, wrong, first, end, result)
+
+
+def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
+    """Whether one of the first `count` guards is below zero by more than errors can cause."""
+    state = stop_gradient(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count])
+    g, terms = jax.jvp(value, state, uneven(state))
+    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
+
+
+def _beyond(piecewise: Piecewise, first, end: Snapshot, given: Given):
+    """The modes after the guard `first` has crossed zero, and along which jumps the motion then slides."""
+    state, given = stop_gradient((end.t, end.q, end.v)), stop_gradient(given)
+    n = len(piecewise.guards)
+    mine, slid = jnp.arange(n) == first, given.slides
+    beyond = jnp.stack([f(*state, given) for f in piecewise.beyond]).astype(given.modes.dtype)
+    modes = jnp.where(mine, beyond, given.modes)
+    if piecewise.sliding is None:
+        return modes, slid
+    which = piecewise.sliding.which
+    shares = piecewise.sliding.mixture(*state, given).shares
+    # A motion that slides leaves to the side of the share that it has.
+    stays = jnp.zeros(n, bool).at[jnp.asarray(which)].set(jnp.stack(shares) < 0.5) & slid
+    modes = jnp.where(mine & stays, given.modes, modes)
+    after = given._replace(modes=modes, slides=slid & ~mine)
+    rates = (
+        jnp.zeros(n, modes.dtype).at[jnp.asarray(which)].set(jnp.stack(piecewise.sliding.mixture(*state, after).rates))
+    )
+    back = mine & ~slid & (rates * (2 * modes - 1) < 0)
+    return modes, (slid & ~mine) | back

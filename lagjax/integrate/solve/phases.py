@@ -1,0 +1,222 @@
+"""The parts of a solve that a hybrid system defines: phases, their guards, and the resets of the state by switches."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
+
+from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
+from lagjax.integrate.solve.backward_time import runs_backward
+from lagjax.integrate.solve.segments import Phase
+from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES
+from lagjax.mechanics.projection import velocity_change
+from lagjax.system import constraints
+from lagjax.system.check_functions import traced_call, traced_system
+from lagjax.system.coordinates import State
+from lagjax.system.function_arguments import OF_STATE, takes_of
+from lagjax.system.hybrid import Hybrid, Switch, replace_fields
+from lagjax.system.model import model_of
+from lagjax.system.system import System
+from lagjax.system.user_errors import Call
+
+
+class Reset(eqx.Module):
+    """The effect of a switch: (t, q, v, multipliers, params) -> (q, v), and whether the motion comes to rest there.
+
+    `function` gives velocities, or the whole state; without one the state is kept. If `settle` is given and the guard
+    `when` opens at no more than `slower_than` after the reset, the motion comes to rest, with the velocities of
+    `settle`.
+    """
+
+    function: Callable | None
+    takes: tuple[str, ...] = eqx.field(static=True)
+    settle: Callable | None = None
+    when: Callable | None = None
+    slower_than: Array | np.ndarray | None = None
+
+    def __call__(self, t, q, v, multipliers, params):
+        q, v = self._reset(t, q, v, multipliers, params)
+        if self.settle is None:
+            return q, v, jnp.asarray(False)
+        assert self.when is not None
+        value = lambda t, q, when=self.when: when(t, q, v, params)
+        _, opening = jax.jvp(value, (t, q), (jnp.ones_like(t), v))
+        rests = opening <= self.slower_than
+        at_rest = self.settle(t, q, v, params)
+        return q, jtu.tree_map(lambda x, y: jnp.where(rests, x, y), at_rest, v), rests
+
+    def _reset(self, t, q, v, multipliers, params):
+        if self.function is None:
+            return q, v
+        given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
+        found = self.function(*(given[name] for name in self.takes))
+        found = (q, found) if _alike(found, v) else found
+        return jtu.tree_map(lambda new, old: new + 0 * old, found, (q, v))
+
+
+def traced_phases(system: System | Hybrid, start: State) -> Any:
+    """The system, or hybrid, with all its functions checked and traced for such states."""
+    return traced_hybrid(system, start) if isinstance(system, Hybrid) else traced_system(system, start)
+
+
+def check_phases(hybrid: Hybrid, start: State):
+    """Raise if constraints of the same name have different shapes in two phases."""
+    first: dict[str, tuple[tuple, str]] = {}
+    for name, model in zip(hybrid.names, model_of(hybrid, *start).phases):
+        for constraint, shape, _ in model.form.residuals:
+            other, phase = first.setdefault(constraint, (shape, name))
+            if other != shape:
+                raise ValueError(
+                    f"constraint '{constraint}' has shape {other} in phase '{phase}', but {shape} in '{name}'.\n"
+                    "Fix: give one of them another name."
+                )
+
+
+def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
+    """Raise if an argument has no meaning for a motion in phases."""
+    check_phases(hybrid, start)
+    if runs_backward(ts):
+        raise ValueError(
+            "a motion in phases runs forward only: what an impact has lost cannot be restored backward in time.\n"
+            "Fix: times that increase."
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "BacksolveAdjoint does not go back through switches.\nFix: leave adjoint out (both modes work)."
+        )
+    if left_to_diffrax(event) is not None:
+        raise ValueError(
+            "a condition for diffrax, such as diffrax.steady_state_event(), cannot be used with a motion in phases.\n"
+            "Fix: events= with a lj.Crossing."
+        )
+
+
+def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> tuple[Phase, ...]:
+    """The guards that end each phase, called once on shapes, and the recorded events; `start`: the first state."""
+    for name, crossing in events.items():
+        if takes_of(crossing.guard) != OF_STATE:
+            raise ValueError(
+                f"event '{name}' takes multipliers, which differ from phase to phase.\n"
+                "Fix: lj.Switch(..., when=lj.releases(name)) if a contact lets go; or traj.multipliers at outputs."
+            )
+    if SWITCHES in events:
+        raise ValueError(
+            f"an event in events= is named '{SWITCHES}', the name of the switches in traj.events.\nFix: another name."
+        )
+    return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
+
+
+def _phase(hybrid, i, start, events):
+    numbers, system = hybrid.leaving(i), hybrid.systems[i]
+    names = {_name(hybrid, k): hybrid.switches[k] for k in numbers}
+    crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
+    both = [guards_of(crossings, system, start, holds=True), guards_of(events, system, start)]
+    given = [guards for guards in both if guards is not None]
+    guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
+    resets = tuple(_reset(hybrid.switches[k], hybrid, system) for k in numbers)
+    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
+
+
+def _name(hybrid, k):
+    return f"{hybrid.switches[k].in_words()}, number {k}"
+
+
+def _reset(switch: Switch, hybrid, system) -> Reset:
+    function = switch.reset
+    if isinstance(function, OfPhases):
+        function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
+    takes = OF_STATE if function is None else takes_of(function)
+    if switch.rest is None:
+        return Reset(function, takes)
+    if takes_of(switch.when) != OF_STATE:
+        raise ValueError(
+            f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
+            "fast it opens.\nFix: rest= only with lj.touches(gap)."
+        )
+    settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
+    return Reset(function, takes, settle, switch.when, switch.slower_than)
+
+
+def traced_hybrid(hybrid: Hybrid, start: State) -> Hybrid:
+    """The hybrid with all functions of its phases and switches checked, and traced for such states."""
+    hybrid = replace_fields(hybrid, systems=tuple(traced_system(system, start) for system in hybrid.systems))
+    return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
+
+
+def _traced_switch(hybrid, k, start):
+    switch = hybrid.switches[k]
+    system = hybrid.systems[hybrid.names.index(switch.phase)]
+    multipliers = model_of(system, *start).zero_multipliers()
+    given: dict[str, Any] = start._asdict() | {"multipliers": multipliers, "speed": start.t}
+    when, reset = traced_guard(_name(hybrid, k), switch.when, given), switch.reset
+    of_switch = f" of the switch {switch.in_words()}"
+    if isinstance(reset, OfPhases):
+        reset = reset.mapped(lambda role, f, takes: traced_call(Call(role, f, takes, of_switch), given, _is_anything))
+    elif reset is not None:
+        call = Call("reset", reset, takes_of(reset), of_switch)
+        reset = traced_call(
+            call, given, partial(_check_reset, start=start), "the arguments of a guard without the parameters"
+        )
+    return switch.with_functions(when, reset)
+
+
+def _is_anything(call, value):
+    """The parts of a contact are checked where they are used."""
+
+
+def _check_reset(call, found, start):
+    if not (_alike(found, start.v) or _alike(found, (start.q, start.v))):
+        raise ValueError(
+            f"{call} must return velocities like v, or a pair (q, v).\n"
+            f"  v has shapes {jax.tree.map(jnp.shape, start.v)}\n"
+            f"  it returned {jax.tree.map(jnp.shape, found)}\n"
+            "Usual cause: only the velocity that jumps was returned.\n"
+            'Fix: return v | {"y": -v["y"]}.'
+        )
+
+
+class OfPhases(eqx.Module):
+    """A reset that depends on the systems before and after a switch."""
+
+    def mapped(self, on: Callable) -> "OfPhases":
+        """The same with `on(role, function, takes)` in place of each function of the user's in it."""
+        return self
+
+    def between(self, before: System, after: System) -> Callable:
+        """Return `reset(t, q, v, params)` for a switch between these systems."""
+        raise NotImplementedError
+
+
+class Plastic(OfPhases):
+    """The nearest velocities in the metric of M that the constraints of the next phase allow."""
+
+    def between(self, before: System, after: System) -> Callable:
+        """The reset onto the constraints of `after`."""
+        return Nearest(after)
+
+
+class Nearest(eqx.Module):
+    """Velocities moved onto the constraints of a system: `reset(t, q, v, params)`."""
+
+    system: System
+    takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
+
+    def __call__(self, t, q, v, params):
+        model = model_of(self.system, t, q, v, params)
+        if not model.m:
+            return v
+        off = constraints.velocity_residual(model, t, *model.vectors(q, v))
+        return jtu.tree_map(jnp.add, v, velocity_change(model, t, q, v, -off))
+
+
+def _alike(found, wanted):
+    same = jtu.tree_structure(found) == jtu.tree_structure(wanted)
+    shapes = lambda tree: [jnp.shape(x) for x in jtu.tree_leaves(tree)]
+    return same and shapes(found) == shapes(wanted)

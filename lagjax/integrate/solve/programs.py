@@ -1,0 +1,279 @@
+"""The compiled program behind `integrate`: the choice of the program and of the method, and the cache of programs.
+
+The program itself is in `one_motion.py`, and for motions in phases in `segments.py`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lagjax.display.progress import waiting
+from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
+from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.jumps.find import with_jumps_in_time
+from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
+from lagjax.integrate.solve.harvest import report_settled
+from lagjax.integrate.solve.one_motion import solved
+from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost
+from lagjax.integrate.solve.segments import solved_in_legs
+from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
+from lagjax.integrate.trajectory.trajectory import SolveInfo, SolveOptions, Trajectory, pack
+from lagjax.jaxtools.cache import filled_up, parted
+from lagjax.jaxtools.compiling import compiler_options
+from lagjax.jaxtools.memory_maps import share_used
+from lagjax.jaxtools.program_cache import kept
+from lagjax.jaxtools.tracing import is_eager, takes_for_regular
+from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
+from lagjax.mechanics.scalar_equations import has_networks
+from lagjax.mechanics.structure import is_free_of_velocities
+from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, evaluations_a_step
+from lagjax.numerics.methods.runge_kutta import Dopri8, in_our_form
+from lagjax.system.model import Model, model_of
+
+# A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
+# in a loop. In batches of a rod or a double pendulum copies are twice as fast. A single motion's step is a fifth slower
+# in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
+# are taken without copies: the first takes two thirds of the time, each of the next ones a fifth more.
+UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
+# The adjoints that can differentiate our methods as they do diffrax's own.
+FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
+
+
+# Making an equinox module takes longer than computing a short motion.
+@jtu.register_dataclass
+@dataclass(frozen=True)
+class Settings:
+    """How to integrate: everything but the system, the state and the times."""
+
+    method: diffrax.AbstractSolver | None
+    controller: diffrax.AbstractStepSizeController | None
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint | None
+    rtol: Float[Array, " 2"]
+    atol: Float[Array, " 2"]
+    dt0: Float[Array, ""] | None
+    # Infinite if the length of steps is not limited.
+    max_step: Float[Array, ""]
+    jump_ts: Float[Array, " J"] | None
+    # Shares of the proposed first step, and of the time between outputs for the longest step: see `Arriving`.
+    shares: Float[Array, " 2"]
+    # Motions of up to this many steps are integrated again for an error estimate.
+    repeated_up_to: Int[Array, ""]
+    # Whether `atol` was not given and follows the motion's own size; the value above is then a placeholder.
+    by_size: bool = eqx.field(static=True)
+    apart: bool = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)
+    drift: str = eqx.field(static=True)
+    progress: bool | None = eqx.field(static=True)
+    # The size of the record for reverse mode, in bytes; None for the usual one.
+    memory: float | None = eqx.field(static=True, default=None)
+    # False if the equations are assumed regular, until that turns out to be wrong.
+    robust: bool = eqx.field(static=True, default=True)
+    # Whether jumps of forces are found and followed.
+    jumps: str = eqx.field(static=True, default="found")
+    # A right-hand side of up to this many operations is copied to each of a method's stages.
+    unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
+
+
+def trajectory_of(*problem) -> Trajectory:
+    """Return the trajectory of (system, q0, v0, params, ts, guards, settings); a failure is recorded in its result.
+
+    If nothing is traced, the equations are first assumed regular, which compiles in two thirds of the time and is
+    enough for most systems; if that fails, the robust solve is compiled too and used from then on. Equinox's wrapper of
+    `jit` takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
+    """
+    if not is_eager():
+        # We are inside a program of the user's, which is not cached here.
+        share_used()
+        return _inside(*problem)
+    *motion, ts, guards, settings = problem
+    # Whether compiling is announced does not change the program.
+    shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
+    # Padded with the last time.
+    many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
+    of = lambda settings: parted((*motion, many, guards, settings))
+    static, arrays = of(settings)
+    programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
+    try:
+        found = programs.run(arrays, len(ts), shown)
+        again = lambda closer: programs.run(of(closer)[1], len(ts), shown, settled=True)
+        return with_errors(again, found, settings, ts) if settings.repeated_up_to else found
+    except jax.errors.JaxRuntimeError:
+        return _trajectory_of(*problem)[0]
+
+
+def _inside(*problem):
+    """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
+    *motion, settings = problem
+    # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
+    regular = takes_for_regular() and settings.adjoint is None
+    settings = replace(settings, robust=not regular)
+    found, settled = _trajectory_of(*motion, settings)
+    if settings.repeated_up_to:
+        again = lambda closer: _trajectory_of(*stop_gradient(motion), closer)[0]
+        found = with_errors_inside(again, found, settings, motion[4])
+    return report_settled(found, settled) if regular else found
+
+
+class _Programs:
+    """The compiled programs of one kind of motion: with the equations assumed regular (None once they turned out not to
+    be), and with the robust solve. JAX keeps them as long as this object lives."""
+
+    def __init__(self, static, count):
+        jit = partial(jax.jit, compiler_options=compiler_options())
+        self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
+        self.robust: Callable = jit(partial(_of_arrays, static, True, count))
+        self._count, self._compiled = count, set()
+
+    def run(self, arrays, count, shown, settled=False):
+        """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given."""
+        if self.regular is not None:
+            found, rows, well = self._run_program(self.regular, arrays, shown)
+            if settled or well:
+                return self._first_outputs(found, rows, count)
+            self.regular = None
+        found, rows, _ = jax.block_until_ready(self._run_program(self.robust, arrays, shown))
+        return self._first_outputs(found, rows, count)
+
+    def _run_program(self, program, arrays, shown):
+        """Run a program; the first time announce that it compiles, as `shown` says (see `waiting`)."""
+        if program in self._compiled:
+            return program(arrays)
+        with waiting(shown, "compiling"):
+            found = program(arrays)
+        self._compiled.add(program)
+        return found
+
+    def _first_outputs(self, found, rows, count):
+        """The trajectory with `count` outputs, from padded `rows`."""
+        if count == self._count:
+            return found
+        # In NumPy: JAX would compile a program for each number of outputs.
+        return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
+
+
+def _of_arrays(static, robust, count, arrays):
+    """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
+    *motion, settings = static.together(arrays)
+    settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
+    found, settled = one_by_one(_trajectory)(*motion, settings)
+    rows = found.rows()
+    return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
+
+
+@jitted
+def _trajectory_of(*problem):
+    return _trajectory(*problem)
+
+
+def _trajectory(system, q0, v0, params, ts, guards, settings):
+    """The trajectory, and whether it is settled: the robust solve would give the same."""
+    model = model_of(system, ts[0], q0, v0, params)
+    s, method = settings, method_of(settings, model)
+    asked = SolveOptions(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
+    how = _how(method, s.method, settings, system.in_phases)
+    settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
+    # Derivatives flow to the floating-point arrays of these; the settings are constants.
+    x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
+    fixed, static = eqx.partition((rest, settings), eqx.is_array)
+
+    jumps = followed(settings, system, ts[0], q0, v0, params)
+    in_time = jumps if jumps is not None and jumps.in_time else None
+    jumps = jumps if jumps is not None and jumps.count else None
+    solve = solved_in_legs if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
+
+    def of_arrays(x, fixed, adjoint, differentiated):
+        rest, settings = eqx.combine(fixed, static)
+        *motion, jump_ts = eqx.combine(x, rest)
+        too_many = None
+        if in_time is not None:
+            jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
+        # With guards to be watched a program is long anyway, and compiles a third faster without copies.
+        unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
+        robust = settings.robust or differentiated and settings.adjoint is None
+        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
+        fields = solve(*motion, settings, adjoint)
+        if too_many is not None:
+            fields["stats"] = with_lost(fields["stats"], too_many)
+        return fields, fields.pop("record", None)
+
+    if settings.adjoint is None:
+        # Each leg of a motion in phases is replayed separately.
+        fields = solve_in_both_modes(of_arrays, x, fixed, recorded=solve is solved)
+    else:
+        fields, _ = of_arrays(x, fixed, settings.adjoint, True)
+    arrays, described = pack(system, params, asked, how)
+    settled = fields.pop("settled")
+    of = HybridTrajectory if system.in_phases else Trajectory
+    return of(t=ts, **fields, arrays=arrays, static=described), settled
+
+
+def followed(settings, system, t, q, v, params):
+    """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
+    if settings.jumps == "ignored":
+        return None
+    found = [jumps for phase in system.phases if (jumps := jumps_found(phase, t, q, v, params)) is not None]
+    if system.in_phases:
+        why = "in the phases of a lj.Hybrid"
+    elif settings.controller is not None or settings.event is not None:
+        why = "with a stepsize_controller, or a condition for diffrax, of your own"
+    elif isinstance(settings.adjoint, diffrax.BacksolveAdjoint):
+        why = "with diffrax.BacksolveAdjoint"
+    else:
+        why = ""
+    missed = [words for jumps in found for words in jumps.missed]
+    if why:
+        missed += [f"{words}, {why}" for jumps in found for words in jumps.in_words()]
+    if missed:
+        warn_of_missed(missed)
+    return found[0] if found and not why else None
+
+
+def _how(method, asked, settings, in_legs):
+    name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    terms = diffrax.ODETerm(lambda t, y, args: y)
+    chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
+    # With many short legs the number of steps does not tell what chose them.
+    chosen = chosen if settings.controller else "legs" if in_legs else "tolerance"
+    return SolveInfo(name, method.error_order(terms), evaluations_a_step(method), chosen)
+
+
+def method_of(settings, model: Model):
+    """Return the method asked for, raising if it cannot do it; by default the fastest that can."""
+    chosen = settings.method
+    if chosen is None:
+        # BacksolveAdjoint integrates a state that is not a pair (q, v).
+        pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
+        if not pairs or not _are_free_of_velocities(model):
+            return Dopri8()
+        return nystrom_for(model)
+    if isinstance(chosen, Nystrom) and not _are_free_of_velocities(model):
+        cause = "there are constraints" if any(phase.m for phase in model.phases) else "these do"
+        raise ValueError(
+            f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
+            "Usual cause: a kinetic energy that depends on q (polar coordinates, joint angles), friction, or a "
+            "rotating frame.\n"
+            "Fix: method=lj.Dopri8(), or leave method out: it is then chosen."
+        )
+    # With other adjoints, and for conditions that evaluate it, the given solver is kept.
+    ours = in_our_form(chosen) if settings.event is None and isinstance(settings.adjoint, FOLLOWED) else None
+    return chosen if ours is None else ours
+
+
+def nystrom_for(model: Model) -> Nystrom:
+    """The default method for accelerations that do not depend on velocities."""
+    # The motion of a network is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
+    # takes two thirds to nine tenths of the evaluations of order 12, and half with many outputs.
+    return Nystrom8() if has_networks(model) else Nystrom12()
+
+
+def _are_free_of_velocities(model):
+    return all(is_free_of_velocities(phase) for phase in model.phases)

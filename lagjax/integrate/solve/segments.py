@@ -1,0 +1,335 @@
+"""A motion in phases: one solve after another, each from a switch to the next.
+
+A leg is a motion of its phase's system that ends where one of the phase's guards crosses zero from above, with the
+outputs that lie in it. Which leg comes next is known at run time, so that all phases are in one loop; in a batch each
+phase is solved for all lanes that are in it, while the others stand still. The legs are what is differentiated: the
+time and the state at a crossing carry their derivatives (`event_times.py`) into the start of the next leg, which is
+the saltation matrix.
+
+A guard is assumed to be above zero where its phase begins. If it is zero there and falls, however slowly, or is below
+zero, it is crossed at once, in a leg of no length: this handles two guards at one time, and friction that cannot hold a
+contact that has stopped sliding.
+
+Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
+
+The crossings recorded over all legs of a motion in phases.
+"""
+
+from dataclasses import replace
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.integrate.events.brackets import uneven
+from lagjax.integrate.events.event import Crossings, Guards
+from lagjax.integrate.solve.one_motion import resolution, solved
+from lagjax.integrate.trajectory.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
+from lagjax.integrate.trajectory.results import RESULTS, ended_well
+from lagjax.integrate.trajectory.trajectory import Snapshot
+from lagjax.jaxtools.fuse_cpu import apart
+from lagjax.jaxtools.trees import like, stop_gradient, where
+from lagjax.mechanics.equations import all_finite
+from lagjax.system import coordinates
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import model_of
+
+
+def nothing(guards: Guards | None, names, q, v, multipliers) -> dict[str, Crossings]:
+    """The events of these names before any crossing; `multipliers`: those of all phases, NaN."""
+    room = {kind.name: kind.most for kind in (() if guards is None else guards.kinds)}
+
+    def none(most):
+        rows = lambda tree: jax.tree.map(lambda x: jnp.full((most, *x.shape), jnp.nan, x.dtype), tree)
+        t = jnp.full(most, jnp.nan, jax.tree.leaves(q)[0].dtype)
+        return Crossings(t, rows(q), rows(v), rows(multipliers), jnp.asarray(0), jnp.asarray(False))
+
+    return {name: none(room[name]) for name in names}
+
+
+def with_those_of(leg: dict[str, Crossings], before: dict[str, Crossings]) -> dict[str, Crossings]:
+    """Append the crossings of a leg to the earlier ones."""
+    return {name: _joined(found, leg[name]) for name, found in before.items()}
+
+
+def _joined(before: Crossings, new: Crossings) -> Crossings:
+    place = jnp.arange(before.t.shape[0]) - jnp.sum(jnp.isfinite(before.t))
+    multipliers = {name: new.multipliers.get(name, jnp.full_like(x, jnp.nan)) for name, x in before.multipliers.items()}
+
+    def join(x, y):
+        later = (place >= 0).reshape(-1, *[1] * (x.ndim - 1))
+        return jnp.where(later, y[jnp.maximum(place, 0)].astype(x.dtype), x)
+
+    rows = jax.tree.map(join, (before.t, before.q, before.v, before.multipliers), (new.t, new.q, new.v, multipliers))
+    return Crossings(*rows, before.count + new.count, before.uncertain | new.uncertain)
+
+
+# How far below zero a guard may be where a motion starts, in tolerances of its terms.
+NOT_BELOW = 1e2
+# The fields that a leg gives at its outputs.
+ROWS = "q", "v", "multipliers"
+# Times within this many resolutions of time are simultaneous.
+AT_ONCE = 4
+
+
+class Phase(NamedTuple):
+    """What ends one phase: its guards, in the order of the switches, and what each of them does to the state.
+
+    `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
+    `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
+    the recorded events, whose guards come after those of switches.
+    """
+
+    guards: Guards | None
+    switches: tuple[int, ...]
+    targets: np.ndarray
+    resets: tuple
+    events: tuple[str, ...]
+
+
+class OutputRows(NamedTuple):
+    """The outputs of all legs so far; NaN, and no phase, where there is none yet."""
+
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    phase: Int[Array, " T"]
+
+
+class PhaseWay(NamedTuple):
+    """How far the legs have come: the state from which the next one starts, and the results of all before.
+
+    `continues`: whether there is a next one. `events`: the recorded crossings. `sizes_so_far`: the largest coordinates
+    and velocities, (2, n); `least`: the sizes below which numbers counted as zero.
+    """
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    phase: Int[Array, ""]
+    continues: Bool[Array, ""]
+    rows: OutputRows
+    switches: Switches
+    events: dict[str, Crossings]
+    end: Snapshot
+    stats: dict[str, Array]
+    sizes_so_far: Array
+    least: Array
+    scaled_error: Float[Array, ""]
+    settled: Bool[Array, ""]
+    result: Any
+
+
+def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
+    """Return the fields of the trajectory, like `one_solve.solved`, with the phase of each output and the switches."""
+    first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
+
+    def next_legs(way: PhaseWay) -> PhaseWay:
+        for i in range(len(hybrid.systems)):
+            here = way.continues & (way.phase == i)
+            leg = lambda way, i=i, here=here: _leg(hybrid, i, here, way, params, ts, phases[i], settings, adjoint)
+            way = lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
+        return way
+
+    if isinstance(adjoint, diffrax.ForwardMode):
+        way = lax.while_loop(lambda way: way.continues, next_legs, first)
+    else:
+        # Each turn takes every lane at least one leg further.
+        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_legs, lambda way: way, way), None)
+        way, _ = lax.scan(step, first, None, length=hybrid.most_switches + 1)
+    rows = way.rows
+    return {
+        "q": rows.q,
+        "v": rows.v,
+        "multipliers": rows.multipliers,
+        "end": way.end,
+        "stats": way.stats,
+        "tolerance": (settings.rtol, way.least),
+        "scaled_error": way.scaled_error,
+        "result": way.result,
+        "settled": way.settled,
+        "events": way.events | ({SWITCHES: way.switches.as_crossings()} if hybrid.switches else {}),
+        "phase": rows.phase,
+        "switches": way.switches,
+    }
+
+
+def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
+    dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
+    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
+    of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
+    model = model_of(hybrid, ts[0], q0, v0, params)
+    multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
+    rows = OutputRows(
+        of_rows(q0, many), of_rows(v0, many), of_rows(multipliers, many),
+        jnp.full(many, NO_PHASE, jnp.int32),
+    )  # fmt: skip
+    record = lambda tree: of_rows(tree, room)
+    none = jnp.full(room, NO_PHASE, jnp.int32)
+    switches = Switches(
+        t=nan(room), way=none, to=none, q=record(q0), v=record(v0), q_after=record(q0), v_after=record(v0),
+        impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
+        ways=tuple(s.phase for s in hybrid.switches),
+    )  # fmt: skip
+    # A motion in no phase would never end.
+    first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
+    exists = (first >= 0) & (first < phases)
+    known = lambda tree: jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), tree)
+    start = Snapshot(ts[0], known(q0), known(v0), jax.tree.map(lambda x: nan(x.shape), multipliers))
+    zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
+    stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    return PhaseWay(
+        t=ts[0], q=q0, v=v0, phase=jnp.clip(first, 0, phases - 1), continues=exists, rows=rows,
+        switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
+        stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
+        scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
+        result=RESULTS.where(exists, RESULTS.successful, RESULTS.no_such_phase),
+    )  # fmt: skip
+
+
+def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings, adjoint) -> PhaseWay:
+    """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
+    system = hybrid.systems[i]
+    # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
+    # still.
+    place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
+    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    times = jnp.where(in_phase, ahead, way.t)
+    settings = settings if system.constraints else replace(settings, drift="none")
+    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
+    result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
+    after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
+    if phase.guards is not None and phase.switches:
+        crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
+        when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
+        uncertain = in_phase & jnp.any(jnp.stack([x.uncertain for x in crossings[: len(phase.switches)]]))
+        ending = apart(_ending, phase, result, end, when, in_phase, way, params, resolution(ts), settings.rtol)
+        result, end, onward = ending.result, ending.end, ending.onward
+        after, target, switches = apart(_switched, system, ending, params, phase, way)
+        switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
+        # A motion in the wrong phase is wrong from that phase's start on, its first output included.
+        invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
+        unknown = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), end.multipliers)
+        end = where(invalid, Snapshot(way.t, way.q, way.v, unknown), end)
+        events = {name: x.none_where(invalid) for name, x in events.items()}
+        broken = onward & ~all_finite((after.q, after.v))
+        result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
+    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
+    known = (ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)
+    known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
+    none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
+    end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
+    least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
+    further = PhaseWay(
+        t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
+        phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
+        rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
+        events=with_those_of(events, way.events),
+        end=where(onward, end._replace(q=after.q, v=after.v), end),
+        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
+        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
+        scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
+        settled=way.settled & found["settled"], result=result,
+    )  # fmt: skip
+    return where(in_phase, further, way)
+
+
+class PhaseEnding(NamedTuple):
+    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
+
+    onward: Bool[Array, ""]
+    first: Int[Array, ""]
+    end: Snapshot
+    result: Any
+
+
+def _ending(
+    phase: Phase, result, end: Snapshot, when, in_phase, way: PhaseWay, params, resolution, rtol
+) -> PhaseEnding:
+    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
+    assert phase.guards is not None
+    count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
+    # An event that ends the motion at the time of a switch comes first.
+    ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
+    when = when[:count]
+    by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
+    switched = in_phase & (result == RESULTS.event_occurred) & ~by_event
+    at_once = switched & (end.t - way.t <= at_one_time)
+    # A switch at once happens where the leg begins, so that its time has the derivatives of that.
+    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
+    end = Snapshot(t, q, v, end.multipliers)
+    is_below = _is_below(end, params, phase.guards, count, rtol)
+    refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
+    onward = switched & ~refused & ~full
+    failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
+    missed = (result == RESULTS.successful) & is_below
+    result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
+    result = RESULTS.where(onward, RESULTS.successful, result)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return PhaseEnding(onward, first, end, result)
+
+
+def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
+    """Whether one of the first `count` guards is below zero by more than errors can cause."""
+    state = stop_gradient(tuple(end))
+    value = lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count])
+    g, terms = jax.jvp(value, state, uneven(state))
+    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
+
+
+def reached(q):
+    """The rows of q that are known."""
+    return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
+
+
+def _filled(rows: OutputRows, known, found, i) -> OutputRows:
+    """Return the outputs, with those of a leg in phase i where they are `known`."""
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
+    multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
+    return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
+
+
+class After(NamedTuple):
+    """The state after a switch."""
+
+    q: PyTree
+    v: PyTree
+    rests: Bool[Array, ""]
+
+
+def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
+    """Return the state after the phase's first switch, the next phase, and the record with that switch."""
+    onward, first, end, _ = ending
+    states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
+    after = jax.tree.map(lambda *x: _one_of(first, x), *states)
+    momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
+    impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
+    s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
+    place = onward & (jnp.arange(s.t.shape[0]) == s.count)
+    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(place, x), y[None].astype(x.dtype), x), all, new)
+    to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
+    record = Switches(
+        t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
+        q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
+        count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
+    )  # fmt: skip
+    return after, to, record
+
+
+def sizes_of(q, v):
+    """The sizes of coordinates and velocities, (2, n)."""
+    return jnp.abs(jnp.stack([stop_gradient(coordinates.flatten(y)[0]) for y in (q, v)]))
+
+
+def _one_of(first, values):
+    found = values[0]
+    for i, x in enumerate(values[1:], 1):
+        found = jnp.where(first == i, x, found)
+    return found

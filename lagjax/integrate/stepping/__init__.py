@@ -1,0 +1,1 @@
+"""Solvers and controllers around diffrax's."""

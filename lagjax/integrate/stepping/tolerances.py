@@ -1,0 +1,228 @@
+"""The error allowed in a step, for each number of the state.
+
+An absolute tolerance in the user's units is far too coarse for a motion of nanometres and far too fine for one of light
+years. If `atol` is not given, each coordinate and each velocity is therefore judged by its own size alone:
+
+    rtol max(|y|, a thousandth of the largest |y| so far),        for velocities also of √(|a| |q|)
+
+|y| is taken at the end of the step where it is larger, so that passing through zero costs nothing; a motion that dies
+out is followed over three decades; √(|a| |q|) is the velocity that goes with an extent and an acceleration, which is
+all there is at rest when a force sets in. To this is added only the round-off from the other coordinates: a motion in a
+plane leaves the third dimension at round-off, which no step can follow. Sizes are compared as √M_ii q_i and √M_ii v_i,
+which have the same unit for all coordinates. If everything is zero at the start, the size is a part of what the
+acceleration there yields in the whole time, or, if that is zero too, the acceleration of the step.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from lagjax.jaxtools.trees import stop_gradient
+
+# The size of an angle counts up to this: a tolerance relative to a thousand turns would mean nothing.
+TURN = 2 * np.pi
+# The size of a number is at least this part of the largest value that it has had.
+DIED_OUT = 1e-3
+# The round-off that one number causes in another, in units of the last digit.
+ROUNDED = 8.0
+# A first step that is too short costs one more step, one that is too long several; it may also miss an event.
+FIRST = 0.1
+# The root of a mass counts as at least this part of the largest one: round-off also comes through constraints.
+LIGHT = 1e-6
+# A coordinate at rest at zero counts as at least this part of the extent of all others when a force sets in.
+OF_OTHERS = 1e-6
+# For a start from zero: parts of the coordinates and velocities that its acceleration yields in the whole time.
+FROM_NOTHING = 1e-6, 1e-3
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of coordinates and of velocities, each (2,)."""
+
+    rtol: Float[Array, " 2"]
+    atol: Float[Array, " 2"]
+
+
+class Scales(NamedTuple):
+    """The size of a motion as told by its start; rows are coordinates and velocities.
+
+    - `root_mass`: √M_ii; `over_root_mass`: one over it, bounded.
+    - `reach`: the largest of √M_ii times the numbers.
+    - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
+    - `unknown`: whether all of this is zero, since nothing accelerates at the start either.
+    """
+
+    root_mass: Float[Array, "1 n"]
+    over_root_mass: Float[Array, "1 n"]
+    reach: Float[Array, "2 1"]
+    time: Float[Array, ""]
+    first: Float[Array, "2 n"]
+    unknown: Bool[Array, ""]
+
+
+def tolerances_at(start, ts, settings, sizes_so_far=None, a=None) -> Tolerances:
+    """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
+
+    `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
+    size where all of the state is zero. Where nothing accelerates either there is none, and it counts as one.
+    """
+    if not settings.by_size:
+        return Tolerances(settings.rtol, settings.atol)
+    sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
+    of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
+    of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
+    of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
+    return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
+
+
+def span_of(ts):
+    """The time that a motion takes; positive even if the motion is refused."""
+    return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
+
+
+def scales_of(mass, q, v, a, span) -> Scales:
+    """The scales of a motion, from its first state and the accelerations there, which need not be finite."""
+    root_mass, sizes = (
+        jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
+        jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
+    )
+    heaviest = jnp.max(root_mass)
+    over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
+    of_q, of_v, of_a = jnp.max(root_mass * sizes, axis=1)
+    nothing = (of_q == 0) & (of_v == 0)
+    # Zero sizes follow from the others: a velocity from extent and acceleration, otherwise from the time scale.
+    of_v = jnp.maximum(of_v, jnp.sqrt(of_a * of_q))
+    larger, smaller = jnp.stack([of_q, of_v]), jnp.stack([of_v, of_a])
+    known = (larger > 0) & (smaller > 0)
+    time = jnp.minimum(span, jnp.min(jnp.where(known, larger / jnp.where(known, smaller, 1.0), span)))
+    of_v = jnp.maximum(of_v, jnp.where(of_a > 0, of_a * time, of_q / span))
+    of_q = jnp.maximum(of_q, of_v * time)
+    reach = jnp.stack([of_q, of_v])[:, None]
+    least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
+    first = jnp.where(nothing, least, sizes[:2])
+    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
+
+
+def shared(scales: Scales, sizes) -> Float[Array, "2 n"]:
+    """For each number the value as large, in √M_ii times it, as the largest of all `sizes` (2, n)."""
+    return jnp.max(scales.root_mass * sizes, axis=1, keepdims=True) * scales.over_root_mass
+
+
+def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+    """The round-off in numbers that are zero while the others are as large as this."""
+    return ROUNDED * jnp.finfo(others.dtype).eps * others
+
+
+class AsNothing(eqx.Module):
+    """The `atol` of each coordinate and each velocity for iterations inside a step, from the start alone.
+
+    If that says nothing, since all is at rest at zero, it follows the unknown, (..., 2n), as in
+    `PerCoordinateTolerance`.
+    """
+
+    scales: Scales
+    rtol: Float[Array, " 2"]
+
+    def __call__(self, y: Float[Array, "..."]) -> Float[Array, " 2n"]:
+        """The tolerances beside those relative to each number."""
+        scales = self.scales
+        now = jnp.max(jnp.abs(y).reshape(-1, *scales.first.shape), axis=0)
+        others = jnp.where(scales.unknown, shared(scales, now), scales.reach * scales.over_root_mass)
+        own_size = jnp.where(scales.first > 0, scales.first, others)
+        return jnp.ravel(DIED_OUT * self.rtol[:, None] * own_size + rounding(others))
+
+
+class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
+    """Wrap `controller`, which has a single tolerance: each number's error is weighed by its own allowed error.
+
+    That follows the number's own size if `scales` are given, otherwise `tolerances`, of coordinates and of velocities.
+    At most a turn counts of coordinates that are `angles`, (n,). The state holds the largest numbers so far, (2, n).
+    """
+
+    controller: diffrax.PIDController
+    tolerances: Tolerances
+    scales: Scales | None
+    angles: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def rtol(self):
+        return self.controller.rtol
+
+    @property
+    def atol(self):
+        return self.controller.atol
+
+    @property
+    def norm(self):
+        return self.controller.norm
+
+    @property
+    def dtmin(self):
+        return self.controller.dtmin
+
+    def wrap(self, direction):
+        """Return this controller: time always runs forward."""
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The first step."""
+        if self.scales is not None and dt0 is None:
+            dt0 = FIRST * stop_gradient(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
+        t1, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return t1, (state, None if self.scales is None else self.scales.first)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Whether to keep a step, and the next one."""
+        state, largest = controller_state
+        weighed, now = self._weighed(t1 - t0, y0, y1_candidate, y_error, largest)
+        keep, *rest, state, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, weighed, error_order, state
+        )
+        largest = None if now is None else jnp.where(keep, now, largest)
+        return keep, *rest, (state, largest), result
+
+    # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
+    @eqx.filter_jit
+    def _weighed(self, h, y0, y1, error, largest):
+        """The error in the controller's units, and the largest numbers including this step."""
+        error, unravel = ravel_pytree(error)
+        before, after, h = stop_gradient((_rows(*y0), _rows(*y1), h))
+        size = jnp.maximum(jnp.abs(before), jnp.abs(after))
+        if largest is None:
+            allowed = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._capped_angles(size)
+            now = None
+        else:
+            now = jnp.maximum(size, largest)
+            allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
+        # Where nothing is allowed nothing may be off: zero stays zero.
+        weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)
+        return unravel(error * weights.ravel()), now
+
+    def _allowed_by_size(self, size, largest, rate):
+        scales = self.scales
+        assert scales is not None
+        others = shared(scales, largest)
+        q, v = self._capped_angles(jnp.maximum(size, DIED_OUT * largest))
+        own_size = jnp.stack([q, jnp.maximum(v, jnp.sqrt(rate * (q + OF_OTHERS * others[0])))])
+        # The same substitute as at the start, from the first acceleration that there is.
+        reach = jnp.max(scales.root_mass[0] * rate) * jnp.stack([scales.time**2, scales.time])[:, None]
+        from_nothing = np.array(FROM_NOTHING, own_size.dtype)[:, None] * reach * scales.over_root_mass
+        own_size = jnp.where(scales.unknown, jnp.maximum(own_size, from_nothing), own_size)
+        if any(self.angles):
+            others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
+        return self.tolerances.rtol[:, None] * own_size + rounding(others)
+
+    def _capped_angles(self, sizes):
+        if not any(self.angles):
+            return sizes
+        most = np.stack([np.where(self.angles, TURN, np.inf), np.full(len(self.angles), np.inf)])
+        return jnp.minimum(sizes, most.astype(sizes.dtype))
+
+
+def _rows(*trees):
+    """The numbers of trees of the same structure, one row per tree."""
+    return ravel_pytree(trees)[0].reshape(len(trees), -1)

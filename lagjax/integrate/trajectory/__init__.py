@@ -1,0 +1,1 @@
+"""A motion, and what is done with it."""

@@ -1,0 +1,181 @@
+"""A motion in phases: a trajectory that knows the phase of each output, and its switches."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.display import plots as plot
+from lagjax.display.printable import by_line
+from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
+from lagjax.jaxtools.compiled import compiled
+from lagjax.mechanics.projection import worst_residual
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import Model
+from lagjax.system.signature import UnknownSystem, known_system
+
+# The phase of an output that was not reached, and the number in unused places for switches.
+NO_PHASE = -1
+# The name under which switches are among the events of a motion.
+SWITCHES = "switches"
+
+
+class Switches(eqx.Module):
+    """The switches of a motion, in order of time; it prints itself.
+
+    - `t` (S,): their times, `[t]`; NaN beyond the last one. S is `most_switches` of the `lj.Hybrid`.
+    - `way` (S,): which of the hybrid's switches each is, and `to` (S,): the number of the next phase; -1 beyond the
+      last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
+    - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
+    - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
+    - `count`: how many there were.
+    - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
+      followed.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    t: Float[Array, " S"]
+    way: Int[Array, " S"]
+    to: Int[Array, " S"]
+    q: PyTree[Float[Array, "S ..."]]
+    v: PyTree[Float[Array, "S ..."]]
+    q_after: PyTree[Float[Array, "S ..."]]
+    v_after: PyTree[Float[Array, "S ..."]]
+    impulse: PyTree[Float[Array, "S ..."]]
+    count: Int[Array, ""]
+    uncertain: Bool[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+    ways: tuple[str, ...] = eqx.field(static=True)
+
+    def as_crossings(self) -> Crossings:
+        """Return the switches as crossings of one guard, with the states before them."""
+        return Crossings(self.t, self.q, self.v, {}, self.count, self.uncertain)
+
+    def __len__(self):
+        return int(self.count)
+
+    def __repr__(self):
+        if isinstance(self.t, Tracer) or not isinstance(self.t, jax.Array | np.ndarray):
+            return "Switches, being traced"
+        if np.ndim(self.count):
+            low, high = int(np.min(self.count)), int(np.max(self.count))
+            return f"Switches of {np.size(self.count)} lanes, {low} to {high} each"
+        return by_line("\n".join(["Switches: " + self.in_words(), *self._rows()]))
+
+    def in_words(self) -> str:
+        """Return the number of switches, and whether some may be missing."""
+        return f"{int(self.count)}" + ("; some may be missing" if bool(self.uncertain) else "")
+
+    def _rows(self):
+        times, ways, to = map(np.asarray, (self.t, self.way, self.to))
+        return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} -> {self.names[to[k]]}" for k in range(int(self.count))]
+
+
+class HybridTrajectory(Trajectory):
+    """A motion in phases, as `lj.integrate` returns it for a `lj.Hybrid`: a `Trajectory` with more.
+
+    - `phase` (T,): the number of the phase at each output, in the order of `system.names`; -1 where none was reached.
+      An output at the very time of a switch has the state and the phase before it.
+    - `switches`: the `Switches`.
+    - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
+    - `end`: the last instant; where the motion ended on a switch, the state after it.
+    - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces
+      and impacts do work, nothing has to be conserved.
+    """
+
+    phase: Int[Array, " T"] = eqx.field(kw_only=True)
+    switches: Switches = eqx.field(kw_only=True)
+
+    @property
+    def system(self) -> Hybrid:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return known_system(self.any_system)
+
+    def named_phases(self) -> np.ndarray:
+        """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
+        return np.array([*self.switches.names, ""])[np.asarray(self.phase)]
+
+    def last_phase(self) -> int:
+        """The number of the phase in which the motion ended, or failed. Not while JAX is tracing."""
+        count = len(self.switches)
+        return int(self.switches.to[count - 1] if count else self.system.first)
+
+    def jacobi_integral(self) -> Float[Array, " T"]:
+        """The Jacobi integral of the phase at every output, (T,), `[L]`. Not for batched trajectories."""
+        return _of_phases(_integral, self)
+
+    def drift(self) -> Float[Array, ""]:
+        """Return NaN: nothing is known to be conserved over all phases."""
+        return jnp.full_like(self.scaled_error, jnp.nan)
+
+    def residual(self) -> Float[Array, ""]:
+        """The worst constraint residual over all outputs, but not between them, each in its own phase, relative."""
+        worst = [_residual_in(model, i, self) for i, model in enumerate(self.model.phases) if model.m]
+        return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
+
+    def plot(self, charges=False):
+        """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
+
+        Switches stand at their own times; else what happens between two outputs is not seen.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
+        """
+        fig = super().plot(charges)
+        for axis in fig.axes:
+            for t in np.asarray(self.switches.t)[: len(self.switches)]:
+                axis.axvline(t, color=plot.COLOURS[-1], linewidth=0.6, linestyle=":", zorder=0)
+        return fig
+
+    def rows(self) -> dict:
+        return super().rows() | {"phase": self.phase}
+
+    def _of_system(self):
+        if isinstance(self.any_system, UnknownSystem):
+            lines = [("system", repr(self.any_system))]
+        elif any(system.constraints for system in self.system.systems):
+            lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)")]
+        else:
+            lines = []
+        names, counts = np.unique(self.named_phases(), return_counts=True)
+        outputs = ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
+        found = [row.strip() for row in self.switches._rows()]
+        shown = found[:6] + (["..."] if len(found) > 6 else [])
+        return [
+            *lines,
+            ("phases", f"outputs: {outputs}"),
+            ("switches", self.switches.in_words()),
+            *(("", row) for row in shown),
+            *((f"event '{name}'", found.in_words()) for name, found in self.events.items() if name != SWITCHES),
+        ]
+
+
+def _integral(model, t, q, v):
+    return jacobi_and_scale(model, t, q, v)[0]
+
+
+def _of_phases(function, trajectory):
+    """Return `function(model, t, q, v)` at all outputs, each with the model of its own phase."""
+    found = jnp.full_like(trajectory.t, jnp.nan)
+    for i, model in enumerate(trajectory.model.phases):
+        values = function(model, trajectory.t, trajectory.q, trajectory.v)
+        found = jnp.where(trajectory.phase == i, values, found)
+    return found
+
+
+def _residual_in(model: Model, i, trajectory):
+    return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v)
+
+
+@compiled
+def _worst(model, i, phase, t, q, v):
+    in_phase = phase == i
+    # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
+    at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))
+    t, q, v = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v))
+    return lax.cond(jnp.any(in_phase), lambda: worst_residual(model, t, q, v), lambda: jnp.zeros_like(t[0]))

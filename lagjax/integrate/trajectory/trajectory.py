@@ -1,0 +1,355 @@
+"""The result of an integration: times, states, multipliers, and how it went."""
+
+import os
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from lagjax.display import plots as plot
+from lagjax.display.animation import Animation
+from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.trajectory import drawing, printed
+from lagjax.integrate.trajectory.drawing import curves, finite, panels
+from lagjax.integrate.trajectory.error_report import Errors, angle_mask
+from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.save import save
+from lagjax.integrate.trajectory.to_xarray import dataset
+from lagjax.jaxtools import packed
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.packed import Packed
+from lagjax.jaxtools.tracing import is_traced
+from lagjax.jaxtools.without_lapack_batches import jitted
+from lagjax.mechanics.projection import worst_residual
+from lagjax.mechanics.structure import what_changes_jacobi_integral
+from lagjax.system.model import Model, model_of
+from lagjax.system.signature import UnknownSystem, known_system
+from lagjax.system.system import System
+
+
+class AccuracyWarning(UserWarning):
+    """A motion was computed, and its own checks show that it is less accurate than its tolerance suggests."""
+
+
+class Snapshot(NamedTuple):
+    """One instant of a motion."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    multipliers: dict[str, Array]
+
+
+class SolveInfo(NamedTuple):
+    """How a motion was stepped through.
+
+    `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
+    `steps`: chosen by the "tolerance", by it over several "legs", "fixed", or by the user's "controller"; `backward`:
+    whether time decreases.
+    """
+
+    method: str
+    order: int
+    evaluations: int | None
+    steps: str
+    backward: bool = False
+
+
+class SolveOptions(NamedTuple):
+    """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
+
+    method: diffrax.AbstractSolver | None
+    stepsize_controller: diffrax.AbstractStepSizeController | None
+    dt0: Array | None
+    max_step: Array | None
+    jump_ts: Array | None
+    drift: str
+    jumps: str = "found"
+
+
+class StaticPart(NamedTuple):
+    """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along."""
+
+    rest: Packed
+    how: SolveInfo
+
+    @property
+    def method(self) -> str:
+        return self.how.method
+
+
+# Functions that need the integrator, which imports this file: `integrate.py` enters them here.
+BY_INTEGRATION: dict[str, Callable] = {}
+
+
+class Trajectory(eqx.Module):
+    """A motion at the requested times. It prints its own quality, and can plot and animate itself.
+
+    - `t` (T,): the requested times, increasing or decreasing.
+    - `q`, `v`: in the structure of the initial state, each leaf with a leading axis T. NaN after an event
+      or a failure ended the motion.
+    - `multipliers`: by constraint name, (T, *shape of the constraint), from the projected states.
+    - `end`: the last instant reached (`t`, `q`, `v`, `multipliers`): the event, where one ended the motion.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`; where forces jump, `num_jumps` (of those that
+      depend on q or v) and `lost_jumps`, whether some were not followed.
+    - `error`: estimates of the errors of `q`, `v`, `multipliers` and of the times of `events` (`Errors`); None if they
+      were not made.
+    - `scaled_error`: the worst error in units of what is allowed (10,000 tolerances, and a thousandth of each number);
+      above 1 the motion is less accurate than that, and `integrate` warns. Without `error` it is the change of the
+      Jacobi integral, if it must be constant, and of the constraints, in units of what the tolerance lets expect; 0 if
+      nothing must be constant. Infinite for a motion that failed. A number that is zero throughout has its error as
+      its size: no verdict depends on units. Errors, changes and sizes are those at the outputs: one that is larger
+      between two of them is not seen.
+    - `result`: a `RESULTS` item; `lj.RESULTS.successful`, `event_occurred`, or what went wrong.
+    - `events`: by name, the `Crossings` of the requested events.
+    - `params`, `system`: what was integrated; `asked`: the method and the steps that were asked for. `tolerance`:
+      (rtol, atol), each (2,): for coordinates and for velocities. If no atol was given it is (2, n), one for each
+      number: what is as good as zero in this motion.
+
+    Under `vmap` every array has the batch's axes in front.
+    """
+
+    t: Float[Array, " T"]
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    end: Snapshot
+    stats: dict[str, Array]
+    scaled_error: Float[Array, ""]
+    result: RESULTS
+    events: dict[str, Crossings]
+    tolerance: tuple[Array, Array]
+    arrays: PyTree
+    static: StaticPart = eqx.field(static=True)
+    error: Errors | None = None
+
+    @property
+    def system(self) -> System:
+        return known_system(self.any_system)
+
+    @property
+    def any_system(self) -> System | UnknownSystem:
+        """The system; for a trajectory that was read from a file without it, the description in the file."""
+        return self._problem()[0]
+
+    @property
+    def params(self) -> PyTree:
+        return self._problem()[1]
+
+    @property
+    def asked(self) -> SolveOptions:
+        return self._problem()[2]
+
+    def _problem(self):
+        return self.static.rest.together(self.arrays)
+
+    def rows(self) -> dict:
+        """The fields with one row per output, by name."""
+        return {"t": self.t, "q": self.q, "v": self.v, "multipliers": self.multipliers}
+
+    @property
+    def model(self) -> Model:
+        """The system prepared for states of this form. Not for batched trajectories."""
+        return model_of(self.system, *jax.tree.map(lambda x: x[0], (self.t, self.q, self.v)), self.params)
+
+    def jacobi_integral(self) -> Float[Array, " T"]:
+        """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""
+        return jacobi_and_scale(self.model, self.t, self.q, self.v)[0]
+
+    def drift(self) -> Float[Array, ""]:
+        """The largest change of the Jacobi integral at the outputs, relative to the largest `|v·p| + |L|` there.
+
+        One that comes and goes between two outputs is not seen.
+        """
+        return _worst_drift(self.model, self.t, self.q, self.v)
+
+    def residual(self) -> Float[Array, ""]:
+        """The worst constraint residual over all outputs, positions and velocities, relative; 0 without constraints.
+
+        Between outputs it is not computed: `at(t)` is on the constraints there.
+        """
+        if not self.system.constraints:
+            return jnp.zeros_like(self.scaled_error)
+        return _worst_residual(self.model, self.t, self.q, self.v)
+
+    def at(self, t: ArrayLike) -> Snapshot:
+        """Return the motion at any time, at the order of its method: continued from the output before by its own steps.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.5])
+        >>> now = traj.at([0.1, 0.2])
+        >>> print(now.q.round(9), now.v.round(9))
+        [0.25 0.4 ] [2. 1.]
+
+        **Arguments:** `t`: a time or an array of them, of any shape and in any order, `[t]`, between the first output
+        and the end of the motion.
+
+        **Returns:** a `Snapshot` (`t`, `q`, `v`, `multipliers`), each leaf with the shape of `t` in front; on the
+        constraints. At an output it is that output. For a batch the batch's axes come first. It is differentiable
+        in `t` and in everything the motion depends on. Under `jit` and in a batch it is NaN outside of the motion.
+
+        Each time costs a short solve from the previous output: with outputs as dense as steps, one step.
+
+        **Raises:** `ValueError` for a time outside of the motion, or after its end by an event or a failure; for
+        outputs off the constraints (`drift="none"`), and for a controller that plans the steps of the whole motion.
+        """
+        return BY_INTEGRATION["at"](self, t)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the motion into a file, an npz; `lj.load_trajectory(path, system)` reads it, bit for bit.
+
+        The functions of the system are not in it. If writing is interrupted, the previous file remains.
+
+        **Raises:** `TypeError`, naming them, for entries of `params` or of the structure of q that are not data;
+        `OSError` if there is no such folder.
+        """
+        save(self, path)
+
+    def to_xarray(self, dims: Sequence[str] | None = None):
+        """Return the motion as an `xarray.Dataset`.
+
+        >>> import lagjax as lj
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v["y"] ** 2 - params["g"] * q["y"])
+        >>> traj = lj.integrate(fall, {"y": 0.0}, {"y": 3.0}, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
+        >>> data = traj.to_xarray()
+        >>> print(data["q.y"].dims, data["q.y"].sel(t=0.2).item(), data.attrs["params.g"])
+        ('t',) 0.4 10.0
+
+        Variables are named as here: `q.y`, `v.y`, their estimated errors `error.q.y`, and multipliers like their
+        constraints. Their dimensions are `t` and, for a coordinate that is an array, `y_0` and so on. `result`, `end`
+        and the numbers of steps are variables too; the method, tolerances and parameters are attributes.
+
+        **Arguments:** `dims`: the names of a batch's axes, which come first; by default "batch", or "batch_0" and so
+        on. The parameters of a batch are variables.
+
+        **Raises:** `ImportError` without xarray; `ValueError` if the number of names differs from that of the axes.
+        """
+        return dataset(self, dims)
+
+    def plot(self, charges=False):
+        """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
+
+        `charges=True` adds the relative change of the quantities known to be conserved; `lj.symmetries(...)`, or
+        functions of (t, q, v, params) by name, add that of others. The outputs are drawn, linked by straight lines:
+        what happens between two of them is not seen.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or without any charges.
+        """
+        self._check_alone("plot()")
+        return plot.time_series(np.asarray(self.t), panels(self, charges))
+
+    def phase_portrait(self):
+        """Plot velocities against coordinates, one panel per coordinate; returns a matplotlib `Figure`.
+
+        A dot marks the start. An angle (a coordinate that enters only through sines and cosines) that goes around is
+        drawn between -π and π. For a batched trajectory every lane is drawn. The outputs are linked by straight lines:
+        what happens between two of them is not seen.
+
+        **Raises:** `ImportError` without matplotlib.
+        """
+        lanes = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[self.t.ndim - 1 :]), self)
+        lanes = [jax.tree.map(lambda x: x[i], lanes) for i in range(len(lanes.t))]
+        is_angle = angle_mask(lanes[0])
+        pairs = [(curves(lane.q), curves(lane.v)) for lane in lanes]
+        drawn = {name: [finite(q[name], v[name]) for q, v in pairs] for name in pairs[0][0]}
+        return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
+
+    def animate(
+        self, positions: Callable, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
+    ) -> Animation:
+        """Animate the motion: points in the plane, lines that link them, and trails.
+
+        >>> import jax.numpy as jnp
+        >>> import lagjax as lj
+        >>> stone = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"])
+        >>> start = {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 5.0}
+        >>> traj = lj.integrate(stone, *start, {"g": 10.0}, ts=jnp.linspace(0.0, 1.0, 11))
+        >>> traj.animate(lambda t, q, params: (q["x"], q["y"]))
+        Animation of 51 frames, 2 s, 8 kB: plays in a notebook, and with .save("motion.html") in a browser
+
+        **Arguments:**
+
+        - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or a
+          dictionary of these, each name in its own colour. The last point of each leaves a trail. Plain NumPy works.
+        - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
+        - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope: an impact or a
+          pulse between two of them is smoothed away.
+        - `trail`: how many seconds of playing the trails reach back.
+
+        **Returns:** an `Animation`. It ends with the motion: at an event, or at the last output before it failed.
+
+        **Raises:** `ValueError` for a batched trajectory, positions that are not points of the plane, and outputs too
+        far apart to tell what happens between them.
+        """
+        self._check_alone("animate(positions)")
+        ended_by_event = bool(self.result == RESULTS.event_occurred)
+        return drawing.film(self, positions, seconds, rate, trail, ended_by_event)
+
+    def _of_system(self):
+        """The printed rows on the system and its events."""
+        of_events = [(f"event '{name}'", crossings.in_words()) for name, crossings in self.events.items()]
+        if isinstance(self.any_system, UnknownSystem):
+            return [("system", repr(self.any_system)), *of_events]
+        found = []
+        if self.system.constraints:
+            found.append(("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)"))
+        changed_by = next(what_changes_jacobi_integral(self.model), None)
+        as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
+        drift = f"{float(self.drift()):.1e} (relative, at the outputs)"
+        found.append(("change of the Jacobi integral", drift + as_it_may))
+        return found + of_events
+
+    def _check_alone(self, call):
+        if self.t.ndim != 1:
+            raise ValueError(
+                f"this trajectory is a batch of shape {self.t.shape[:-1]}: draw one lane of it.\n"
+                f"Fix: jax.tree.map(lambda x: x[0], traj).{call}"
+            )
+
+    def __repr__(self):
+        if is_traced(self):
+            return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
+        lanes = self.t.shape[:-1]
+        return "\n".join(printed.batch_lines(self, lanes) if lanes else printed.lines(self))
+
+
+@jitted
+def jacobi_and_scale(model, t, q, v):
+    """The Jacobi integral at each of a batch of states, and the size of its terms `|v·p| + |L|`."""
+
+    def at(t, q, v):
+        x, u = model.vectors(q, v)
+        value, p = jax.value_and_grad(model.lagrangian, argnums=2)(t, x, u)
+        power = u @ p
+        return power - value, jnp.abs(power) + jnp.abs(value)
+
+    return jax.vmap(at)(t, q, v)
+
+
+def worst_drift(model, t, q, v):
+    """The largest change of the Jacobi integral from the first state on, relative to its largest terms."""
+    h, scale = jacobi_and_scale(model, t, q, v)
+    largest = jnp.nanmax(scale)
+    return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
+
+
+def pack(system, params, asked: SolveOptions, how: SolveInfo) -> tuple[PyTree, StaticPart]:
+    """Split (system, params, asked) into arrays and a hashable rest."""
+    arrays, rest = packed.pack((system, params, asked))
+    return arrays, StaticPart(rest, how)
+
+
+@compiled
+def _worst_drift(model, t, q, v):
+    return worst_drift(model, t, q, v)
+
+
+@compiled
+def _worst_residual(model, t, q, v):
+    return worst_residual(model, t, q, v)

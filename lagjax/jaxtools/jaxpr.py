@@ -1,0 +1,347 @@
+"""JAX programs (jaxprs) as data: evaluate and rewrite equations, find what depends on what, split a program.
+
+JAX's primitives by name, classified for the code that walks over programs; a test checks each name.
+
+A primitive that is not listed is treated as unknown, which is slower and never wrong.
+"""
+
+import weakref
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import wraps
+from typing import TypeVar, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+# They work entry by entry, on numbers alone.
+ELEMENTWISE = {
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
+    "clamp", "cos", "cosh", "convert_element_type", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
+    "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt",
+    "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "rem", "round", "rsqrt", "select_n", "sign",
+    "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
+}  # fmt: skip
+# Those of these that NumPy computes the same way: it computes constants.
+IN_NUMPY = {
+    "abs": np.abs, "add": np.add, "and": np.bitwise_and, "eq": np.equal, "ge": np.greater_equal, "gt": np.greater,
+    "le": np.less_equal, "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal,
+    "neg": np.negative, "not": np.bitwise_not, "or": np.bitwise_or, "square": np.square, "sub": np.subtract,
+    "select_n": lambda which, *cases: np.choose(which.astype(int), cases),
+}  # fmt: skip
+REDUCING = {"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "reduce_and", "reduce_or"}
+ACCUMULATING = {"cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"}
+# They move entries and compute none.
+MOVING = {
+    "broadcast_in_dim", "concatenate", "copy", "dynamic_slice", "gather", "iota", "pad", "reshape", "rev", "slice",
+    "split", "squeeze", "stack", "transpose", "unstack",
+}  # fmt: skip
+# Linear in all operands together; in the first operand, where the others choose or scale; in each of two operands.
+ADDITIVE = {
+    "add", "add_any", "broadcast_in_dim", "concatenate", "convert_element_type", "copy", "cumsum", "neg", "pad",
+    "reduce_sum", "reshape", "rev", "slice", "split", "squeeze", "stack", "stop_gradient", "sub", "transpose",
+}  # fmt: skip
+LINEAR_IN_FIRST = {"div", "dynamic_slice", "gather"}
+BILINEAR = {"dot_general", "mul"}
+PERIODIC = {"cos", "sin"}
+# Primitives that stand for the program that they carry; the second kind has rules of its own for derivatives.
+CALLS = {"jit", "closed_call"}
+CALLS_WITH_RULES = {"custom_jvp_call", "custom_vjp_call", "remat2"}
+CONTROL_FLOW = {"cond", "scan", "while"}
+# Equinox's primitives: for use under `vmap`, and marks for derivatives.
+EQUINOX_PRIMITIVES = {
+    "maybe_set", "nonbatchable", "nondifferentiable_backward", "select_if_vmap", "unvmap_all", "unvmap_any",
+    "unvmap_max", "vprim",
+}  # fmt: skip
+# LAPACK on a CPU, with the number of axes of the first operand for one matrix; others may hold solvers that call it.
+LAPACK = {
+    "cholesky": 2, "eig": 2, "eigh": 2, "geqp3": 2, "geqrf": 2, "hessenberg": 2, "householder_product": 2, "lu": 2,
+    "ormqr": 2, "qr": 2, "schur": 2, "svd": 2, "triangular_solve": 2, "tridiagonal": 2, "tridiagonal_solve": 1,
+}  # fmt: skip
+HOLDS_A_SOLVER = {"linear_solve"}
+
+
+T = TypeVar("T")
+
+# Chains of at least so many calls are worth a loop.
+LONG_CHAIN = 16
+
+
+def bodies(equation) -> list[Jaxpr]:
+    """The programs inside a primitive: branches, loop bodies, called functions."""
+    found = []
+    for value in equation.params.values():
+        for item in value if isinstance(value, (tuple, list)) else (value,):
+            if isinstance(item, (ClosedJaxpr, Jaxpr)):
+                found.append(getattr(item, "jaxpr", item))
+    return found
+
+
+def once_per_program(find: Callable[[Jaxpr], T]) -> Callable[[Jaxpr], T]:
+    """Keep what `find` says of a program as long as this lives: it never changes, and JAX traces a function once."""
+    known: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
+
+    @wraps(find)
+    def found(jaxpr):
+        # Two tests of one dictionary: an entry may go between them only if the program does.
+        if jaxpr not in known:
+            known[jaxpr] = find(jaxpr)
+        return known[jaxpr]
+
+    return found
+
+
+def anywhere(test: Callable) -> Callable[[Jaxpr], bool]:
+    """Return the function that says whether `test` holds for an equation of a program, or of one inside it."""
+
+    @once_per_program
+    def holds(jaxpr):
+        return any(test(equation) or any(map(holds, bodies(equation))) for equation in jaxpr.eqns)
+
+    return holds
+
+
+def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
+    """The program with each of its equations changed, those inside loops, branches and functions too."""
+    return _rewritten(closed, lambda jaxpr: jaxpr.replace(eqns=list(map(change, jaxpr.eqns))))
+
+
+def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJaxpr:
+    """The program with its list of equations changed, and the lists inside loops, branches and functions.
+
+    An object used in several places stays one object, and one that does not change stays the same object: JAX
+    recognises functions that it has compiled by their identity.
+    """
+    # New objects by the id of the old one, which is kept alive lest another object get its id.
+    made = {}
+
+    def once(value, make):
+        if id(value) not in made:
+            made[id(value)] = value, make()
+        return made[id(value)][1]
+
+    def inside(value):
+        # From jax 0.12 on both names are one class, and a program is closed by itself.
+        if isinstance(value, ClosedJaxpr) and value.jaxpr is not value:
+            jaxpr = inside(value.jaxpr)
+            return value if jaxpr is value.jaxpr else once(value, lambda: value.replace(jaxpr=jaxpr))
+        if isinstance(value, Jaxpr):
+            return once(value, lambda: of_program(value))
+        if isinstance(value, tuple):
+            new = [inside(item) for item in value]
+            # A named tuple keeps its type.
+            make = type(value) if not hasattr(value, "_fields") else lambda items: type(value)(*items)
+            return value if _same(new, value) else make(new)
+        return value
+
+    def of_equation(equation):
+        params = equation.params
+        new = [inside(value) for value in params.values()]
+        return equation if _same(new, params.values()) else equation.replace(params=dict(zip(params, new)))
+
+    def of_program(jaxpr):
+        new = [of_equation(equation) for equation in change(jaxpr).eqns]
+        return jaxpr if _same(new, jaxpr.eqns) else jaxpr.replace(eqns=new)
+
+    return cast(ClosedJaxpr, inside(closed))
+
+
+def _same(new, old):
+    return len(new) == len(old) and all(one is other for one, other in zip(new, old))
+
+
+def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with long chains f(f(f(... x))) of the same call turned into loops.
+
+    (diffrax goes back a hundred floating-point numbers from the last time, one after the other.)
+    """
+    return _rewritten(closed, _chains_as_loops)
+
+
+def _chains_as_loops(jaxpr):
+    uses = Counter(x for e in jaxpr.eqns for x in variables(e))
+    uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
+    # The equations of each chain so far, by the variable that it ends with.
+    chains = {}
+    for equation in jaxpr.eqns:
+        if not bodies(equation) or equation.effects or len(variables(equation)) != 1 or len(equation.outvars) != 1:
+            continue
+        (operand,), (result,) = variables(equation), equation.outvars
+        if operand.aval != result.aval:
+            continue
+        before = chains.get(operand, [])
+        if not (before and uses[operand] == 1 and _alike(before[-1], equation)):
+            before = []
+        chains.pop(operand, None)
+        chains[result] = [*before, equation]
+    loops = {id(chain[-1]): chain for chain in chains.values() if len(chain) >= LONG_CHAIN}
+    absorbed = {id(e) for chain in loops.values() for e in chain[:-1]}
+    kept = [e if id(e) not in loops else _loop(jaxpr, loops[id(e)]) for e in jaxpr.eqns if id(e) not in absorbed]
+    return jaxpr.replace(eqns=kept)
+
+
+def _alike(one, other):
+    return one.primitive is other.primitive and list(map(str, bodies(one))) == list(map(str, bodies(other)))
+
+
+def _loop(jaxpr, chain):
+    (x,), last = variables(chain[0]), chain[-1]
+    step = lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0]
+    looped = jax.jit(lambda value: lax.fori_loop(0, len(chain), step, value))
+    (call,) = jax.make_jaxpr(looped)(x.aval).eqns
+    return call.replace(invars=[x], outvars=last.outvars)
+
+
+def equations(jaxpr: Jaxpr) -> Iterator:
+    """All equations of a program, those inside its loops, branches and functions included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for body in bodies(equation):
+            yield from equations(body)
+
+
+def length(jaxpr: Jaxpr) -> int:
+    """How many operations a program consists of, those inside its loops and functions included."""
+    return sum(1 for _ in equations(jaxpr))
+
+
+def variables(equation) -> list:
+    """The distinct operands of an equation that are not literals."""
+    return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))
+
+
+def written(literal: Literal) -> np.ndarray:
+    """The value of a literal, in the dtype that it has in the program."""
+    # JAX also has operands that are not arrays; those are never literals.
+    assert isinstance(literal.aval, ShapedArray)
+    return np.asarray(literal.val, literal.aval.dtype)
+
+
+def evaluate(jaxpr: Jaxpr, equation, values) -> list:
+    """The results of one equation of a program, whatever its primitive; `values` by variable."""
+    if not bodies(equation):
+        operands = [x.val if isinstance(x, Literal) else values[x] for x in equation.invars]
+        results = equation.primitive.bind(*operands, **equation.params)
+        return results if equation.primitive.multiple_results else [results]
+    operands = variables(equation)
+    alone = jaxpr.replace(constvars=[], invars=operands, outvars=equation.outvars, eqns=[equation])
+    return jaxpr_as_fun(ClosedJaxpr(alone, ()))(*(values[x] for x in operands))
+
+
+def applied(jaxpr: Jaxpr, equation, operands) -> list:
+    """The same as `evaluate`, given the operands in order."""
+    return evaluate(
+        jaxpr, equation, {x: value for x, value in zip(equation.invars, operands) if not isinstance(x, Literal)}
+    )
+
+
+def interpreted(
+    closed: ClosedJaxpr, inputs: Sequence, rule: Callable, of_constant: Callable, enters: Callable | None = None
+) -> list:
+    """The results of a program with values of any kind in place of its arrays.
+
+    `rule(equation, operands)` returns the results of a primitive for such values; the program that a call stands for is
+    interpreted too, unless `enters(equation)` is false. `of_constant(x, aval)` turns a constant into a value.
+    """
+    jaxpr = closed.jaxpr
+    values = {x: of_constant(constant, x.aval) for x, constant in zip(jaxpr.constvars, closed.consts)}
+    values.update(zip(jaxpr.invars, inputs))
+    read = lambda x: of_constant(x.val, x.aval) if isinstance(x, Literal) else values[x]
+    for equation in jaxpr.eqns:
+        operands, inner = [read(x) for x in equation.invars], stands_for(equation)
+        if inner is None or not (enters is None or enters(equation)):
+            results = rule(equation, operands)
+        else:
+            results = interpreted(inner, operands, rule, of_constant, enters)
+        values.update(zip(equation.outvars, results))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def stands_for(equation) -> ClosedJaxpr | None:
+    """The program that a call stands for; None for others: a reduction, too, holds one, for pairs of entries."""
+    inner = [p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
+    if equation.primitive.name not in CALLS | CALLS_WITH_RULES or len(inner) != 1:
+        return None
+    closed = inner[0] if isinstance(inner[0], ClosedJaxpr) else ClosedJaxpr(inner[0], ())
+    return closed if len(closed.jaxpr.invars) == len(equation.invars) else None
+
+
+def reached(jaxpr: Jaxpr, inputs: Iterable) -> set:
+    """The variables that depend on some of a program's variables; each primitive is one node."""
+    found = set(inputs)
+    for equation in jaxpr.eqns:
+        if any(x in found for x in variables(equation)):
+            found.update(equation.outvars)
+    return found
+
+
+def depends(jaxpr: Jaxpr, inputs: Iterable) -> bool:
+    """Whether any result of a program depends on some of its variables."""
+    found = reached(jaxpr, inputs)
+    return any(not isinstance(x, Literal) and x in found for x in jaxpr.outvars)
+
+
+def needed(jaxpr: Jaxpr) -> list:
+    """The equations that a program's results depend on."""
+    wanted, kept = {x for x in jaxpr.outvars if not isinstance(x, Literal)}, []
+    for equation in reversed(jaxpr.eqns):
+        if equation.effects or any(x in wanted for x in equation.outvars):
+            wanted.update(variables(equation))
+            kept.append(equation)
+    return kept[::-1]
+
+
+def outputs_of(closed: ClosedJaxpr, which: Iterable[int]) -> ClosedJaxpr:
+    """The program that gives some of the results of another one, and computes nothing else."""
+    jaxpr = closed.jaxpr.replace(outvars=[closed.jaxpr.outvars[i] for i in which])
+    return closed.replace(jaxpr=jaxpr.replace(eqns=needed(jaxpr)))
+
+
+def run(closed: ClosedJaxpr, operands: Sequence) -> list:
+    """The results of a program."""
+    return jaxpr_as_fun(closed)(*operands)
+
+
+def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
+    """Split a program into two functions: of the inputs `first`, and of the first one's results and the inputs `then`.
+
+    A division of floating-point numbers by a value of the first function becomes a multiplication by its inverse.
+    """
+    jaxpr = program.jaxpr
+    late = reached(jaxpr, (jaxpr.invars[i] for i in then))
+    is_known = lambda x: not isinstance(x, Literal) and x not in late
+    before = [e for e in jaxpr.eqns if not any(x in late for x in variables(e))]
+    after = [e for e in jaxpr.eqns if any(x in late for x in variables(e))]
+    crossing = dict.fromkeys(x for e in after for x in variables(e) if x not in late)
+    crossing.update(dict.fromkeys(x for x in jaxpr.outvars if is_known(x)))
+    divisors = dict.fromkeys(e.invars[1] for e in after if _divides_numbers(e) and is_known(e.invars[1]))
+    constants = dict(zip(jaxpr.constvars, program.consts))
+
+    def at_first(*given):
+        values = constants | {jaxpr.invars[i]: x for i, x in zip(first, given)}
+        for equation in before:
+            values.update(zip(equation.outvars, evaluate(jaxpr, equation, values)))
+        return [values[x] for x in crossing] + [1 / values[x] for x in divisors]
+
+    def afterwards(prepared, *given):
+        values = dict(zip(crossing, prepared)) | {jaxpr.invars[i]: x for i, x in zip(then, given)}
+        inverse = dict(zip(divisors, prepared[len(crossing) :]))
+        for equation in after:
+            if _divides_numbers(equation) and is_known(equation.invars[1]):
+                dividend, divisor = equation.invars
+                results = [values[dividend] * inverse[divisor]]
+            else:
+                results = evaluate(jaxpr, equation, values)
+            values.update(zip(equation.outvars, results))
+        return [jnp.asarray(written(x)) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
+
+    return at_first, afterwards
+
+
+def _divides_numbers(equation):
+    results = [x.aval for x in equation.outvars if equation.primitive.name == "div"]
+    return any(not result.shape and jnp.issubdtype(result.dtype, jnp.floating) for result in results)

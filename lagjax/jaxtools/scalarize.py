@@ -1,0 +1,357 @@
+"""Programs on small arrays rewritten as operations on single numbers, without known zeros.
+
+The mechanics is written with vectors and matrices. For a few coordinates these are mostly zeros and ones: the rows of a
+unit matrix along which a momentum is differentiated, a diagonal mass matrix. `written_out` splits a program into
+operations on single numbers: products with a known zero are dropped, products with a known one are not computed, and
+neither are unused numbers. XLA keeps the rest in registers.
+
+A product with a known zero is zero, even if the other factor turns out to be infinity or NaN: so it is where a known
+zero is the derivative of what does not matter. Two exceptions keep the meaning of what the user writes: a factor that
+is known to be infinity or NaN gives NaN; and in a program that asks whether a number is one (`isnan`, `isfinite`,
+`nan_to_num`), all products with zeros are computed. Primitives that are not known here, control flow, and arrays of
+more than `LARGE` entries are left unchanged.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from lagjax.jaxtools.elementary import sincos_in_lanes
+from lagjax.jaxtools.jaxpr import CALLS, ELEMENTWISE, IN_NUMPY, ClosedJaxpr, Literal, applied, equations, interpreted
+
+LARGE = 512
+
+
+class TooLong(Exception):
+    """A program becomes longer than the allowed number of operations."""
+
+
+def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
+    """Evaluate a program on its (flat) arguments, number by number; raise `TooLong` beyond about `most` operations.
+
+    >>> import jax, jax.numpy as jnp
+    >>> program = jax.make_jaxpr(lambda x: jnp.diag(jnp.array([2.0, 0.0])) @ x)(jnp.ones(2))
+    >>> numbers = jax.make_jaxpr(lambda x: written_out(program, x))(jnp.ones(2))
+    >>> print([str(equation.primitive) for equation in numbers.jaxpr.eqns].count("mul"))
+    1
+    """
+    # Known numbers follow the same rules as in the compiled program: 1/0 is infinite, without a warning.
+    with np.errstate(all="ignore"):
+        inputs = [_split(x) if _small(x.aval) else x for x in map(_Value, args)]
+        ledger = _Ledger(most, not asks_for_nan(closed))
+        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, ledger), _constant, _is_plain_call)
+    return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
+
+
+def asks_for_nan(closed: ClosedJaxpr) -> bool:
+    """Whether a program asks of a number whether it is NaN or infinite."""
+
+    def asks(equation):
+        name, operands = equation.primitive.name, equation.invars
+        if name not in ("eq", "ne"):
+            return name == "is_finite"
+        known = [x.val for x in operands if isinstance(x, Literal)]
+        return operands[0] is operands[1] or any(np.ndim(x) == 0 and not np.isfinite(x) for x in known)
+
+    return any(asks(equation) for equation in equations(closed.jaxpr))
+
+
+class _Ledger:
+    """The sines and cosines computed so far by their argument, how many operations are still allowed, and whether
+    products with known zeros are dropped."""
+
+    def __init__(self, most, drops_zeros=True):
+        self.pairs, self.left, self.drops_zeros = {}, most, drops_zeros
+
+    def count(self, entries):
+        """Count the entries that are not known numbers."""
+        self.left -= sum(not isinstance(x, np.generic) for x in entries)
+        if self.left < 0:
+            raise TooLong
+
+
+class _Value:
+    """A whole array with the interface of a program's variable."""
+
+    def __init__(self, array):
+        self.array, self.aval = array, jax.typeof(array)
+
+
+def _small(aval):
+    return hasattr(aval, "shape") and aval.size <= LARGE and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
+
+
+def _split(value):
+    """The numbers of a whole array, as an array of objects."""
+    array = value.array
+    if isinstance(array, (np.ndarray, np.generic)) or not isinstance(array, Tracer):
+        return _known(np.asarray(array))
+    if array.shape == ():
+        return _filled((), [array])
+    flat = array.reshape(-1)
+    return _filled(array.shape, [jax.lax.squeeze(jax.lax.slice(flat, (i,), (i + 1,)), (0,)) for i in range(array.size)])
+
+
+def _known(array):
+    return _filled(array.shape, list(array.reshape(-1)))
+
+
+def _filled(shape, entries):
+    result = np.empty(len(entries), object)
+    for i, entry in enumerate(entries):
+        result[i] = entry
+    return result.reshape(shape)
+
+
+def _joined(value, aval):
+    """A whole array, from a `_Value` or an array of numbers."""
+    if not isinstance(value, np.ndarray):
+        return value.array
+    if value.shape == ():
+        return value[()]
+    entries = [jnp.asarray(x, aval.dtype) for x in value.reshape(-1)]
+    return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
+
+
+def _constant(x, aval):
+    if not _small(aval):
+        return _Value(x)
+    return _split(_Value(x)) if isinstance(x, Tracer) else _known(np.asarray(x, aval.dtype))
+
+
+def _is_plain_call(equation):
+    return equation.primitive.name in CALLS
+
+
+def _apply(jaxpr, ledger, equation, operands):
+    name, params = equation.primitive.name, equation.params
+    splittable = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
+    if splittable and name in ELEMENTWISE:
+        return [_elementwise(equation, operands, ledger)]
+    if splittable and name == "dot_general":
+        return _product(params, equation.outvars, *operands, ledger.drops_zeros)
+    if splittable and name in MOVES:
+        found = MOVES[name](params, equation.outvars, *operands)
+        if found is not None:
+            return found
+    results = applied(jaxpr, equation, [_joined(x, v.aval) for x, v in zip(operands, equation.invars)])
+    return [_split(x) if _small(v.aval) else x for x, v in zip(map(_Value, results), equation.outvars)]
+
+
+def _pair(x, pairs):
+    """Sine and cosine of a number, computed together and only once."""
+    if id(x) not in pairs:
+        pairs[id(x)] = (x, *sincos_in_lanes(x))
+    return pairs[id(x)][1:]
+
+
+def _elementwise(equation, operands, ledger):
+    (variable,) = equation.outvars
+    shape, dtype = variable.aval.shape, variable.aval.dtype
+    rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
+    entries = [_simplified(equation, dtype, ledger, *x) for x in zip(*rows)]
+    ledger.count(entries)
+    return _filled(shape, entries)
+
+
+def _is_known(x, number):
+    return isinstance(x, np.generic) and x == number
+
+
+def _simplified(equation, dtype, ledger, *x):
+    """The result of a primitive for one number, simplified if operands are known."""
+    name = equation.primitive.name
+    if name in ("add", "add_any"):
+        return _add(*x)
+    if name == "sub" and _is_known(x[1], 0):
+        return x[0]
+    if name == "sub" and _is_known(x[0], 0):
+        return _negative(x[1])
+    if name == "mul":
+        return _multiply(*x, ledger.drops_zeros)
+    if name == "neg":
+        return _negative(x[0])
+    if name == "div" and _is_known(x[1], 1):
+        return x[0]
+    if name == "div" and ledger.drops_zeros and _is_known(x[0], 0) and not isinstance(x[1], np.generic):
+        return x[0]
+    if name == "select_n" and isinstance(x[0], np.generic):
+        return x[1 + int(x[0])]
+    if name == "select_n" and all(y is x[1] for y in x[2:]):
+        return x[1]
+    if name == "convert_element_type":
+        if isinstance(x[0], np.generic):
+            return np.asarray(x[0]).astype(dtype)[()]
+        if x[0].dtype == dtype and not getattr(x[0], "weak_type", False):
+            return x[0]
+    if name in ("sin", "cos") and not isinstance(x[0], np.generic):
+        return _pair(x[0], ledger.pairs)[name == "cos"]
+    if name == "div" and jnp.issubdtype(dtype, jnp.floating) and all(isinstance(y, np.generic) for y in x):
+        return np.divide(*x)
+    if name in IN_NUMPY and all(isinstance(y, np.generic) for y in x):
+        return np.asarray(IN_NUMPY[name](*x), dtype)[()]
+    return equation.primitive.bind(*x, **equation.params)
+
+
+def _add(x, y):
+    if _is_known(x, 0):
+        return y
+    if _is_known(y, 0):
+        return x
+    if isinstance(x, np.generic) and isinstance(y, np.generic):
+        return np.add(x, y)
+    return jax.lax.add(*_arrays(x, y))
+
+
+def _multiply(x, y, drops_zeros):
+    for a, b in ((x, y), (y, x)):
+        # A known factor may be infinite: the product is computed below.
+        if _is_known(a, 0) and drops_zeros and not isinstance(b, np.generic):
+            return a
+        if _is_known(a, 1):
+            return b
+        if _is_known(a, -1):
+            return _negative(b)
+    if isinstance(x, np.generic) and isinstance(y, np.generic):
+        return np.multiply(x, y)
+    return jax.lax.mul(*_arrays(x, y))
+
+
+def _negative(x):
+    return np.negative(x) if isinstance(x, np.generic) else jax.lax.neg(x)
+
+
+def _arrays(x, y):
+    dtype = (y if isinstance(x, np.generic) else x).dtype
+    return tuple(np.asarray(z, dtype) if isinstance(z, np.generic) else z for z in (x, y))
+
+
+def _converted(entries, dtype):
+    one = lambda x: x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
+    return _filled(entries.shape, [x if x.dtype == dtype else one(x) for x in entries.reshape(-1)])
+
+
+def _total(entries, zero):
+    total = zero
+    for entry in entries:
+        total = _add(total, entry)
+    return total
+
+
+def _zero(variables):
+    return np.zeros((), variables[0].aval.dtype)[()]
+
+
+def _broadcast(params, variables, x):
+    shape, places = params["shape"], params["broadcast_dimensions"]
+    widened = [1] * len(shape)
+    for place, size in zip(places, x.shape):
+        widened[place] = size
+    return [np.broadcast_to(x.reshape(widened), shape)]
+
+
+def _sliced(params, variables, x):
+    strides = params["strides"] or [1] * x.ndim
+    return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]]
+
+
+def _dynamic_slice(params, variables, x, *starts):
+    if not all(isinstance(s[()], np.generic) for s in starts):
+        return None
+    sizes = params["slice_sizes"]
+    starts = [min(max(int(s[()]), 0), n - size) for s, n, size in zip(starts, x.shape, sizes)]
+    return [x[tuple(slice(s, s + size) for s, size in zip(starts, sizes))]]
+
+
+def _padded(params, variables, x, filling):
+    if any(inner or low < 0 or high < 0 for low, high, inner in params["padding_config"]):
+        return None
+    result = _filled(variables[0].aval.shape, [filling[()]] * variables[0].aval.size)
+    place = tuple(slice(low, low + n) for n, (low, _, _) in zip(x.shape, params["padding_config"]))
+    result[place] = x
+    return [result]
+
+
+def _sum(params, variables, x):
+    axes = params["axes"]
+    kept = [i for i in range(x.ndim) if i not in axes]
+    rows = x.transpose([*kept, *axes]).reshape([x.shape[i] for i in kept] + [-1])
+    shape = rows.shape[:-1]
+    rows = rows.reshape(-1, rows.shape[-1]) if rows.size else np.empty((int(np.prod(shape)), 0), object)
+    return [_filled(shape, [_total(row, _zero(variables)) for row in rows])]
+
+
+def _cumulative_sum(params, variables, x):
+    axis, result = params["axis"], x.copy()
+    if params["reverse"]:
+        return None
+    result = np.moveaxis(result, axis, 0)
+    for i in range(1, len(result)):
+        flat = [_add(a, b) for a, b in zip(result[i - 1].reshape(-1), result[i].reshape(-1))]
+        result[i] = _filled(result[i].shape, flat) if result[i : i + 1].ndim > 1 else flat[0]
+    return [np.moveaxis(result, 0, axis)]
+
+
+def _product(params, variables, x, y, drops_zeros):
+    (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
+    free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
+    sizes = lambda z, axes: int(np.prod([z.shape[i] for i in axes]))
+    # The operands may have other dtypes than the result: integers, or lower precision.
+    x, y = (_converted(z, variables[0].aval.dtype) for z in (x, y))
+    inner, batch = sizes(x, contract_x), sizes(x, batch_x)
+    x = x.transpose([*batch_x, *free_x, *contract_x]).reshape(batch, -1, inner)
+    y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, -1, inner)
+    zero = _zero(variables)
+    entries = [
+        _total([_multiply(p, q, drops_zeros) for p, q in zip(row, column)], zero)
+        for rows, columns in zip(x, y)
+        for row in rows
+        for column in columns
+    ]
+    return [_filled(variables[0].aval.shape, entries)]
+
+
+def _unstacked(params, variables, x):
+    return [
+        _filled(v.aval.shape, list(part.reshape(-1))) for v, part in zip(variables, np.moveaxis(x, params["axis"], 0))
+    ]
+
+
+def _split_up(params, variables, x):
+    return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
+
+
+def _counted(params, variables):
+    aval, axis = variables[0].aval, params["dimension"]
+    shape = [-1 if i == axis else 1 for i in range(len(aval.shape))]
+    return [_known(np.broadcast_to(np.arange(aval.shape[axis], dtype=aval.dtype).reshape(shape), aval.shape))]
+
+
+MOVES: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda params, variables, *x: [np.concatenate(x, params["dimension"])],
+    "copy": lambda params, variables, x: [x],
+    "cumsum": _cumulative_sum,
+    "dynamic_slice": _dynamic_slice,
+    "iota": _counted,
+    "pad": _padded,
+    "reduce_sum": _sum,
+    "reshape": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "rev": lambda params, variables, x: [np.flip(x, params["dimensions"])],
+    "slice": _sliced,
+    "split": _split_up,
+    "squeeze": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
+    "stack": lambda params, variables, *x: [
+        np.stack([y.reshape(1, -1) for y in x], 0).reshape(-1, *x[0].shape)
+        if params["axis"] == 0
+        else np.moveaxis(np.stack([np.atleast_1d(y) for y in x], 0), 0, params["axis"])
+    ],
+    "unstack": _unstacked,
+    "transpose": lambda params, variables, x: [x.transpose(params["permutation"])],
+}

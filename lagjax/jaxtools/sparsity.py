@@ -1,0 +1,277 @@
+"""Which outputs of a function depend on which entries of a vector, read off its jaxpr.
+
+Every intermediate value carries, entry by entry, the set of inputs that it depends on; a set is a Python integer, one
+bit per input. Primitives that work entry by entry unite the sets of their operands; those that move entries move the
+sets; sums and products of matrices unite what they sum. Where an operation is unknown here, such as a loop or an index
+that is not constant, every entry of its results depends on everything that its operands depend on. The pattern holds at
+every state: it may be too full, never too empty, since no values but those of constants are used.
+
+The package asdex finds the same patterns, just as fast; it needs numba, and stops at a primitive that it does not know.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Bool
+
+from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
+
+
+class SparseValue(NamedTuple):
+    """An intermediate value: the inputs that each entry depends on, and the entries if they are constants."""
+
+    sets: np.ndarray
+    known: np.ndarray | None = None
+
+
+ENTRYWISE = ELEMENTWISE | {"copy", "reduce_precision"}
+# Products of matrices larger than this are not searched for zeros.
+TERMS = 2_000_000
+
+
+def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
+    """Return which outputs of `function(vector, *rest)` depend on which entries of the vector.
+
+    >>> import jax.numpy as jnp
+    >>> print(pattern(lambda x: x[1:] * x[:-1], jnp.zeros(3)).astype(int))
+    [[1 1 0]
+     [0 1 1]]
+
+    **Arguments:** a function that returns one array, a vector, and pytrees of arrays, of which only shapes and
+    dtypes count. What the function closes over is a constant, unless JAX is tracing it.
+
+    **Returns:** (m, n) booleans: false where the output never depends on the entry.
+    """
+    shaped = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (vector, *rest))
+    closed = jax.make_jaxpr(lambda *args: jnp.ravel(function(*args)))(*shaped)
+    n = shaped[0].size
+    inputs = [SparseValue(_empty(x.aval.shape)) for x in closed.jaxpr.invars]
+    inputs[0] = SparseValue(np.array([1 << i for i in range(n)], object))
+    (found,) = interpreted(closed, inputs, _apply, _constant)
+    return _as_booleans(found.sets, n)
+
+
+def _as_booleans(sets, count):
+    """One row per set."""
+    width = count // 8 + 1
+    rows = np.frombuffer(b"".join(int(s).to_bytes(width, "little") for s in sets), np.uint8).reshape(-1, width)
+    return np.unpackbits(rows, axis=1, bitorder="little")[:, :count].astype(bool)
+
+
+def _constant(x, aval):
+    known = None if isinstance(x, Tracer) else np.asarray(x)
+    return SparseValue(_empty(np.shape(x)), known)
+
+
+def _empty(shape):
+    return np.full(shape, 0, object)
+
+
+def _apply(equation, operands):
+    name, params = equation.primitive.name, equation.params
+    shapes = [x.aval.shape for x in equation.outvars]
+    results = None
+    if name in ENTRYWISE:
+        results = [SparseValue(_united(name, operands, shapes[0]), _evaluated(name, equation, operands))]
+    elif name in RULES and None not in (results := RULES[name](operands, params, equation)):
+        pass
+    else:
+        # Anything else: each result depends on everything that the operands depend on.
+        everything = np.bitwise_or.reduce([_union(x.sets) for x in operands] + [0])
+        results = [SparseValue(np.full(shape, everything, object)) for shape in shapes]
+    return results
+
+
+def _union(sets, axis=None):
+    """The union over some axes, or over all."""
+    if axis is None:
+        return np.bitwise_or.reduce(np.ravel(sets), initial=0)
+    for i in sorted(axis, reverse=True):
+        sets = np.bitwise_or.reduce(sets, axis=i, initial=0)
+    return np.asarray(sets, object)
+
+
+def _united(name, operands, shape):
+    sets = _empty(shape)
+    for i, operand in enumerate(operands):
+        part = operand.sets
+        if name == "mul":
+            # A product with a constant zero is zero, as with a mask.
+            other = operands[1 - i].known
+            part = part if other is None else np.where(other == 0, 0, part)
+        elif name == "select_n" and operands[0].known is not None:
+            part = np.where(operands[0].known.astype(int) == i - 1, part, 0)
+        sets = sets | part
+    return np.asarray(sets, object).reshape(shape)
+
+
+def _evaluated(name, equation, operands):
+    """The entries of a result made of constants alone, as indices are."""
+    known = [x.known for x in operands]
+    if any(x is None for x in known):
+        return None
+    if name == "convert_element_type":
+        return known[0].astype(equation.outvars[0].aval.dtype)
+    return IN_NUMPY[name](*known) if name in IN_NUMPY else None
+
+
+def _moving(move):
+    """The rule of a primitive that moves entries, given the same move of NumPy arrays."""
+
+    def rule(operands, params, equation):
+        # The second operand of a padding is a number.
+        known = [x.known for x in operands]
+        moved = None if any(x is None for x in known) else move(known, params)
+        sets = move([x.sets for x in operands], params)
+        single = not isinstance(sets, list)
+        sets, moved = ([sets], [moved]) if single else (sets, moved or [None] * len(sets))
+        return [SparseValue(s, k) for s, k in zip(sets, moved)]
+
+    return rule
+
+
+def _broadcast(arrays, params):
+    shape = [1] * len(params["shape"])
+    for size, axis in zip(np.shape(arrays[0]), params["broadcast_dimensions"]):
+        shape[axis] = size
+    return np.broadcast_to(np.reshape(arrays[0], shape), params["shape"])
+
+
+def _reshape(arrays, params):
+    return np.reshape(arrays[0], params["new_sizes"])
+
+
+def _slice(arrays, params):
+    strides = params["strides"] or [1] * np.ndim(arrays[0])
+    return arrays[0][tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
+
+
+def _split(arrays, params):
+    return list(np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"]))
+
+
+def _pad(arrays, params):
+    x, fill = arrays
+    for axis, (low, high, interior) in enumerate(params["padding_config"]):
+        size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
+        shape = list(x.shape)
+        shape[axis] = max(low, 0) + size + max(high, 0)
+        wide = np.full(shape, np.asarray(fill).item(), x.dtype)
+        along = lambda s, axis=axis: (slice(None),) * axis + (s,)
+        wide[along(slice(max(low, 0), max(low, 0) + size, interior + 1))] = x
+        x = wide[along(slice(max(-low, 0), shape[axis] - max(-high, 0)))]
+    return x
+
+
+def _concatenate(arrays, params):
+    return np.concatenate(arrays, params["dimension"])
+
+
+def _gather(operands, params, equation):
+    return _by_positions(partial(equation.primitive.bind, **params), operands[0], operands[1:], equation)
+
+
+def _by_positions(move, source, indices, equation):
+    """Find where constant indices take entries from: apply the primitive itself to the entries' positions."""
+    if any(x.known is None for x in indices):
+        return [None]
+    # Positions count from one, as zero means that nothing is taken: a gather fills float32 with NaN, made zero here.
+    with jax.ensure_compile_time_eval():
+        positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
+        taken = np.nan_to_num(np.asarray(move(positions, *(jnp.asarray(x.known) for x in indices)))).astype(int)
+    taken = np.where((taken >= 0) & (taken <= source.sets.size), taken, 0)
+    return [SparseValue(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
+
+
+def _scatter(operands, params, equation):
+    """The operand's entries united with those written there, also where the latter replace the former."""
+    onto, indices, updates = operands
+    if indices.known is None:
+        return [None]
+    with jax.ensure_compile_time_eval():
+        add = lambda updates: lax.scatter_add(
+            jnp.zeros(onto.sets.shape, jnp.float32), jnp.asarray(indices.known), updates,
+            params["dimension_numbers"], mode=params["mode"],
+        )  # fmt: skip
+        like = jax.ShapeDtypeStruct(updates.sets.shape, jnp.float32)
+        positions = jnp.arange(1, onto.sets.size + 1, dtype=jnp.float32).reshape(onto.sets.shape)
+        (target,) = jax.linear_transpose(add, like)(positions)
+    sets = np.append(np.array([0], object), np.ravel(onto.sets))
+    np.bitwise_or.at(sets, np.ravel(np.asarray(target)).astype(int), np.ravel(updates.sets))
+    return [SparseValue(sets[1:].reshape(onto.sets.shape))]
+
+
+def _dynamic_slice(operands, params, equation):
+    starts = [x.known for x in operands[1:]]
+    if any(x is None for x in starts):
+        return [None]
+    source, sizes = operands[0].sets, params["slice_sizes"]
+    # XLA shifts a slice back that would reach beyond the end.
+    first = [int(np.clip(s, 0, n - k)) for s, n, k in zip(starts, source.shape, sizes)]
+    return [SparseValue(source[tuple(slice(i, i + k) for i, k in zip(first, sizes))])]
+
+
+def _dot_general(operands, params, equation):
+    (contract, batch), shape = params["dimension_numbers"], equation.outvars[0].aval.shape
+    sides = []
+    for x, c, b in zip(operands, contract, batch):
+        free = [i for i in range(x.sets.ndim) if i not in (*c, *b)]
+        size = lambda axes, x=x: int(np.prod([x.sets.shape[i] for i in axes]))
+        to = lambda a, c=c, b=b, free=free, size=size: np.transpose(a, (*b, *c, *free)).reshape(
+            size(b), size(c), size(free)
+        )
+        counts = np.ones(x.sets.shape, bool) if x.known is None else x.known != 0
+        sides.append((to(x.sets), to(counts)))
+    (a, a_counts), (b, b_counts) = sides
+    if a.size * b.shape[2] > TERMS:
+        rows, columns = _union(a, (1,)), _union(b, (1,))
+        return [SparseValue((rows[:, :, None] | columns[:, None, :]).reshape(shape))]
+    found = _empty((a.shape[0], a.shape[2], b.shape[2]))
+    for k in range(a.shape[1]):
+        found |= np.where(b_counts[:, k, None, :], a[:, k, :, None], 0)
+        found |= np.where(a_counts[:, k, :, None], b[:, k, None, :], 0)
+    return [SparseValue(found.reshape(shape))]
+
+
+def _reduce(operands, params, equation):
+    return [SparseValue(_union(operands[0].sets, params["axes"]))]
+
+
+def _accumulate(operands, params, equation):
+    flip = lambda x: np.flip(x, params["axis"]) if params["reverse"] else x
+    return [SparseValue(flip(np.bitwise_or.accumulate(flip(operands[0].sets), axis=params["axis"])))]
+
+
+def _iota(operands, params, equation):
+    aval = equation.outvars[0].aval
+    along = np.arange(aval.shape[params["dimension"]], dtype=aval.dtype)
+    along = along.reshape([-1 if i == params["dimension"] else 1 for i in range(len(aval.shape))])
+    return [SparseValue(_empty(aval.shape), np.broadcast_to(along, aval.shape))]
+
+
+RULES = {
+    "broadcast_in_dim": _moving(_broadcast),
+    "reshape": _moving(_reshape),
+    "squeeze": _moving(lambda arrays, params: np.squeeze(arrays[0], tuple(params["dimensions"]))),
+    "transpose": _moving(lambda arrays, params: np.transpose(arrays[0], params["permutation"])),
+    "rev": _moving(lambda arrays, params: np.flip(arrays[0], params["dimensions"])),
+    "slice": _moving(_slice),
+    "split": _moving(_split),
+    "pad": _moving(_pad),
+    "concatenate": _moving(_concatenate),
+    "stack": _moving(lambda arrays, params: np.stack(arrays, params["axis"])),
+    "gather": _gather,
+    "dynamic_slice": _dynamic_slice,
+    "scatter": _scatter,
+    "scatter-add": _scatter,
+    "dot_general": _dot_general,
+    "iota": _iota,
+    **dict.fromkeys(REDUCING, _reduce),
+    **dict.fromkeys(ACCUMULATING, _accumulate),
+}

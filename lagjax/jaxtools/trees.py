@@ -1,0 +1,26 @@
+"""Operations on all arrays of a tree at once; everything else in it stays as it is."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+
+def stop_gradient(tree):
+    """The tree without derivatives.
+
+    >>> print(jax.grad(lambda x: x * stop_gradient({"x": x})["x"])(3.0))
+    3.0
+    """
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
+def where(condition, a, b):
+    """The arrays of `a` where the condition holds, else those of `b`, in the dtypes of these."""
+    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
+    return jax.tree.map(pick, a, b)
+
+
+def like(mask, x):
+    """A mask of rows or lanes with as many axes as x has."""
+    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))

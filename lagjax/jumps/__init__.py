@@ -1,1 +1,0 @@
-"""Jumps and kinks of forces, read off their programs."""

@@ -1,0 +1,248 @@
+"""The nearest state that satisfies the constraints, from any distance, with chosen coordinates held.
+
+Nearest in the metric of the mass matrix M of the given state: the stationary point of
+
+    ½ (x - x0)ᵀ M (x - x0) + μᵀ g(t, x)        then        ½ (u - u0)ᵀ M (u - u0) + νᵀ phi(t, x, u)
+
+for positions x and velocities u; `g` and `phi` are called `r(y)` below. Held coordinates leave the problem: their rows
+and columns become those of the unit matrix. A constraint whose row vanishes then depends only on held coordinates: it
+is not an equation for the others, and at the end it holds or it does not.
+
+Newton's method for a stationary point finds one nearby, which may be a farthest point instead of a nearest. So the
+first step is to find some state that satisfies the constraints, by steps that are shortest in M; it is its own nearest
+point, with μ = 0. From there the target is moved to x0 in stages, and the stationary point followed.
+
+Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11.3 (continuation).
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.tracing import is_traced
+from lagjax.jaxtools.trees import stop_gradient
+from lagjax.mechanics.diagnosis import describe, listed
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.projection import departures, within
+from lagjax.mechanics.saddle_point import displacement_map
+from lagjax.numerics.linalg import dense
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
+from lagjax.system import constraints, coordinates
+from lagjax.system.check_functions import prepare
+
+TO_REACH = 40
+STAGES, PER_STAGE = 16, 3
+# Far from the manifold a full step may overshoot: the best of these fractions is taken.
+FRACTIONS = np.array([1.0, 0.5, 0.2, 0.05])
+
+
+def consistent_state(
+    system,
+    t,
+    q,
+    v,
+    params,
+    hold: str | Iterable[str] = (),
+    *,
+    hold_position: str | Iterable[str] = (),
+    hold_velocity: str | Iterable[str] = (),
+):
+    """Return the state nearest to the given one, in the mass matrix's metric, that satisfies the constraints.
+
+    >>> import lagjax as lj
+    >>> rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), {"rod": rod})
+    >>> q, v = consistent_state(
+    ...     pendulum, 0.0, {"x": 6.0, "y": 8.0}, {"x": 1.0, "y": 0.0}, {"length": 5.0}
+    ... )
+    >>> print(q["x"].round(6), q["y"].round(6))
+    3.0 4.0
+    >>> q, v = consistent_state(
+    ...     pendulum, 0.0, {"x": 3.0, "y": 1.0}, {"x": 4.0, "y": 0.0}, {"length": 5.0}, hold="x"
+    ... )
+    >>> print(q["y"].round(6), v["y"].round(6))
+    4.0 -3.0
+
+    **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
+    keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector, or a
+    dict of true and false by name; `hold_position`, `hold_velocity`: for the position alone, as of a crank
+    whose speed a motor determines, or for the velocity alone.
+
+    **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
+
+    **Raises:**
+
+    - `ValueError` if no consistent state is reached, with the residual by constraint name (while JAX is tracing, the
+      values are NaN instead).
+    - `ValueError` for a name to hold that is not a coordinate.
+    - `TypeError`, `ValueError` for a state of the wrong shape or dtype.
+
+    Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
+    """
+    model, s = prepare(system, t, q, v, params)
+    both = free_coordinates(s.q, hold)
+    free = both & free_coordinates(s.q, hold_position, "hold_position")
+    free_velocity = both & free_coordinates(s.q, hold_velocity, "hold_velocity")
+    if not model.m:
+        return s.q, s.v
+    q, v, reached = _consistent_state(model, s, jnp.asarray(free), jnp.asarray(free_velocity))
+    if is_traced((q, v)):
+        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
+    if not reached:
+        raise ValueError(_unreachable(model, s, q, v, free, free_velocity))
+    return q, v
+
+
+def free_coordinates(q, hold, argument: str = "hold") -> np.ndarray:
+    """Return which coordinates may move, (n,) booleans."""
+    names = coordinates.names(q)
+    if isinstance(hold, Mapping):
+        hold = [name for name, held in hold.items() if held]
+    hold = {hold} if isinstance(hold, str) else set(hold)
+    held = np.array([name in hold or name.split("[")[0] in hold for name in names])
+    unknown = hold - set(names) - {name.split("[")[0] for name in names}
+    if unknown:
+        raise ValueError(
+            f"{argument} names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
+            "Fix: hold the coordinates by these names."
+        )
+    return ~held
+
+
+def _unreachable(model, s, q, v, free, free_velocity):
+    best = coordinates.State(s.t, q, v, s.params)
+    tolerance, names = _round_off(s.t), np.asarray(model.names)
+    both = ~free & ~free_velocity
+    kinds = (("", both), ("the position of ", ~free & ~both), ("the velocity of ", ~free_velocity & ~both))
+    held = [f"{what}{listed(names[which])}" for what, which in kinds if np.any(which)]
+    among = f" with {' and '.join(held)} held" if held else ""
+    off = departures(model, best, tolerance, tolerance)
+    fix = "hold less, start nearer, or check each constraint with lj.constraint_residual(system, t, q, v, params)"
+    if np.any(both) and within(equations_of(model), *best[:3], tolerance, np.array([tolerance, 1e30])):
+        fix = f"hold the position alone, hold_position={list(map(str, names[both]))}, if the velocity need not be kept"
+    return (
+        f"no consistent state was found near q = {describe(s.q)}{among}: at the best state reached, constraint {off}.\n"
+        "Usual cause: constraints that contradict each other, too much held, or a start too far from the manifold.\n"
+        f"Fix: {fix}."
+    )
+
+
+def _round_off(t):
+    return 1e3 * float(jnp.finfo(t.dtype).eps)
+
+
+@compiled
+def _consistent_state(model, s, free, free_velocity):
+    t, (x0, u0) = s.t, model.vectors(s.q, s.v)
+    metric = mass_and_forcing(model, t, x0, u0).mass
+    x, live = x0, (model, t)
+    if model.holonomic.any():
+        x = _nearest(lambda problem, x: constraints.position_residual(*problem, x), live, x0, metric, free)
+    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
+    u = _nearest(velocity_residual, (*live, x), u0, metric, free_velocity)
+    q, v, tolerance = model.tree(x), model.tree(u), _round_off(t)
+    return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
+
+
+def _nearest(residual: Callable, problem, y0, metric, free):
+    """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
+    metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
+    n, fixed, fixed_metric, start = y0.size, stop_gradient(problem), *stop_gradient((metric, y0))
+    residual = _two_or_more(residual)
+
+    def rows_at(problem, y):
+        rows = jax.jacfwd(lambda y: residual(problem, y))(y)
+        left = jnp.where(free[None, :], rows, 0.0)
+        size = lambda rows: jnp.max(jnp.abs(lax.stop_gradient(rows)), axis=1)
+        return jnp.where((size(left) > DEPENDENT_BELOW[np.dtype(y0.dtype)] * size(rows))[:, None], left, 0.0)
+
+    def usable_rows(rows, dependent_below=None):
+        return independent_rows(rows, dependent_below) & jnp.any(rows != 0, axis=1)
+
+    def to_displacement(y, dependent_below=None):
+        rows = rows_at(fixed, y)
+        return displacement_map(fixed_metric, rows, usable_rows(rows, dependent_below))
+
+    def shortest_step(y, dependent_below):
+        slope = jnp.sum(jnp.abs(rows_at(fixed, y)), axis=1)
+        step = to_displacement(y, dependent_below) @ residual(fixed, y)
+        trials = y[None] - FRACTIONS.astype(y.dtype)[:, None] * step[None]
+        left = jax.vmap(lambda y: jnp.max(jnp.abs(residual(fixed, y)) / jnp.where(slope > 0, slope, 1.0)))(trials)
+        return trials[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))], None
+
+    # Off the manifold dependent rows disagree by about the distance to it, which is unknown at first.
+    thresholds = jnp.maximum(0.1 * 0.25 ** jnp.arange(TO_REACH), DEPENDENT_BELOW[np.dtype(y0.dtype)])
+    reached, _ = lax.scan(shortest_step, start, thresholds.astype(y0.dtype))
+
+    def newton_matrix(y, multipliers):
+        curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
+        curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
+        rows = rows_at(fixed, y)
+        independent = usable_rows(rows)
+        # The full matrix, even for more equations than coordinates: all multipliers are unknowns.
+        rows = jnp.where(independent[:, None], rows, 0.0)
+        return jnp.block([[fixed_metric + curvature, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
+
+    def equations(problem, metric, target, y, multipliers):
+        force = metric @ (y - target) + multipliers @ rows_at(problem, y)
+        return jnp.concatenate([force, residual(problem, y)])
+
+    def follow(state, share):
+        target = reached + share * (start - reached)
+        for _ in range(PER_STAGE):
+            y, multipliers = state
+            independent = usable_rows(rows_at(fixed, y))
+            left = equations(fixed, fixed_metric, target, y, multipliers)
+            left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
+            step = dense.solve(newton_matrix(y, multipliers), left)
+            state = y - step[:n], jnp.where(independent, multipliers - step[n:], 0.0)
+        return state, None
+
+    zero = jnp.zeros_like(residual(fixed, start))
+    shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
+    (y, multipliers), _ = lax.scan(follow, (reached, zero), shares)
+    finite = jnp.all(jnp.isfinite(y))
+    y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)
+    # One more Newton step gives the nearest point all its derivatives, by the implicit function theorem.
+    inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
+    y, multipliers, reached = stop_gradient((y, multipliers, reached))
+    nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
+    # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
+    near = reached + (y0 - start)
+    near = near - lax.stop_gradient(to_displacement(reached)) @ residual(problem, near)
+    length = lambda y: (y - start) @ fixed_metric @ (y - start)
+    off = jnp.max(jnp.abs(residual(fixed, nearest)))
+    kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
+    return jnp.where(kept, nearest, near)
+
+
+def _two_or_more(residual):
+    """Pad a single equation with one that restricts nothing: a single equation would never be left out."""
+
+    def padded(problem, y):
+        found = residual(problem, y)
+        return found if found.size > 1 else jnp.concatenate([found, jnp.zeros(2 - found.size, found.dtype)])
+
+    return padded
+
+
+def unreachable_ahead(trajectory) -> str | None:
+    """Explain that the constraints cannot be met a little after the end; None if they can."""
+    system, end = trajectory.system, trajectory.end
+    if not system.constraints:
+        return None
+    ahead = 1e-3 * (trajectory.t[-1] - trajectory.t[0])
+    q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
+    try:
+        consistent_state(system, end.t + ahead, q, end.v, trajectory.params)
+    except ValueError as error:
+        return (
+            f"the constraints cannot be met a little later. {error}\n"
+            "(So ends a loop that can close only so far, or one motion that is prescribed twice.)"
+        )
+    return None

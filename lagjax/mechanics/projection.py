@@ -1,0 +1,157 @@
+"""States on the constraint manifold.
+
+A step of any integrator leaves the manifold by its local error, and the error accumulates: the constraint
+drifts. The nearest state on it, nearest in the metric of the mass matrix, is the stationary point of
+
+    ½ (q* - q)ᵀ M (q* - q) + μᵀ g(t, q*)        then        ½ (v* - v)ᵀ M (v* - v) + νᵀ phi(t, q*, v*)
+
+One Newton step of either is a saddle-point solve with the matrix that also gives the accelerations, so a
+massless coordinate (M singular) is no obstacle. Positions are moved only where positions are constrained.
+
+Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.4 and §VII.1.2.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, PyTree
+
+from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools.trees import stop_gradient
+from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.system import constraints, coordinates
+
+# With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
+# below 1e-8 of the size of the state; a crude fixed step of 0.1 takes eight.
+ITERATIONS = 12
+ONE_IS_ENOUGH_BELOW = 1e-8
+
+
+class Projected(NamedTuple):
+    """A state returned to the constraints, and whether it satisfies them to the tolerance."""
+
+    q: PyTree[Array]
+    v: PyTree[Array]
+    holds: Bool[Array, ""]
+
+
+def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
+    """Return the state moved onto the constraints; NaN if equations assumed regular turn out singular."""
+    if equations.are_taken_for_regular:
+        return Projected(*equations.projected(t, q, v), jnp.asarray(True))
+    return to_manifold(equations, t, q, v, rtol, atol)
+
+
+@compiled
+def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
+    """Return the nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
+
+    `holds` is true if a displacement of `atol + rtol |y|` accounts for what is left of each residual, including those
+    of dependent constraints; `rtol` and `atol` are one number, or one for q and one for v.
+    """
+    model, (x, u) = equations.model, equations.model.vectors(q, v)
+    # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
+    frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
+    displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
+    of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
+    live, holonomic = (model, t), model.holonomic
+    fixed = stop_gradient(live)
+    position_residual = lambda problem, x: constraints.position_residual(*problem, x)
+    if holonomic.any():
+        # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
+        x = _newton(position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
+    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
+    u = _newton(velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
+    left = jnp.concatenate([position_residual(fixed, x), velocity_residual((*fixed, x), u)])
+    allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
+    holds = jnp.all(jnp.abs(left) <= allowed)
+    return Projected(model.tree(x), model.tree(u), lax.stop_gradient(holds))
+
+
+def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
+    """Iterate `y - displacement(r(problem, y))`; differentiate only the last iteration, enough where r vanishes."""
+    fixed, start = stop_gradient((problem, y))
+
+    def size(r):
+        return jnp.max(jnp.abs(r) / jnp.where(slope > 0, slope, 1.0))
+
+    def unfinished(state):
+        i, y, r = state
+        return (i < ITERATIONS) & (size(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(jnp.max(jnp.abs(y)), first))
+
+    def iterate(state):
+        i, y, r = state
+        y = y - displacement(r)
+        return i + 1, y, residual(fixed, y)
+
+    r = residual(fixed, start)
+    first = size(r)
+    _, near, _ = lax.while_loop(unfinished, iterate, (0, start, r))
+    # This has the value of `near` and the derivative of y.
+    y = near + (y - start)
+    return y - displacement(residual(problem, y))
+
+
+def velocity_change(model, t, q, v, change):
+    """Return the least change of v, in the metric of M, that changes the residuals of all constraints by `change`.
+
+    `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
+    """
+    return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
+
+
+def worst_residual(model, t, q, v):
+    """Return the largest relative residual along a trajectory, of positions and velocities.
+
+    A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
+    velocity for the velocity level): to the residual that a displacement as large as the motion would cause.
+    """
+    residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations_of(model)))(t, q, v)
+    # Outputs after an event or a failure are NaN and say nothing about the constraints.
+    scale = slope @ level_size(jnp.nanmax(size, axis=0))
+    return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
+
+
+def level_size(size):
+    """Return the largest coordinate and the largest velocity; a single coordinate may be zero and sets no scale."""
+    return jnp.max(size.reshape(2, -1), axis=1)
+
+
+def within(equations: Equations, t, q, v, rtol, atol) -> Bool[Array, ""]:
+    """Whether a displacement of `atol + rtol |y|` accounts for every residual, of positions and velocities."""
+    residual, slope, size = residuals_and_slopes(equations, t, q, v)
+    return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
+
+
+def _allowed(size, rtol, atol):
+    """Return the displacements of coordinates and of velocities that count as zero, for a state of these sizes."""
+    return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
+
+
+@compiled
+def residuals_and_slopes(equations: Equations, t, q, v):
+    """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
+    model, (x, u) = equations.model, equations.model.vectors(q, v)
+    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
+    slope = equations.row_sizes(t, q, v)
+    # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
+    of_q = slope[model.holonomic]
+    columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
+    return jnp.concatenate([position, velocity]), jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
+
+
+def departures(model, s: coordinates.State, rtol, atol) -> str:
+    """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
+    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(model), *s[:3]))
+    allowed = np.asarray(_allowed(size, rtol, atol))
+    # NaN is a violation too.
+    off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))
+    equations = list(zip(model.equation_names, model.holonomic))
+    labels = [f"'{name}'" for name, holonomic in equations if holonomic]
+    labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]
+    return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)

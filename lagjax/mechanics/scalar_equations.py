@@ -1,0 +1,123 @@
+"""The equations of a small system, written out number by number.
+
+Accelerations, multipliers and the return to the constraints of `saddle_point.py` and `projection.py`, for systems of a
+few coordinates, as straight-line code on single numbers. The matrix
+
+    [M  Aᵀ] [ a]   [  F  ]
+    [A  0 ] [-λ] = [gamma]
+
+is eliminated in the order in which it is written, coordinates before constraints, so that its zeros, which are known
+before anything runs, cost nothing. That is as accurate as pivoting where M is definite; where it is not, where
+constraints depend on each other, and where a state is too far from the constraints to be returned in two iterations,
+the results are NaN: a caller then takes the robust way.
+
+Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (without pivoting where definite).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array
+
+from lagjax.jaxtools.plain import is_plain
+from lagjax.jaxtools.scalarize import TooLong
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.multiplier_forces import with_reactions
+from lagjax.mechanics.scalar_form import WRITTEN, Numbers
+from lagjax.mechanics.structure import is_diagonal
+from lagjax.numerics.linalg import dense
+from lagjax.system import constraints
+from lagjax.system.model import Model
+
+# Coordinates and constraint equations together. Measured on chains: a full mass matrix of nine is as fast in arrays;
+# with constraints, whose matrix is mostly zeros, a step is seven times faster up to here, for twice the compile time.
+UP_TO, CONSTRAINED_UP_TO = 8, 16
+# Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
+# thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
+MATRIX = 64
+# A program of more operations takes too long to compile.
+LONG = 2000
+# Two iterations are enough where the second one moves the state by less than this share of its size.
+SMALL_CORRECTION = 1e-7
+
+
+class WrittenOut(NamedTuple):
+    """`equations(model, t, q, v)` -> (a, multipliers stacked); `project(same)` -> (q, v).
+
+    `may_fail` says whether either may give NaN where the robust way does not.
+    """
+
+    equations: Numbers
+    project: Numbers | None
+    may_fail: bool
+
+    def prepare(self, model: Model) -> tuple[tuple | None, tuple | None]:
+        """The parts that do not depend on the state, of the equations and of the return to the constraints."""
+        prepare = lambda numbers: None if numbers is None else numbers.prepare(model)
+        return prepare(self.equations), prepare(self.project)
+
+
+def has_networks(model: Model) -> bool:
+    """Whether a system or its parameters have matrices as large as those of a network."""
+    arrays = [x for x in jtu.tree_leaves(model) if eqx.is_array(x)]
+    return any(x.ndim > 1 and x.size >= MATRIX for x in arrays)
+
+
+def is_small(model: Model) -> bool:
+    """Whether the equations of a system are to be written out."""
+    if is_plain() or has_networks(model):
+        return False
+    return model.n + model.m <= (CONSTRAINED_UP_TO if model.m else UP_TO)
+
+
+def write_out(model: Model) -> WrittenOut | None:
+    """Write out the equations of a small system in single numbers. None if L makes them too long."""
+    diagonal = model.m == 0 and is_diagonal(model)
+    try:
+        equations = Numbers(partial(_equations, diagonal), model, most=WRITTEN)
+    except TooLong:
+        return None
+    if equations.length > LONG:
+        return None
+    return WrittenOut(equations, Numbers(_projected, model) if model.m else None, may_fail=not diagonal)
+
+
+def _equations(diagonal, model: Model, t, q, v):
+    x, u = model.vectors(q, v)
+    linear = mass_and_forcing(model, t, x, u)
+    if model.n == 1 and not model.m:
+        return model.tree(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
+    rows = constraints.acceleration_rows(model, t, x, u)
+    solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
+    a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
+    valid = solver.valid if linear.response is None else solver.valid & unique
+    return model.tree(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
+
+
+def _projected(model: Model, t, q, v):
+    x, u = model.vectors(q, v)
+    mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
+    # The residual vanishes at the solution, so that the derivative of the matrix does not count.
+    solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
+    no_force = jnp.zeros_like(x)
+    last_x = last_u = no_force
+    if model.holonomic.any():
+        for _ in range(2):
+            position = iter(constraints.position_residual(model, t, x))
+            wanted = jnp.stack([-next(position) if restored else jnp.zeros_like(x[0]) for restored in model.holonomic])
+            last_x, _ = solver.solve(no_force, wanted, refine=False)
+            x = x + last_x
+    for _ in range(2):
+        last_u, _ = solver.solve(no_force, -constraints.velocity_residual(model, t, x, u), refine=False)
+        u = u + last_u
+    near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
+    return model.tree(jnp.where(near, x, jnp.nan)), model.tree(u)
+
+
+def _tiny(correction, y) -> Array:
+    norm = lambda z: jnp.sum(jnp.abs(z))
+    return norm(correction) <= SMALL_CORRECTION * norm(y) + 1e-300

@@ -1,1 +1,0 @@
-"""From equations of motion to trajectories."""

@@ -1,0 +1,1 @@
+"""Small dense, banded and rank-deficient linear algebra."""

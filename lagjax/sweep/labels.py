@@ -1,0 +1,190 @@
+"""Names for the arrays of a sweep, the same in xarray, in pandas and in a store: variables, dimensions, flags.
+
+An array that `run` returns is named by its path, `end.q`; a single array is named "value". Its dimensions are those of
+the sweep, followed by its own, `end.q_0`. A trajectory shows its outputs over the times `t`, their errors, its end,
+events and parameters, named as by `Trajectory.to_xarray`; its other parts have no name here. A name that is already
+taken gets the prefix `value_` or `status_`.
+"""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.integrate.trajectory.results import RESULTS, in_words
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.sweep.axes import POINT, Axes
+from lagjax.sweep.batch_program import LOST, NOT_RUN, Status
+
+# The name of a store's own group, not available to arrays.
+STORE_GROUP = "lagjax"
+# The name of a trajectory's times, and the index of the parameters among its `arrays`.
+TIMES, PARAMS = "t", 1
+STATUS_LONG_NAMES = Status(
+    "how each point ended",
+    "total steps of all integrations of a point",
+    "worst error of a point, relative to the allowed error",
+    "worst relative constraint residual of a point",
+)
+
+
+class Label(NamedTuple):
+    """An array's name and its dimensions after those of the sweep; `times` if it holds the times of a trajectory."""
+
+    name: str
+    dims: tuple[str, ...]
+    times: bool = False
+
+
+class Labels(NamedTuple):
+    """The labels of a sweep: its axes (with all their dimensions), values by leaf, status by field."""
+
+    axes: dict[str, Label]
+    values: dict[str, Label]
+    status: dict[str, Label]
+
+
+def labels_of(axes: Axes, like: PyTree) -> Labels:
+    """The labels of a sweep whose `run` returns values of the shapes in `like`.
+
+    **Raises:** `ValueError` if two values have the same name.
+    """
+    of_axes, names, values = _of_axes(axes), {}, {}
+    dims_of_axes = {dim for label in of_axes.values() for dim in label.dims}
+    taken = {STORE_GROUP, *dims_of_axes, *(label.name for label in of_axes.values())}
+    shown = list(_shown_arrays(like))
+    for part in shown:
+        names[part.key] = _unused_name(part.name, "value", taken)
+        taken.add(names[part.key])
+    status = {}
+    for field in Status._fields:
+        status[field] = Label(_unused_name(field, "status", taken), ())
+        taken.add(status[field].name)
+    for part in shown:
+        dims = *part.dims, *inner_dims(part.of or names[part.key], part.inner)
+        values[part.key] = Label(names[part.key], tuple(_unused_dimension(dim, taken) for dim in dims), part.times)
+    return Labels(of_axes, values, status)
+
+
+def _of_axes(axes):
+    found, taken = {}, set(axes.names) | {POINT}
+    for name, x in axes.values.items():
+        inner = tuple(_unused_dimension(dim, taken) for dim in inner_dims(name, x.ndim - 1))
+        dims = (POINT if axes.paired else name, *inner)
+        # xarray requires that a coordinate named like a dimension is one-dimensional.
+        shown = _unused_dimension(f"{name}_values", taken) if inner and name == dims[0] else name
+        taken |= {shown, *inner}
+        found[name] = Label(shown, dims)
+    return found
+
+
+def inner_dims(name: str, count: int) -> tuple[str, ...]:
+    """The names of an array's own dimensions."""
+    return tuple(f"{name}_{i}" for i in range(count))
+
+
+def _unused_name(name, kind, taken):
+    for candidate in (name, f"{kind}_{name}"):
+        if candidate not in taken:
+            return candidate
+    raise ValueError(f"two of the values are named '{name}'.\nFix: another key in the dictionary that run returns.")
+
+
+def _unused_dimension(dim, taken):
+    while dim in taken:
+        dim = f"value_{dim}"
+    return dim
+
+
+class _ShownArray(NamedTuple):
+    """An array among the values: its leaf, preferred name and named dimensions.
+
+    Its other `inner` dimensions are named after `of`, or after the array.
+    """
+
+    key: str
+    name: str
+    dims: tuple[str, ...]
+    inner: int
+    of: str = ""
+    times: bool = False
+
+
+def _shown_arrays(like) -> Iterable[_ShownArray]:
+    for path, part in _with_path(like):
+        key = key_of(path) or "value"
+        if isinstance(part, Trajectory):
+            yield from _of_motion(part, f"{key}." if key_of(path) else "")
+        else:
+            yield _ShownArray(key, _flat(key), (), len(part.shape))
+
+
+def _of_motion(motion, prefix):
+    """The arrays that a trajectory shows, named as by its own `to_xarray`."""
+    batch = inner_dims(f"{prefix}lane", len(motion.t.shape) - 1)
+    dims = *batch, f"{prefix}{TIMES}"
+
+    def part(key, name, dims, x, of="", times=False):
+        inner, flat = len(x.shape) - len(dims), tuple(map(_flat, dims))
+        return _ShownArray(prefix + key, _flat(prefix + name), flat, inner, _flat(prefix + of) if of else "", times)
+
+    yield part("t", "times", dims, motion.t, times=True)
+    errors = {} if motion.error is None else {f"error.{name}": getattr(motion.error, name) for name in ("q", "v")}
+    for which, tree in {"q": motion.q, "v": motion.v, **errors}.items():
+        for path, x in _with_path(tree):
+            inner = key_of(path)
+            yield part(_joined(which, inner), _joined(which, inner), dims, x, inner or "q")
+    for name, x in motion.multipliers.items():
+        yield part(f"multipliers.{name}", name, dims, x, name)
+    if hasattr(motion, "phase"):
+        yield part("phase", "phase", dims, motion.phase)
+    yield part("end.t", "end", batch, motion.end.t)
+    for name, found in motion.events.items():
+        yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{prefix}crossing_of_{name}"), found.t)
+    for path, x in _with_path(motion.arrays[PARAMS]):
+        inner = key_of(path)
+        yield part(_joined(f"arrays.{PARAMS}", inner), _joined("params", inner), batch, x)
+
+
+def _joined(which, inner):
+    return f"{which}.{inner}" if inner else which
+
+
+def _flat(name):
+    # Zarr and netCDF interpret a slash as a folder separator.
+    return name.replace("/", "_")
+
+
+def _with_path(tree):
+    return jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Trajectory))
+
+
+def key_of(path) -> str:
+    """A path as `named_leaves` writes it."""
+    return jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".")
+
+
+def flags() -> dict[str, Any]:
+    """The meanings of the result codes, in the form of the CF conventions."""
+    codes = {LOST: "lost_from_the_store", NOT_RUN: "not_run"}
+    codes |= {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+    codes = dict(sorted(codes.items()))
+    return {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
+
+
+def status_attributes(field: str) -> dict[str, Any]:
+    """The attributes of a status array in xarray."""
+    return {"long_name": getattr(STATUS_LONG_NAMES, field)} | (flags() if field == "result" else {})
+
+
+def words_of(code) -> str:
+    """A result code in words."""
+    return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
+
+
+def shared_times(x: np.ndarray, has_values: np.ndarray):
+    """The times shared by all points that have values; None if they differ, or no point has values."""
+    times = x[has_values]
+    return times[0] if len(times) and np.all(times == times[0]) else None

@@ -1,0 +1,353 @@
+"""What a store says of itself: one description, from which the metadata of all of its arrays follow.
+
+The description stands in the attributes of the group `lagjax`, with a digest: the fingerprint of the sweep, its blocks,
+and the places of its arrays. What zarr and xarray need, a `zarr.json` for each array, is made from it and read by them
+only; a sweep that continues writes it again where it is damaged. A store is made under a temporary name and then
+renamed, so that several processes may open it at the same time.
+
+A store may come from anyone, and opening it writes nothing:
+
+- it consists of folders and files, without links, and its names stay inside of it;
+- every shape follows from those of the axes, so that no other number decides how much memory is taken; and arrays that
+  would need far more memory than the files hold are not read.
+"""
+
+import json
+import math
+import os
+import re
+import shutil
+import uuid
+from pathlib import Path, PureWindowsPath
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lagjax.display.printable import by_line, printable
+from lagjax.files.npz import MALFORMED, Explained, parsed
+from lagjax.sweep.axes import Axes, Blocks
+from lagjax.sweep.batch_program import NOT_RUN, STATUS_TYPES, Program, Status, digest
+from lagjax.sweep.chunks import Spec, chunk_file, nothing, write_chunk
+from lagjax.sweep.fingerprint import FORMAT, named_leaves
+from lagjax.sweep.labels import STORE_GROUP, labels_of, status_attributes
+
+META = "zarr.json"
+MARKS = f"{STORE_GROUP}/marks"
+GROUP = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+# Arrays of a store hold truth values and numbers, in the names of zarr and NumPy.
+NUMBERS = "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64 complex64 complex128".split()
+# A file of metadata has at most this many bytes.
+MOST_METADATA = 16_000_000
+# Arrays that need more than this many bytes, and more than this many times those of all files, are not read.
+MOST_BYTES, MOST_EXPANSION = 16_000_000, 1000
+# A sweep that continues computes as many points at a time as its store says, but no more than this.
+LONGEST_CHUNK = 1 << 24
+
+
+class Described(NamedTuple):
+    """What a description says, checked: the arrays by their places, and the blocks of the grid."""
+
+    arrays: dict[str, Spec]
+    blocks: Blocks
+
+
+def description_at(path: Path) -> tuple[dict[str, Any], Described]:
+    """The description of a store, and what it says.
+
+    **Raises:** `ValueError` if there is no such store, or its description is damaged or not as lagjax writes it.
+    """
+    if not path.exists():
+        raise ValueError(f"there is no {path}.\nFix: the path that was passed to lj.sweep as store=.")
+    file = path / STORE_GROUP / META
+    if not file.exists() and not (path / MARKS).exists():
+        raise ValueError(
+            f"{path} exists, but is not the store of a sweep that this version reads.\n"
+            "Usual cause: another folder; or a store of lagjax 0.1.\n"
+            "Fix: another path, or remove it if it is not needed."
+        )
+    try:
+        description = _read_metadata(file)["attributes"]["lagjax"]
+        _require(description["digest"] == digest_of(description), "its digest is that of another")
+    except (OSError, ValueError, *MALFORMED) as error:
+        raise ValueError(
+            f"{file} is damaged: the sweep of this store is unknown.\n"
+            "Usual cause: a copy that was cut short, or a disk that failed.\n"
+            f"Fix: copy that file again from the original; or remove {path} and compute it again."
+        ) from error
+    try:
+        number = description["fingerprint"]["format"]
+        if type(number) is int and number > FORMAT:
+            raise ValueError(
+                f"it was written by lagjax {description['fingerprint']['versions']['lagjax']!r:.20}, which is newer.\n"
+                "Fix: pip install -U lagjax."
+            )
+        if number != FORMAT:
+            raise ValueError(
+                f"its format is {number!r:.20}, not {FORMAT}.\n"
+                "Usual cause: an earlier lagjax wrote it.\nFix: compute it again, or read it with that version."
+            )
+        return description, checked(description)
+    except (ValueError, *MALFORMED) as error:
+        why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {printable(error)[:200]}"
+        raise ValueError(by_line(f"{path} cannot be read: {why}")) from error
+
+
+def digest_of(description: dict) -> str:
+    """The digest of a store's description, without the digest itself."""
+    return digest(json.dumps({key: x for key, x in description.items() if key != "digest"}, sort_keys=True).encode())
+
+
+def checked(description: dict[str, Any]) -> Described:
+    """Check a description.
+
+    **Raises:** `ValueError`, or what Python raises for missing or malformed parts, if it is not as `create` makes it.
+    """
+    said, places, names, dims = (description[name] for name in ("fingerprint", "places", "names", "dims"))
+    texts = [*names, *said["values"], said["layout"], said["program"], said["points"], *said["versions"]]
+    texts += [*said["versions"].values(), *said["axes"].values(), *description["times"], *sum(dims.values(), [])]
+    _require(all(isinstance(x, str) and x.isprintable() for x in texts), "its names are not text")
+    _require(isinstance(description["paired"], bool) and len(set(names)) == len(names) > 0, "its axes have no names")
+    _require(set(said["axes"]) == set(names), "its axes have other names")
+
+    arrays = {}
+
+    def add(place, of_axes, inner, dtype, fill, chunk=None):
+        shape = *of_axes, *inner
+        chunk = (*(chunk or of_axes), *(max(1, n) for n in inner))
+        _require(_is_inside(place) and place not in arrays, f"two arrays are at {place}")
+        _require(len(dims[place]) == len(shape), f"{place} has no names of its dimensions")
+        arrays[place] = Spec(shape, chunk, dtype, fill, dims[place])
+
+    axes = [_dtype_and_shape(said["axes"][name]) for name in names]
+    _require(all(shape and shape[0] > 0 for _, shape in axes), "an axis is empty")
+    for name, (dtype, shape) in zip(names, axes):
+        add(places["axes"][name], shape[:1], shape[1:], dtype, nothing(dtype))
+    lengths = tuple(shape[0] for _, shape in axes)
+    _require(not description["paired"] or len(set(lengths)) == 1, "paired axes have different lengths")
+    blocks = Blocks(lengths[:1] if description["paired"] else lengths, tuple(description["block"]))
+    shape, block = blocks
+    _require(type(said["chunk"]) is int, "its chunk length is not a number")
+    _require(0 < said["chunk"] <= max(LONGEST_CHUNK, math.prod(shape)), "its chunks are empty or too long")
+    _require(len(block) == len(shape), "its blocks have another number of axes")
+    _require(all(type(k) is int and 0 < k <= n for n, k in zip(shape, block)), "its blocks are empty or too long")
+    splits = (all(k == 1 for k in block[:i]) and block[i + 1 :] == shape[i + 1 :] for i in range(len(shape)))
+    _require(any(splits), "its blocks are not in the order of its points")
+    values = {name: _dtype_and_shape(words) for name, words in said["values"].items()}
+    for name, (dtype, inner) in values.items():
+        add(places["values"][name], shape, inner, dtype, nothing(dtype), block)
+    for name, dtype, fill in zip(Status._fields, STATUS_TYPES, (NOT_RUN, 0, np.nan, np.nan)):
+        add(places["status"][name], shape, (), dtype, fill, block)
+    for place, name in description["times"].items():
+        add(place, (), values[name][1], values[name][0], nothing(values[name][0]))
+    _require(MARKS not in arrays and {*arrays} == {*dims}, "it names other arrays")
+    marks = (len(values) + len(Status._fields), 2)
+    arrays[MARKS] = Spec((len(blocks), *marks), (1, *marks), np.dtype("uint64"), 0, None, compressed=False)
+    return Described(arrays, blocks)
+
+
+def _dtype_and_shape(words):
+    """The dtype and shape at the beginning of words such as "float64[2, 3]"."""
+    found = re.match(r"(\w+)\[([\d, ]*)\]", words)
+    if found is None or found[1] not in NUMBERS:
+        raise ValueError("an array does not hold numbers.")
+    dtype, shape = np.dtype(found[1]), tuple(int(n) for n in found[2].split(", ") if found[2])
+    _require(words.startswith(f"{dtype}{list(shape)}"), "an array has no shape")
+    return dtype, shape
+
+
+def _is_inside(name):
+    """True for the name of an array that stays inside its store; raises `ValueError` for any other."""
+    parts = name.split("/")
+    inside = not PureWindowsPath(name).anchor and "\\" not in name and name.isprintable() and len(name) < 1000
+    _require(inside and not {"", ".", "..", META} & {*parts}, f"the array {name!r:.80} is not inside of it")
+    return True
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ValueError(f"{otherwise}.")
+
+
+def check_files(path: Path) -> int:
+    """The bytes of all files in a store.
+
+    **Raises:** `ValueError` for a link, or anything else that is neither a folder nor a file.
+    """
+    folders, size = [path], 0
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(Path(entry.path))
+                elif entry.is_file(follow_symlinks=False):
+                    size += entry.stat(follow_symlinks=False).st_size
+                else:
+                    what = "a link" if entry.is_symlink() else "not a file"
+                    raise Explained(
+                        f"{entry.path!r} is {what}, and a store has only files of its own.\n"
+                        "Usual cause: a copy made of links; or a store that was changed.\n"
+                        "Fix: copy the files themselves (cp -rL), if you trust what they link to."
+                    )
+    return size
+
+
+def check_room(path: Path, described: Described, size: int) -> None:
+    """Raise `ValueError` if the arrays need far more memory than the files of a store, `size` bytes, can hold."""
+    needed = sum(spec.bytes for spec in described.arrays.values())
+    if needed > MOST_BYTES and needed > MOST_EXPANSION * size:
+        raise Explained(
+            f"the arrays of {path} need {needed / 1e9:.3g} GB, and its files have {size / 1e9:.3g} GB.\n"
+            "Usual cause: a sweep of which hardly anything has been computed; or a store that was changed.\n"
+            "Fix: lj.sweep(run, axes, store=path), which computes what is missing."
+        )
+
+
+def create(
+    path: Path,
+    axes: Axes,
+    program: Program,
+    fingerprint: dict,
+    blocks: Blocks,
+    times: dict[str, np.ndarray],
+    structure: dict | None,
+) -> None:
+    """Make a store; if another process was first, its store is kept. A failure leaves nothing behind.
+
+    `times`: the times of trajectories that all points share, by leaf. `structure`: the description of the values
+    (`structures`).
+    """
+    made = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        description = {"fingerprint": fingerprint, "block": blocks.block, "names": list(axes.values)}
+        description |= {"paired": axes.paired, "structure": structure} | _places(axes, program, times)
+        description = json.loads(json.dumps(description))
+        description["digest"] = digest_of(description)
+        arrays, texts = checked(description).arrays, _metadata_of(description)
+        if max(map(len, texts.values())) > MOST_METADATA:
+            raise ValueError(
+                f"run returns {len(fingerprint['values']):,} arrays, whose description is longer than a store's may be."
+                "\nFix: return fewer and larger arrays."
+            )
+        temporary.mkdir()
+        for name, text in texts.items():
+            _write(temporary / name / META, text)
+        whole = {description["places"]["axes"][name]: x for name, x in axes.values.items()}
+        whole |= {place: times[key] for place, key in description["times"].items()}
+        for place, x in whole.items():
+            write_chunk(chunk_file(temporary / place, arrays[place]), arrays[place], x)
+        os.rename(temporary, path)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        # Another process was first; the caller checks next whether its store belongs to this sweep.
+        if path.exists() and isinstance(error, Exception):
+            return
+        for folder in made:
+            if folder.exists() and not any(folder.iterdir()):
+                folder.rmdir()
+        raise
+
+
+def _places(axes, program, times):
+    """Where the arrays are, by content, the names of their dimensions, and the times that are coordinates."""
+    labels, lead = labels_of(axes, program.values), list(axes.dims)
+    places = {"axes": {name: label.name for name, label in labels.axes.items()}, "values": {}}
+    places["status"] = {name: label.name for name, label in labels.status.items()}
+    dims = {label.name: list(label.dims) for label in labels.axes.values()}
+    dims |= dict.fromkeys(places["status"].values(), lead)
+    shared = {}
+    for key, x in named_leaves(program.values):
+        if str(x.dtype) not in NUMBERS:
+            raise TypeError(
+                f"the value '{key}' is {x.dtype}, which zarr cannot store.\nFix: return it as jnp.float32(...)."
+            )
+        label, inner = labels.values.get(key), [f"{STORE_GROUP}_{i}" for i in range(len(x.shape))]
+        if label is not None and key in times:
+            # The points still store their own times, so that values are read back exactly as computed.
+            shared[label.dims[-1]], dims[label.dims[-1]] = key, [label.dims[-1]]
+            label = None
+        place = _hidden_name(key, places["values"].values()) if label is None else label.name
+        places["values"][key], dims[place] = place, [*lead, *(inner if label is None else label.dims)]
+    return {"places": places, "dims": dims, "times": shared}
+
+
+def _hidden_name(key, taken):
+    name = f"{STORE_GROUP}/values/{key.replace('/', '_')}"
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _metadata_of(description):
+    """The text of the `zarr.json` of every group and array of a store, by place."""
+    status = {place: status_attributes(name) for name, place in description["places"]["status"].items()}
+    arrays = {place: spec.metadata(status.get(place, {})) for place, spec in checked(description).arrays.items()}
+    # Of the axes, xarray knows as coordinates those that are named like their dimension.
+    axes, dims = description["places"]["axes"].values(), description["dims"]
+    attributes = {"about": "a sweep, which lagjax.open_sweep reads with its checksums"}
+    if others := [place for place in axes if dims[place] != [place]]:
+        attributes["coordinates"] = " ".join(others)
+    # xarray reads these instead of the metadata of each array.
+    shown = {place: x for place, x in arrays.items() if not place.startswith(f"{STORE_GROUP}/")}
+    consolidated = {"kind": "inline", "must_understand": False, "metadata": shown}
+    groups = {"": GROUP | {"attributes": attributes, "consolidated_metadata": consolidated}}
+    groups[STORE_GROUP] = GROUP | {"attributes": {"lagjax": description}}
+    groups[f"{STORE_GROUP}/values"] = GROUP
+    return {place: json.dumps(x, indent=2) for place, x in (groups | arrays).items()}
+
+
+def damaged(path: Path, description: dict[str, Any]) -> dict[str, str]:
+    """The places in a store whose `zarr.json` is damaged or missing, each with a line about it."""
+    found = {}
+    for place, text in _metadata_of(description).items():
+        file = path / place / META
+        try:
+            intact = place == STORE_GROUP or _holds(_read_metadata(file), json.loads(text))
+        except (OSError, ValueError, *MALFORMED):
+            intact = False
+        if not intact:
+            found[place] = f"{file} was {'damaged' if file.exists() else 'missing'}"
+    return found
+
+
+def _holds(found, expected):
+    """Whether metadata are unchanged; users may add attributes and consolidate more arrays."""
+    if not isinstance(expected, dict):
+        return found == expected
+    return all(key == "attributes" or _holds(found[key], x) for key, x in expected.items())
+
+
+def restore(path: Path, description: dict[str, Any]) -> list[str]:
+    """Write each `zarr.json` again that is damaged or missing; returns a line about each.
+
+    **Raises:** `ValueError` if they cannot be written.
+    """
+    found, texts = damaged(path, description), _metadata_of(description)
+    for place, line in found.items():
+        try:
+            _write(path / place / META, texts[place])
+        except OSError as error:
+            raise ValueError(f"{line}, and cannot be restored: {error.strerror}.") from error
+    return list(found.values())
+
+
+def _read_metadata(file):
+    if file.stat().st_size > MOST_METADATA:
+        raise ValueError(f"{file} is longer than {MOST_METADATA:,} bytes.")
+    return parsed(file.read_bytes(), MOST_METADATA)
+
+
+def _write(file, text):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(f".{uuid.uuid4().hex[:8]}.partial")
+    partial.write_text(text)
+    partial.replace(file)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary folders of processes that were killed while they made this store."""
+    leftover = re.compile(re.escape(f".{path.name}.") + "[0-9a-f]{8}")
+    for other in path.parent.iterdir():
+        if leftover.fullmatch(other.name):
+            shutil.rmtree(other, ignore_errors=True)

@@ -1,0 +1,381 @@
+"""The result of a sweep: values and statuses by axis; printing, plotting, exporting, running failed points again."""
+
+import os
+from collections.abc import Callable, Iterable
+from copy import copy
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.display import plots as plot
+from lagjax.display.printable import printable
+from lagjax.display.web_page import Page
+from lagjax.files.table import Table
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.sweep import structure, tables
+from lagjax.sweep.axes import POINT, Axes
+from lagjax.sweep.batch_program import LOST, TRUSTED, Status
+from lagjax.sweep.chunks import nothing
+from lagjax.sweep.fingerprint import in_words as versions_in_words
+from lagjax.sweep.fingerprint import named_leaves, versions
+from lagjax.sweep.labels import words_of
+from lagjax.sweep.metadata import damaged
+from lagjax.sweep.store import Store, warn_of_damage
+from lagjax.sweep.web_page import MOST_MEGABYTES, page_of
+from lagjax.system import coordinates
+
+RESTORED = "Fix: lj.sweep(run, axes, store=path), which restores it."
+COMPUTED_AGAIN = (
+    "These points are marked as lost in status, and are NaN or 0 in values.\n"
+    "Fix: lj.sweep(run, axes, store=path), which computes them again."
+)
+
+
+class Sweep:
+    """The result of a sweep, by axis. It prints how its points ended, plots itself and exports to xarray.
+
+    - `axes`: the names and values of the parameters that varied; `dims`: the dimensions and their lengths.
+    - `values`: what `run` returned, each leaf with the axes in front (NumPy), NaN where a point failed. With a store
+      they are read from it on access; blocks that cannot be read cause a warning and are lost in `status`.
+    - `status`: a `Status` of arrays in the shape of the axes; `ok` is True where the values can be trusted.
+    - `how`: a description of what ran it; `ran`: how many points this call computed, in how many `seconds`, after
+      `compiling` seconds of compilation: 0 if an earlier sweep had compiled the program.
+    """
+
+    def __init__(
+        self,
+        axes: Axes,
+        values: "PyTree | Stored",
+        status: Status,
+        how: str,
+        ran: int,
+        compiling: float,
+        seconds: float,
+        again: Callable,
+    ):
+        self.axes = axes
+        self.status = Status(*(x.reshape(axes.shape) for x in status))
+        self.how, self.ran, self.compiling, self.seconds = how, ran, compiling, seconds
+        self._values, self._again = values, again
+
+    def __copy__(self):
+        same = object.__new__(Sweep)
+        same.__dict__.update(self.__dict__)
+        return same
+
+    def __deepcopy__(self, memo):
+        # Only arrays are copied: structures, systems and the engine never change.
+        same, values = copy(self), self._values
+        same.axes, same.status = (jax.tree.map(np.copy, x) for x in (self.axes, self.status))
+        same._values = values if isinstance(values, Stored) else jax.tree.map(np.copy, values)
+        return same
+
+    @property
+    def dims(self) -> dict[str, int]:
+        """The dimensions and their lengths."""
+        return self.axes.dims
+
+    @property
+    def values(self) -> PyTree:
+        """What `run` returned, each leaf with the axes in front."""
+        flat = self._values
+        if isinstance(flat, Stored):
+            flat, lost = flat.read(self.status.result.reshape(-1) == LOST)
+            self.status.result.reshape(-1)[lost] = LOST
+        return jax.tree.map(lambda x: x.reshape(self.axes.shape + x.shape[1:]), flat)
+
+    @property
+    def ok(self) -> np.ndarray:
+        """Which points were computed to their end, with no more drift than the tolerance allows, or fitted well."""
+        return np.isin(self.status.result, TRUSTED)
+
+    def counts(self) -> dict[str, int]:
+        """How many points ended with each result, in words, the most frequent first."""
+        codes, counts = np.unique(self.status.result, return_counts=True)
+        return {words_of(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
+
+    def resweep(self, run: Callable | None = None, where=None) -> "Sweep":
+        """Run the points that are not `ok` again, with another `run` (other settings), and keep the rest.
+
+        **Arguments:** `run` as in `lj.sweep`, returning the same structure; by default the same one, which finishes a
+        sweep that was interrupted. `where`: booleans in the shape of the axes, of the points to run.
+
+        **Returns:** a new `Sweep`, in memory.
+        """
+        where = ~self.ok if where is None else np.broadcast_to(np.asarray(where, bool), self.axes.shape)
+        which = np.flatnonzero(where.reshape(-1))
+        return self._again(self, run, which) if len(which) else self
+
+    def to_xarray(self):
+        """Values, statuses and axes as an `xarray.Dataset`, with dimensions and coordinates by name.
+
+        The outputs of a `Trajectory` have the dimension `t` if all points share their times. The attributes of `result`
+        say what its numbers mean (`flag_values`, `flag_meanings`). A value that is named like an axis gets the prefix
+        `value_`. A store has the same names: `xarray.open_zarr(path)`.
+
+        **Raises:** `ImportError` without xarray; `ValueError` if two values have the same name.
+        """
+        return tables.dataset(self)
+
+    def to_pandas(self, values: Callable | None = None):
+        """A `pandas.DataFrame` with one row per point: the axes, what `run` returned, how the point ended.
+
+        >>> import numpy as np
+        >>> import lagjax as lj
+        >>> run = lambda point: {"sum": point["a"] + point["b"], "both": point["a"] * np.array([1.0, 10.0])}
+        >>> swept = lj.sweep(run, {"a": np.array([1.0, 2.0]), "b": np.array([0.5])}, progress=False)
+        >>> print(swept.to_pandas().drop(columns=["steps", "scaled_error", "residual"]))
+             a    b  both[0]  both[1]  sum      result
+        0  1.0  0.5      1.0     10.0  1.5  successful
+        1  2.0  0.5      2.0     20.0  2.5  successful
+
+        Rows are in the order of the points, the last axis fastest. An array of a point has one column per number, up
+        to 100; `result` is categorical, in words.
+
+        **Arguments:** `values`: a function of `swept.values` that returns the values to show instead, each with the
+        axes in front: `lambda values: {"end": values.q[..., -1]}`. Trajectories require it.
+
+        **Raises:** `ImportError` without pandas; `ValueError` if a point has more numbers than fit into a row.
+        """
+        return tables.frame(self, values)
+
+    def plot(self, value: str | Callable | None = None):
+        """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
+
+        **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
+        axes; by default every leaf with one number per point. Line plots mark points that are not `ok`; NaN is grey in
+        maps. A `Trajectory` over one axis is drawn against time, one curve per point.
+
+        **Returns:** a matplotlib `Figure`.
+
+        **Raises:** `ValueError` if there is no such value, or there are more than three axes.
+        """
+        values = self.values
+        if value is None and isinstance(values, Trajectory) and len(self.axes.shape) == 1:
+            return self._plot_motions(values)
+        panels = self._panels(values, value)
+        if self.axes.paired:
+            name, x = next(iter(self.axes.values.items()))
+            return plot.lines(name, x if x.ndim == 1 else np.arange(len(x)), panels, ~self.ok)
+        axes = {name: x if x.ndim == 1 else np.arange(len(x)) for name, x in self.axes.values.items()}
+        if len(axes) == 1:
+            ((name, x),) = axes.items()
+            return plot.lines(name, x, panels, ~self.ok)
+        if len(axes) > 3:
+            raise ValueError(
+                f"a figure can show three axes, and this sweep has {len(axes)}: {', '.join(axes)}.\n"
+                "Fix: choose a part with swept.to_xarray().isel(...) and plot that."
+            )
+        return plot.maps(axes, panels)
+
+    def to_html(
+        self,
+        path: str | os.PathLike | None = None,
+        *,
+        positions: Callable | None = None,
+        seconds: float | None = None,
+        rate: float = 25.0,
+        trail: float = 2.0,
+        megabytes: float = MOST_MEGABYTES,
+    ) -> Page:
+        """Make a page with a slider for each axis, which works without Python and without a network.
+
+        >>> import jax.numpy as jnp
+        >>> import lagjax as lj
+        >>> swept = lj.sweep(lambda point: {"height": point["v"] ** 2 / 20}, {"v": jnp.arange(3.0)}, progress=False)
+        >>> swept.to_html()  # doctest: +ELLIPSIS
+        Page of 3 points, v (3), ... kB: works in a notebook, and with .save("page.html") in a browser
+
+        It shows how the chosen point ended, in words. A value with one number per point is shown as a number, and as a
+        curve over the axis that was moved last; a `Trajectory` as curves against time; an array as curves, one per
+        column, against the array `t` in the same dictionary, or else against the index. What happens between two
+        outputs is not seen.
+
+        **Arguments:**
+
+        - `path`: where to write the page; it can also be written later: `page.save(path)`.
+        - `positions`, `seconds`, `rate`, `trail`: for a sweep of trajectories, a film as made by `Trajectory.animate`.
+        - `megabytes`: the largest allowed size of the page.
+
+        **Returns:** a `Page`, which shows itself in a notebook.
+
+        **Raises:** `ValueError` if there is nothing to draw, or the page would be too large.
+        """
+        in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
+        flat = jax.tree.map(in_front, self.values)
+        codes, film_settings = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
+        page = page_of(self.axes, flat, codes, positions, megabytes, film_settings)
+        if path is not None:
+            page.save(path)
+        return page
+
+    def _plot_motions(self, motions):
+        (name, x), *others = self.axes.values.items()
+        if others or x.ndim > 1:
+            name, x = POINT if others else name, np.arange(len(x))
+        columns = [q.reshape(*motions.t.shape, -1) for q in jax.tree.leaves(motions.q)]
+        curves = np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)
+        one = jax.tree.map(lambda q: q[0, 0], motions.q)
+        return plot.families(name, x, motions.t, dict(zip(coordinates.names(one), curves)))
+
+    def _panels(self, values, value):
+        if callable(value):
+            chosen = {"value": np.asarray(value(values))}
+        else:
+            without_motions = jax.tree.map(_without_motion, values, is_leaf=lambda x: isinstance(x, Trajectory))
+            candidates = named_leaves(without_motions if value is None else values)
+            chosen = {name: x for name, x in candidates if value is None or name == value}
+        numbers = {name: x for name, x in chosen.items() if x.shape == self.axes.shape}
+        if not numbers:
+            contents = ", ".join(f"'{name}' {x.shape[len(self.axes.shape) :]}" for name, x in named_leaves(values))
+            named = f" named {value!r}" if isinstance(value, str) else ""
+            raise ValueError(
+                f"there is no value{named} with one number per point; each point has {contents}.\n"
+                "Fix: choose one, such as swept.plot(lambda values: values.q[..., -1])."
+            )
+        return numbers
+
+    def __repr__(self):
+        size, steps = self.axes.size, self.status.steps.reshape(-1)
+        dims = " x ".join(f"{name} ({n})" for name, n in self.dims.items())
+        rows = [("points", f"{size:,}: {dims}")]
+        rows += [("status" if i == 0 else "", f"{n:,} {words}") for i, (words, n) in enumerate(self.counts().items())]
+        if bad := np.flatnonzero(~self.ok.reshape(-1)).tolist():
+            rows.append(("first not ok", self.axes.words(bad[0])))
+        if steps.any():
+            worst = int(np.argmax(steps))
+            rows.append(
+                ("steps a point", f"{int(np.median(steps)):,} (median), {steps[worst]:,} at {self.axes.words(worst)}")
+            )
+        residual = self.status.residual[np.isfinite(self.status.residual)]
+        if residual.any():
+            rows.append(("worst constraint residual", f"{residual.max():.1e} (relative, at the outputs)"))
+        rows.append(("values", ", ".join(self._shapes())))
+        rows.append(("run", self.how))
+        if self.ran:
+            compiled = f"compiled in {self.compiling:.3g} s" if self.compiling else "nothing had to be compiled"
+            rows.append(("", f"{compiled}; computed in {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s"))
+        width = max(len(label) for label, _ in rows)
+        return "\n".join(["Sweep", *(printable(f"  {label:<{width}}  {value}") for label, value in rows)])
+
+    def _shapes(self):
+        shown = []
+        leaves = self._values.like if isinstance(self._values, Stored) else jax.tree.map(lambda x: x[0], self._values)
+        is_trajectory = lambda x: isinstance(x, Trajectory)
+        for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=is_trajectory):
+            name = jax.tree_util.keystr(path, simple=True, separator=".")
+            if is_trajectory(part):
+                shown.append(f"{name or 'value'} Trajectory at {part.t.shape[-1]} times")
+            else:
+                shown.append(f"{name or 'value'} {part.dtype}{list(part.shape) if part.shape else ''}")
+        return shown
+
+
+def _without_motion(part):
+    return None if isinstance(part, Trajectory) else part
+
+
+def open_sweep(
+    path: str | os.PathLike, *, run: Callable | None = None, system: Any = None, classes: Iterable[type] = ()
+) -> Sweep:
+    """Open the sweep in a store: its values have the structure of what `run` returned, trajectories included.
+
+    A store is data: opening it imports nothing, runs nothing of it and writes nothing, whoever has written it; nothing
+    outside of it is read. Other versions of lagjax, jax and diffrax may have written it.
+
+    Statuses are read now, values on first access. A file that is missing, cut off or of another block is detected now,
+    without reading the values; a file whose contents have changed is detected when the values are read. Either causes a
+    warning that names the file; its points are then "lost from the store" in `status` and not `ok`.
+    `lj.sweep(run, axes, store=path)` computes them again.
+
+    >>> import tempfile
+    >>> import lagjax as lj
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     done = lj.sweep(lambda point: point["x"] ** 2, {"x": [1.0, 2.0]}, store=folder + "/squares", progress=False)
+    ...     print(open_sweep(folder + "/squares").counts())
+    {'successful': 2}
+
+    **Arguments:** `path`: the folder that was passed to `lj.sweep` as `store`. Functions are not stored, so a
+    trajectory does not know its system. It can be plotted and animated all the same. For methods that need the system
+    (`print`, `drift()`), pass `system`, the one that was integrated, or `run`, the function that was swept; `run` is
+    only traced, not run. `classes`: your own classes among the values, named tuples and dataclasses: `classes=[Pair]`.
+
+    **Returns:** a `Sweep`.
+
+    **Raises:** `ValueError` if there is no store, it is not as lagjax writes it, its description is damaged or of an
+    earlier format, or `run` returns another structure. `values` is a dictionary by name for values that contain
+    functions, or objects of classes that were not passed (which a warning names).
+    """
+    path, table = Path(path), Table(classes)
+    store = Store(path)
+    if wrong := damaged(path, store.about):
+        warn_of_damage(path, wrong.values(), "It is read all the same. " + RESTORED, stacklevel=2)
+    axes, (status, missing, lost) = store.axes(), store.status()
+    if lost:
+        warn_of_damage(path, lost.values(), COMPUTED_AGAIN, stacklevel=2)
+    how = f"from {path}" + (f", of which {len(missing)} blocks are missing" if missing else "")
+    if (by := store.about["fingerprint"]["versions"]) != versions():
+        how += f", written by {versions_in_words(by)}"
+    if run is None:
+        like = structure.as_stored(store, system, table)
+    else:
+        like = structure.as_run_returns(run, axes, store)
+    return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)
+
+
+def opened(swept, run, indices):
+    """Refuse to run points of an opened sweep again."""
+    raise ValueError(
+        "a sweep that was opened from its store does not know the function that ran it.\n"
+        "Fix: lj.sweep(run, axes, store=path), which computes what is missing; without a store lj.sweep(run, axes)."
+    )
+
+
+def of_store(swept, run, indices):
+    """Refuse to run points of a sweep in a store with another function."""
+    raise ValueError(
+        "the values in a store belong to the run that it was begun with.\n"
+        "Fix: lj.sweep(other, axes of the failed points, paired=True), or a sweep without a store."
+    )
+
+
+class Stored:
+    """The values of a store, read on access; `like` has the shapes of one point. A pickle holds only the path."""
+
+    def __init__(self, store: Store | Path, like: PyTree = None):
+        self._store, self._like = store, like
+
+    def __reduce__(self):
+        return Stored, (Path(os.path.abspath(self.store.path)),)
+
+    @property
+    def store(self) -> Store:
+        """The store, opened on first access."""
+        if isinstance(self._store, Path):
+            self._store = Store(self._store)
+        return self._store
+
+    @property
+    def like(self) -> Any:
+        """One point's values, as shapes."""
+        if self._like is None:
+            # Unpickled.
+            self._like = structure.as_stored(self.store, None, Table())
+        return self._like
+
+    def read(self, known: np.ndarray) -> tuple[PyTree, np.ndarray]:
+        """(the values, which points are lost); warns of lost points that are not yet `known`."""
+        values, lost = self.store.values(self.like)
+        where, new = known.copy(), []
+        for number, wrong in lost.items():
+            here = self.store.blocks.points(number)
+            new += [] if known[here].all() else [wrong]
+            where[here] = True
+        if new:
+            warn_of_damage(self.store.path, new, COMPUTED_AGAIN, stacklevel=3)
+        for x in jax.tree.leaves(values):
+            x[where] = nothing(x.dtype)
+        return values, where

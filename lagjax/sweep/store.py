@@ -1,0 +1,333 @@
+"""A sweep on disk: a group of zarr that xarray reads directly, written block by block; complete blocks are marked.
+
+    NAME                (*axes,) + a point's shape: values by `labels`, result, steps, scaled_error, residual; the axes
+    lagjax              the description of the store, and
+    lagjax/values/NAME  the arrays of trajectories without a label: their ends, statistics, parameters
+    lagjax/marks        (blocks, arrays, 2): the length and checksum of each file of a block; written last
+
+A block is a box of the grid with consecutive flat indices (`axes`). A block that is not marked is computed again, even
+if parts of it were written. Zarr reads a missing file as a block of fill values, so the marks must record which files
+belong there. Files are compared with their marks in two ways:
+
+- a quick check, whenever a store is opened: each file exists, has its length and ends with its checksum. It reads 4
+  bytes per file, and detects files that are missing, cut off, or of another block;
+- a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
+
+Any other damage is detected when values are read. Files are read and written without zarr (`chunks`), and nothing
+outside of the store is, whatever its description says (`metadata`); opening a store writes nothing.
+
+Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
+blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.
+"""
+
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax.sweep.axes import Axes, Blocks
+from lagjax.sweep.batch_program import LOST, NOT_RUN, Program, Status
+from lagjax.sweep.chunks import (
+    CHECKSUM,
+    UNREADABLE,
+    Spec,
+    as_number,
+    chunk_file,
+    nothing,
+    read_bytes,
+    read_chunk,
+    write_chunk,
+)
+from lagjax.sweep.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
+from lagjax.sweep.labels import flags
+from lagjax.sweep.metadata import MARKS, check_files, check_room, create, description_at, remove_leftovers, restore
+
+# The largest number of files that a message names.
+SHOWN = 5
+
+
+class Store:
+    """An open store of a sweep.
+
+    `of_own_sweep`: the caller knows its axes, which decide how much memory it takes; otherwise arrays far larger than
+    its files are refused.
+    """
+
+    def __init__(self, path: str | os.PathLike, of_own_sweep: bool = False):
+        self.path = Path(path)
+        size = check_files(self.path) if self.path.is_dir() else 0
+        self.about: dict[str, Any]
+        self.about, described = description_at(self.path)
+        if not of_own_sweep:
+            check_room(self.path, described, size)
+        self._specs, self.blocks = described
+        # The array of each leaf of the values, and of each field of the status.
+        places = self.about["places"]
+        self._values: dict[str, str] = {name: places["values"][name] for name in self.about["fingerprint"]["values"]}
+        self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
+        names = *self._values.values(), *self._status.values()
+        self.arrays: dict[str, Spec] = {name: self._specs[name] for name in names}
+
+    @property
+    def size(self) -> int:
+        """The number of points."""
+        return math.prod(self.blocks.shape)
+
+    def missing(self) -> np.ndarray:
+        """The numbers of the blocks that are not marked."""
+        return self._missing(self._marks()[0])
+
+    def _marks(self):
+        """(the marks of all blocks, 0 for unmarked ones; the numbers of the blocks whose mark is damaged)."""
+        spec, unreadable = self._specs[MARKS], []
+        found = np.zeros(spec.shape, spec.dtype)
+        for number in range(len(self.blocks)):
+            try:
+                found[number] = read_chunk(self._file(MARKS, number), spec)[0]
+            except FileNotFoundError:
+                pass
+            except UNREADABLE:
+                unreadable.append(number)
+        return found, unreadable
+
+    def _missing(self, marks):
+        return np.flatnonzero(marks.reshape(len(self.blocks), -1).max(axis=1) == 0)
+
+    def write(self, number: int, values, status: Status):
+        """Write a block, and then mark it."""
+        shape = tuple(x.stop - x.start for x in self.blocks.region(number))
+        flat = [x for _, x in named_leaves(values)] + list(status)
+        marks = [
+            write_chunk(self._file(name, number), spec, x.reshape(shape + x.shape[1:]))
+            for (name, spec), x in zip(self.arrays.items(), flat)
+        ]
+        self._mark(number, marks)
+
+    def _mark(self, number, marks):
+        write_chunk(self._file(MARKS, number), self._specs[MARKS], np.asarray([marks], np.uint64))
+
+    def unmark(self, numbers: Iterable[int]):
+        """Mark some blocks as not written."""
+        for number in numbers:
+            self._mark(number, np.zeros((len(self.arrays), 2)))
+
+    def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
+        """The damage of some blocks: by the block's number, the file and what is wrong with it.
+
+        A quick check, or a full check if `read`. Blocks that are not marked are skipped.
+        """
+        marks, unreadable = self._marks() if marks is None else marks
+        found = {}
+        for number in numbers:
+            if number in unreadable:
+                found[number] = f"{self._file(MARKS, number)} is damaged"
+            elif np.any(marks[number]):
+                wrong = next(self._damage(number, marks[number], read), None)
+                if wrong is not None:
+                    found[number] = wrong
+        return found
+
+    def first(self) -> int | None:
+        """The number of the first marked block."""
+        missing = set(self.missing().tolist())
+        return next((number for number in range(len(self.blocks)) if number not in missing), None)
+
+    def read(self, number: int) -> list[np.ndarray]:
+        """The values of a block, each (points, ...)."""
+        lead = len(self.blocks.shape)
+        found = [self._block(name, number) for name in self._values.values()]
+        return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
+
+    def _block(self, name, number):
+        """The numbers of a block, in the shape of its region."""
+        spec, here = self.arrays[name], self.blocks.region(number)
+        shape = *(x.stop - x.start for x in here), *spec.shape[len(here) :]
+        # Blocks at the end of an axis are filled up to their whole shape.
+        return read_chunk(self._file(name, number), spec)[tuple(map(slice, shape))]
+
+    def _damage(self, number, mark, read):
+        for name, (length, checksum) in zip(self.arrays, mark.tolist()):
+            if length == 0:
+                continue
+            file = self._file(name, number)
+            try:
+                with open(file, "rb") as content:
+                    stored = os.fstat(content.fileno()).st_size
+                    content.seek(max(0, stored - CHECKSUM))
+                    end = as_number(content.read())
+                if stored == length and read:
+                    read_bytes(file, self.arrays[name])
+            except FileNotFoundError:
+                yield f"{file} is missing"
+            except OSError as error:
+                yield f"{file} cannot be read ({error.strerror})"
+            except UNREADABLE:
+                yield f"{file} is not as it was written"
+            else:
+                if stored != length:
+                    yield f"{file} has {stored:,} bytes of {length:,}"
+                elif end != checksum:
+                    yield f"{file} is not as it was written"
+
+    def _file(self, name, number):
+        """The file of a block; None for an empty array."""
+        place = (number,) if name == MARKS else self.blocks.place(number)
+        return chunk_file(self.path / name, self._specs[name], place)
+
+    def axes(self) -> Axes:
+        """The axes.
+
+        **Raises:** `ValueError` if their values are damaged.
+        """
+        names = tuple(self.about["names"])
+        return Axes(names, tuple(map(self._axis, names)), self.about["paired"])
+
+    def _axis(self, name):
+        place = self.about["places"]["axes"][name]
+        folder, spec = self.path / place, self._specs[place]
+        try:
+            x = read_chunk(chunk_file(folder, spec), spec)[tuple(map(slice, spec.shape))]
+        except UNREADABLE:
+            x = None
+        if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
+            raise ValueError(
+                f"the values of the axis '{name}' in {folder} are damaged.\n"
+                "Usual cause: a file that was lost in a copy.\n"
+                f"Fix: lj.sweep(run, axes, store='{self.path}'), which writes them again."
+            )
+        return x
+
+    def write_axes(self, axes: Axes) -> list[str]:
+        """Write damaged axes again; returns a line about each."""
+        damaged = []
+        for name, x in axes.values.items():
+            try:
+                self._axis(name)
+            except ValueError:
+                place = self.about["places"]["axes"][name]
+                write_chunk(chunk_file(self.path / place, self._specs[place]), self._specs[place], x)
+                damaged.append(f"{self.path / place} was damaged")
+        return damaged
+
+    def values(self, like=None) -> tuple[Any, dict[int, str]]:
+        """(the values of all points; the lost blocks: by number, what is wrong).
+
+        Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
+        """
+        named, _, lost = self._read(self._values)
+        if like is not None:
+            named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
+        return named, lost
+
+    def _read(self, places):
+        """(the arrays at some places, each (points, ...); the unmarked blocks; the lost blocks with what is wrong).
+
+        Arrays have nothing in blocks that are unmarked or cannot be read.
+        """
+        marks, unreadable = self._marks()
+        missing = set(self._missing(marks).tolist()) - set(unreadable)
+        arrays, lost = {}, self.damage(range(len(self.blocks)), False, (marks, unreadable))
+        for name, place in places.items():
+            spec = self.arrays[place]
+            found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
+            for number in set(range(len(self.blocks))) - missing:
+                try:
+                    found[self.blocks.region(number)] = self._block(place, number)
+                except UNREADABLE:
+                    lost.setdefault(number, f"{self._file(place, number)} is damaged")
+            arrays[name] = found.reshape(self.size, *spec.shape[len(self.blocks.shape) :])
+        return arrays, missing, lost
+
+    def one(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """The shapes of one point's values by name, without reading any values."""
+        arrays, lead = {name: self.arrays[place] for name, place in self._values.items()}, len(self.blocks.shape)
+        return {name: jax.ShapeDtypeStruct(x.shape[lead:], x.dtype) for name, x in arrays.items()}
+
+    def status(self) -> tuple[Status, set[int], dict[int, str]]:
+        """(the statuses of all points, the unmarked blocks, the lost blocks with what is wrong)."""
+        found, missing, lost = self._read(self._status)
+        status = Status(**found)
+        if unknown := sorted({*np.unique(status.result).tolist()} - {*flags()["flag_values"]}):
+            raise ValueError(
+                f"{self.path} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
+                "Fix: pip install -U lagjax."
+            )
+        for numbers, code in ((missing, NOT_RUN), (lost, LOST)):
+            for number in numbers:
+                for x, fill in zip(status, (code, 0, np.nan, np.nan)):
+                    x[self.blocks.points(number)] = fill
+        return status, missing, lost
+
+
+def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
+    """Warn of damage in a store."""
+    wrong = list(wrong)
+    more = [f"and {len(wrong) - SHOWN:,} more"] if len(wrong) > SHOWN else []
+    lines = "\n".join(f"    {line}" for line in [*wrong[:SHOWN], *more])
+    warnings.warn(
+        f"the store {path} is damaged or incomplete:\n{lines}\n"
+        "Usual cause: a copy that was cut short, files removed, a disk or its network that failed.\n" + then,
+        stacklevel=stacklevel + 1,
+    )
+
+
+def chunk_of(path: str | os.PathLike) -> int:
+    """The chunk length that a store was begun with."""
+    return description_at(Path(path))[0]["fingerprint"]["chunk"]
+
+
+def open_store(
+    path: Path,
+    axes: Axes,
+    program: Program,
+    layout: str,
+    part: tuple[int, int],
+    accept: bool,
+    new_store: Callable[[], tuple[Blocks, dict, dict | None]],
+) -> Store:
+    """Open the store of a sweep, or make it if there is none; refuse one that belongs to another sweep.
+
+    `new_store()`: the blocks of a new store, the times of trajectories that all points share, the structure of values.
+    Damage causes a warning; metadata and axes are restored, and damaged blocks of this part are marked as missing.
+    """
+    wanted = fingerprint(axes, program, layout)
+    if not path.exists():
+        create(path, axes, program, wanted, *new_store())
+    store = Store(path, of_own_sweep=True)
+    _check_belongs(path, store.about["fingerprint"], wanted, accept)
+    remove_leftovers(path)
+    wrong = restore(path, store.about)
+    wrong += store.write_axes(axes)
+    lost = store.damage(range(part[0], len(store.blocks), part[1]), read=True)
+    if wrong or lost:
+        recomputed = f"Blocks that are computed again: {len(lost):,} of {len(store.blocks):,}"
+        outcome = recomputed if lost else "It has been restored"
+        warn_of_damage(path, [*wrong, *lost.values()], f"{outcome}; nothing needs to be done.", stacklevel=4)
+    store.unmark(lost)
+    return store
+
+
+def _check_belongs(path, stored, here, accept):
+    found = differences(stored, here)
+    older = [line for line in found if line.startswith(("versions", "format"))]
+    # Other versions may trace another program from the same function.
+    other = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
+    shown = lambda lines: "".join(f"    {line}\n" for line in lines)
+    if other:
+        raise ValueError(
+            f"{path} belongs to another sweep, and is left unchanged:\n{shown(found)}"
+            "Usual cause: run, the axes or a setting has changed since it was begun.\n"
+            "Fix: another path; or undo the differences, to continue this one."
+        )
+    if older and not accept:
+        raise ValueError(
+            f"{path} was written by other versions, and is left unchanged:\n{shown(older)}"
+            "Its contents can be read: lj.open_sweep(path).\n"
+            "Fix: lj.sweep(..., accept_versions=True) continues it if run is still the same function, which "
+            "cannot be checked across versions; or another path."
+        )

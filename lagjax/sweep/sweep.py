@@ -1,0 +1,270 @@
+"""The entry point of sweeps: compile once, run on all devices, keep what was done."""
+
+import os
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from lagjax.display.progress import meter
+from lagjax.sweep.axes import axes_of
+from lagjax.sweep.batch_program import LAYOUTS, not_run
+from lagjax.sweep.fill_store import Filling, compare_versions, groups_of_blocks, new_store
+from lagjax.sweep.fingerprint import check_file_names, shapes_of
+from lagjax.sweep.labels import labels_of
+from lagjax.sweep.result import Stored, Sweep, of_store
+from lagjax.sweep.scheduler import CHUNKS_EACH, Engine, chunk_length, usable_cores
+from lagjax.sweep.store import chunk_of, open_store, warn_of_damage
+
+# Points per call of the compiled program. On a CPU a call costs 0.2 ms, and larger chunks gain nothing; a GPU needs
+# more to be fully used.
+CHUNK = {"cpu": 1024, "gpu": 65536}
+# The largest part of the free memory that a sweep may use.
+FILL_AT_MOST = 0.8
+
+
+def sweep(
+    run: Callable[[dict[str, Any]], Any],
+    axes: Mapping[str, ArrayLike],
+    *,
+    paired: bool = False,
+    store: str | os.PathLike | None = None,
+    accept_versions: bool = False,
+    part: tuple[int, int] | None = None,
+    chunk: int | None = None,
+    layout: str = "vmap",
+    devices: list | None = None,
+    sort: bool | None = None,
+    workers: int | None = None,
+    progress: bool | None = None,
+) -> Sweep:
+    """Call `run` at every point of a grid, in parallel, and label what it returns.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> def run(point):
+    ...     return lj.integrate(swing, point["angle"], 0.0, {"g": point["g"]}, ts=jnp.array([0.0, 1.0])).q[-1]
+    >>> swept = sweep(run, {"g": jnp.array([1.0, 4.0]), "angle": jnp.linspace(0.0, 1.0, 3)}, progress=False)
+    >>> print(swept.values.round(4), swept.counts())
+    [[ 0.      0.2777  0.6001]
+     [ 0.     -0.1947 -0.3062]] {'successful': 6}
+
+    **Main arguments:**
+
+    - `run(point)`: any JAX function; `point` is a dictionary with one scalar (or slice) per axis. It may return any
+      pytree of numbers and arrays: a final state, a period, a gradient, a whole `Trajectory`. `integrate` needs no
+      special options in it: it does not raise, and `status` records how it ended.
+    - `axes`: the parameters that vary, arrays (n, ...) by name. They form a grid of all combinations, the last axis
+      fastest; with `paired` they all move together.
+
+    **Long sweeps:**
+
+    - `store`: a directory to which blocks of points are written as they are finished (zarr). When the same sweep is
+      called again, only missing points are computed; a store of another sweep is refused. Stored files are read once
+      and checked against their checksums; damaged blocks cause a warning and are computed again.
+    - `accept_versions`: continue a store that other versions of lagjax, jax or diffrax began. Whether `run` is still
+      the same function is then unknown: a few points are computed again, with a warning if they differ.
+    - `part`: (k, n): this process computes every n-th block from the k-th on; by default taken from `jax.distributed`.
+    - `progress`: show points done, rate and time left (tqdm); by default in a terminal or a notebook.
+
+    **How it runs** (`print(swept)` shows it):
+
+    - `chunk`: points per call of the compiled program.
+    - `layout`: `"vmap"` runs lanes together (those that take more than 32,768 steps are run again alone); `"map"` runs
+      them one after the other.
+    - `sort`: first run a few points, then all points in the order of the steps they are expected to take, so that a few
+      long lanes do not hold up the rest; by default with `"vmap"`, from 16,000 points on.
+    - `devices`: JAX devices between which each chunk is split; by default all.
+    - `workers`: chunks computed at the same time; by default one per CPU core, or two.
+
+    A second call compiles nothing if the axes have the same names, shapes and dtypes, whatever their values and
+    lengths, and `run` is the same function, or one with the same code that reads the same values from outside.
+
+    **Returns:** a `Sweep`. After an interruption (Ctrl-C) it has the finished points; `swept.resweep()` runs the rest.
+
+    **Raises:** `TypeError`, `ValueError` for invalid axes and settings, or another sweep's store; `MemoryError`
+    if the values would not fit, before anything runs.
+    """
+    if not callable(run):
+        raise TypeError(
+            f"run must be a function of a point, not {type(run).__name__}.\n"
+            "Fix: lambda point: lj.integrate(system, q0, v0, params | point, ts=ts).q."
+        )
+    grid = axes_of(axes, paired)
+    devices = jax.local_devices() if devices is None else list(devices)
+    part = (jax.process_index(), jax.process_count()) if part is None else part
+    _check(layout, part, store)
+    platform = devices[0].platform
+    cores = usable_cores() if platform == "cpu" else 2
+    workers = (cores if len(devices) == 1 else 2) if workers is None else workers
+    if chunk is None and store is not None and Path(store).exists():
+        # A store keeps its chunk length, even when it is continued on another number of cores.
+        chunk = chunk_of(store)
+    elif chunk is None:
+        chunk = chunk_length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
+    engine = Engine(run, grid, chunk, workers, sort, layout, devices, progress)
+    if store is not None:
+        labels = labels_of(grid, engine.program.values)
+        check_file_names("axis", labels.axes)
+        check_file_names("value", [label.name for label in labels.values.values()])
+    _check_memory(grid, engine.program, workers, store, devices)
+    if store is None:
+        return _in_memory(engine, np.arange(grid.size), None)
+    return _in_store(engine, grid, Path(store), part, accept_versions)
+
+
+def _in_memory(engine, indices, before):
+    started, axes = time.perf_counter(), engine.axes
+    values, status = not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
+    done = 0
+    with _meter(len(indices), engine.progress) as shown:
+        try:
+            for positions, found, how in engine.over(indices):
+                at = indices[positions]
+                # Consecutive points are written as a slice, which is five times as fast.
+                at = slice(at[0], at[0] + len(at)) if np.all(np.diff(at) == 1) else at
+                for whole, new in zip(jax.tree.leaves((values, status)), jax.tree.leaves((found, how))):
+                    whole[at] = new
+                done += len(positions)
+                shown.update(len(positions))
+        except KeyboardInterrupt:
+            _tell_interrupted(done, len(indices), "swept.resweep() runs the rest.")
+    compiling, seconds = engine.seconds_since(started)
+
+    return Sweep(axes, values, status, engine.words, done, compiling, seconds, _Again(engine))
+
+
+class _Again:
+    """Runs points of a sweep in memory again, with the engine that ran it; a pickle has neither that nor `run`."""
+
+    def __init__(self, engine: Engine):
+        self._engine = engine
+
+    def __deepcopy__(self, memo):
+        return self
+
+    def __reduce__(self):
+        engine = self._engine
+        return Elsewhere, (engine.chunk, engine.workers, engine.sort, engine.layout)
+
+    def __call__(self, swept, other, which):
+        engine = self._engine if other is None else self._engine.with_run(other, len(which))
+        return _again(swept, engine, which)
+
+
+class Elsewhere(NamedTuple):
+    """Runs points of an unpickled sweep again, with the function that is passed."""
+
+    chunk: int
+    workers: int
+    sort: bool
+    layout: str
+
+    def __call__(self, swept, other, which):
+        if other is None:
+            raise ValueError(
+                "a sweep that was unpickled does not know the function that ran it.\nFix: swept.resweep(run)."
+            )
+        chunk = chunk_length(len(which), self.workers, self.chunk)
+        settings = self.workers, self.sort, self.layout
+        return _again(swept, Engine(other, swept.axes, chunk, *settings, jax.local_devices(), None), which)
+
+
+def _again(swept, engine, which):
+    lead = len(swept.axes.shape)
+    flat = jax.tree.map(lambda x: x.reshape(swept.axes.size, *x.shape[lead:]), (swept.values, swept.status))
+    there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)
+    if there != here:
+        raise ValueError(
+            f"this run returns another structure than the sweep: {here}, not {there}.\n"
+            "Fix: return the same structure, computed with other settings."
+        )
+    return _in_memory(engine, which, flat)
+
+
+def _in_store(engine, axes, path, part, accept_versions):
+    started = time.perf_counter()
+    new = lambda: new_store(engine, axes, CHUNKS_EACH * part[1])
+    store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, new)
+    compare_versions(engine, store)
+    k, n = part
+    missing = [number for number in store.missing().tolist() if number % n == k]
+    length = lambda number: store.blocks.points(number).stop - store.blocks.points(number).start
+    done = 0
+    with _meter(sum(map(length, missing)), engine.progress) as shown:
+        try:
+            for numbers in groups_of_blocks(engine, store, missing):
+                filling = Filling(engine, store, numbers)
+                for positions, values, status in engine.over(filling.indices):
+                    filling.take(positions, values, status)
+                    shown.update(len(positions))
+                done += len(filling.indices)
+        except KeyboardInterrupt:
+            # A block that was written just before the interruption counts as well.
+            done = sum(map(length, set(missing) - set(store.missing().tolist())))
+            _tell_interrupted(done, sum(map(length, missing)), "the same call continues from there.")
+
+    here = f"{engine.words}, in {path}"
+    status, _, lost = store.status()
+    if lost:
+        fix = "Fix: this call without part, or with the part to which these blocks belong."
+        warn_of_damage(path, lost.values(), fix, stacklevel=3)
+    compiling, seconds = engine.seconds_since(started)
+    return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, of_store)
+
+
+def _check(layout, part, store):
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(map(repr, LAYOUTS))}, not {layout!r}.")
+    k, n = part
+    if not 0 <= k < n:
+        raise ValueError(f"part must be (k, n) with 0 <= k < n, not {part}.\nFix: part=(0, 2) and part=(1, 2).")
+    if n > 1 and store is None:
+        raise ValueError(
+            f"this is process {k} of {n}, and without a store its points would be lost.\n"
+            'Fix: store="a directory that all processes can reach".'
+        )
+
+
+def _check_memory(axes, program, workers, store, devices):
+    """Raise `MemoryError` if the values would not fit."""
+    on_host, free = devices[0].platform == "cpu", _free_memory()
+    device_limit = None if on_host else (devices[0].memory_stats() or {}).get("bytes_limit")
+    if device_limit is not None and workers * program.working > device_limit:
+        raise MemoryError(
+            f"a chunk of {program.chunk:,} points needs {program.working / 1e9:.3g} GB on each device, and "
+            f"{workers} at a time do not fit into its {device_limit / 1e9:.3g} GB.\nFix: chunk={program.chunk // 4}."
+        )
+    kept = 0 if store is not None else axes.size * program.bytes_of_point
+    needed = kept + (workers * program.working if on_host else 0)
+    if free is not None and needed > FILL_AT_MOST * free:
+        raise MemoryError(
+            f"this sweep needs {needed / 1e9:.3g} GB: {axes.size:,} points of {program.bytes_of_point:,} bytes, and "
+            f"{workers} x {program.working / 1e9:.2g} GB of working memory. {free / 1e9:.3g} GB are free.\n"
+            "Usual cause: run returns whole trajectories, or a grid with one axis too many.\n"
+            'Fix: return less per point (a final state, a period), or store="directory"; or a smaller chunk=.'
+        )
+
+
+def _free_memory():
+    """The bytes available without swapping; None if the system does not report them."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    fields = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
+    return fields.get("MemAvailable")
+
+
+def _tell_interrupted(done, total, then):
+    warnings.warn(f"interrupted: {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
+
+
+def _meter(total, progress):
+    return meter(progress, total=total, unit=" points", unit_scale=True)

@@ -1,0 +1,1 @@
+"""What the user writes, how it is checked, and the prepared model of it."""

@@ -1,0 +1,196 @@
+"""A system prepared for states of one form: what is known of it before any value is, and its functions of vectors.
+
+A front door makes a `Model` once (`first_call.prepare`). Everything below takes the model and a state in vector form,
+(t, x, u), and does not ask again for the user's structure, the shapes of constraints or their number.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.jaxtools.cache import shape_of
+from lagjax.system import coordinates
+from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
+from lagjax.system.traced_functions import Traced
+
+
+class Residual(NamedTuple):
+    """The form of a constraint's residual, by its name; `of_positions`: whether it is holonomic."""
+
+    name: str
+    shape: tuple[int, ...]
+    of_positions: bool
+
+    @property
+    def size(self) -> int:
+        """How many equations it is."""
+        return self.shape[0] if self.shape else 1
+
+
+class Form(NamedTuple):
+    """The form of a system's states: structure and shapes of q, the dtype, and the residuals of the constraints."""
+
+    structure: Any
+    shapes: tuple[tuple[int, ...], ...]
+    dtype: np.dtype
+    residuals: tuple[Residual, ...]
+
+    def tree(self, x):
+        """A vector (..., n) in the structure of q."""
+        if len(self.shapes) == 1:
+            return jtu.tree_unflatten(self.structure, [x.reshape(x.shape[:-1] + self.shapes[0])])
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
+        leaves = [x[..., a:b].reshape(x.shape[:-1] + shape) for a, b, shape in zip(ends, ends[1:], self.shapes)]
+        return jtu.tree_unflatten(self.structure, leaves)
+
+
+class Model(eqx.Module):
+    """A system, or hybrid, with its parameters, for states of one form. n coordinates, m constraint equations."""
+
+    system: Any
+    params: PyTree
+    form: Form = eqx.field(static=True)
+
+    @property
+    def n(self) -> int:
+        """The number of coordinates."""
+        return sum(int(np.prod(shape)) for shape in self.form.shapes)
+
+    @property
+    def m(self) -> int:
+        """The number of constraint equations."""
+        return sum(residual.size for residual in self.form.residuals)
+
+    @property
+    def names(self) -> list[str]:
+        """The name of each coordinate, as the user would write it."""
+        return coordinates.names(self.tree(np.zeros(self.n)))
+
+    @property
+    def equation_names(self) -> list[str]:
+        """The name of each constraint equation, in the order in which they are stacked."""
+        places = lambda residual: [f"[{i}]" for i in range(residual.size)] if residual.shape else [""]
+        return [residual.name + place for residual in self.form.residuals for place in places(residual)]
+
+    @property
+    def holonomic(self) -> np.ndarray:
+        """Which of the stacked constraint equations restrict positions, (m,) booleans."""
+        return np.array([residual.of_positions for residual in self.form.residuals for _ in range(residual.size)], bool)
+
+    @property
+    def example(self) -> tuple:
+        """A state (t, q, v) of this form, to trace with."""
+        leaves = [jax.ShapeDtypeStruct(shape, self.form.dtype) for shape in ((), *self.form.shapes)]
+        q = jtu.tree_unflatten(self.form.structure, leaves[1:])
+        return leaves[0], q, q
+
+    @property
+    def phases(self) -> "tuple[Model, ...]":
+        """The model of each phase; the model itself where the system is no hybrid."""
+        if not self.system.in_phases:
+            return (self,)
+        return tuple(model_of(phase, *self.example, self.params) for phase in self.system.phases)
+
+    def tree(self, x):
+        """A vector (..., n) in the user's structure."""
+        return self.form.tree(x)
+
+    def vector(self, tree) -> Float[Array, " n"]:
+        """A position, velocity or force in the user's structure as a vector."""
+        return coordinates.flatten(tree)[0]
+
+    def vectors(self, q, v) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """A position and a velocity as vectors."""
+        return self.vector(q), self.vector(v)
+
+    def split(self, stacked: Float[Array, " m"]) -> dict[str, Array]:
+        """One array for each constraint, by name, from a vector over all constraint equations."""
+        parts, start = {}, 0
+        for residual in self.form.residuals:
+            parts[residual.name] = stacked[start : start + residual.size].reshape(residual.shape)
+            start += residual.size
+        return parts
+
+    def stacked(self, multipliers: dict[str, Array]) -> Float[Array, " m"]:
+        """A vector over all constraint equations, from one array for each constraint."""
+        parts = [jnp.ravel(multipliers[residual.name]) for residual in self.form.residuals]
+        return jnp.concatenate([jnp.zeros(0, self.form.dtype), *parts])
+
+    def zero_multipliers(self) -> dict[str, np.ndarray]:
+        """Zero multipliers of the right shapes, by name."""
+        return {residual.name: np.zeros(residual.shape, self.form.dtype) for residual in self.form.residuals}
+
+    def belongs_to(self, name: str) -> np.ndarray:
+        """Which of the stacked constraint equations belong to a constraint, (m,) booleans."""
+        return np.array([residual.name == name for residual in self.form.residuals for _ in range(residual.size)], bool)
+
+    def lagrangian(self, t, x, u) -> Float[Array, ""]:
+        """L."""
+        return self.system.lagrangian(t, self.tree(x), self.tree(u), self.params)
+
+    def dissipation(self, t, x, u) -> Float[Array, ""]:
+        """Rayleigh's function R."""
+        return self.system.dissipation(t, self.tree(x), self.tree(u), self.params)
+
+    def force(self, t, x, u, multipliers: Float[Array, " m"] | None = None) -> Float[Array, " n"]:
+        """The generalized force Q that L does not contain; without `multipliers`, for those of zero."""
+        return self.vector(self.force_at(t, self.tree(x), self.tree(u), multipliers)).astype(x.dtype)
+
+    def force_at(self, t, q, v, multipliers: Float[Array, " m"] | None = None):
+        """The same in the user's structure."""
+        force = self.system.force
+        if takes_of(force) != WITH_MULTIPLIERS:
+            return force(t, q, v, self.params)
+        stacked = jnp.zeros(self.m, self.form.dtype) if multipliers is None else multipliers
+        return force(t, q, v, self.split(stacked), self.params)
+
+    @property
+    def reacts(self) -> bool:
+        """Whether the force depends on multipliers."""
+        force = self.system.force
+        return force is not None and bool(self.m) and takes_of(force) == WITH_MULTIPLIERS
+
+    def of(self, params) -> "Model":
+        """The same system with other parameters."""
+        return unchecked(self.system, params, self.form)
+
+    def alone(self, name: str) -> "Model":
+        """The same with a single one of its constraints."""
+        residuals = tuple(residual for residual in self.form.residuals if residual.name == name)
+        system = eqx.tree_at(lambda s: s.constraints, self.system, {name: self.system.constraints[name]})
+        return unchecked(system, self.params, self.form._replace(residuals=residuals))
+
+    def mapped(self, change: Callable) -> "Model":
+        """The same with `change(function, role)` in place of each of the user's functions (`System.map`)."""
+        return unchecked(self.system.map(change), self.params, self.form)
+
+
+def model_of(system, t, q, v, params) -> Model:
+    """The model of a system for states like this one; nothing is checked, and no value is looked at."""
+    leaves, structure = jtu.tree_flatten(q)
+    residuals = () if system.in_phases else tuple(
+        Residual(name, _shape_of(c, t, q, v, params), c.of_positions) for name, c in system.constraints.items()
+    )  # fmt: skip
+    form = Form(structure, tuple(np.shape(x) for x in leaves), np.dtype(jnp.result_type(t)), residuals)
+    return unchecked(system, params, form)
+
+
+def _shape_of(constraint, *state):
+    # A traced function knows what it returns.
+    known = constraint.function
+    value = known.program.value if isinstance(known, Traced) else shape_of(constraint.residual, *state)
+    return tuple(jnp.shape(value))
+
+
+def unchecked(system, params, form) -> Model:
+    """A model of these parts: to make a module the usual way takes long."""
+    model = object.__new__(Model)
+    for name, x in (("system", system), ("params", params), ("form", form)):
+        object.__setattr__(model, name, x)
+    return model

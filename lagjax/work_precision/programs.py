@@ -1,0 +1,139 @@
+"""A solve by one method as a compiled program, and the time that calls take.
+
+The program takes tolerance, times and start as arguments, so one compilation serves a method at all tolerances. It is
+the program that a plain call of `integrate` runs, without the checks around it.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.integrate.integrate import integrate
+from lagjax.integrate.solve.backward_time import runs_backward
+from lagjax.integrate.solve.harvest import reporting
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.cache import parted
+from lagjax.jaxtools.compiling import compiler_options
+from lagjax.jaxtools.tracing import REGULAR_FIRST
+from lagjax.system.coordinates import State
+from lagjax.system.system import System
+
+# Seconds of measuring after which a call is not repeated; a single call that takes longer is timed twice, unless it is
+# very long.
+ENOUGH, VERY_LONG = 0.05, 0.2
+# A shorter call is made once before it is timed, since caches are cold after another program.
+SHORT = 0.02
+# Times below this fraction of the call of an empty program cannot be distinguished from zero.
+RESOLVED = 0.1
+
+
+class ComparedMotion(NamedTuple):
+    """The motion to integrate: `start` has the first time; `options` are those of `integrate`, including events."""
+
+    system: System
+    start: State
+    ts: np.ndarray
+    options: Mapping[str, Any]
+
+
+class TimedProgram:
+    """The trajectory of a motion by one method, as a function of (tolerance, ts, q, v); the number of times is fixed.
+
+    `compile_seconds` is the time of tracing and compiling. Like `integrate`, the program first assumes that the
+    equations are regular; if they turn out singular, the robust program is compiled, too, and used from then on.
+    """
+
+    def __init__(self, motion: ComparedMotion, method: Any):
+        self._motion, self._method = motion, method
+        self.compile_seconds = 0.0
+        self._compiled = self._compile(robust=False)
+
+    def __call__(self, tolerance, ts=None, q=None, v=None) -> Trajectory:
+        """Solve; by default from the motion's start, with outputs at its own times."""
+        args = self._arguments(tolerance, ts, q, v)
+        trajectory, regular = self._compiled(args)
+        if regular is not None and not bool(regular):
+            self._compiled = self._compile(robust=True)
+            trajectory, _ = self._compiled(args)
+        return jax.block_until_ready(trajectory)
+
+    def call(self, tolerance) -> Callable[[], Any]:
+        """The bare call, for timing; the caller has to wait for the result."""
+        args = self._arguments(tolerance)
+        return lambda: self._compiled(args)
+
+    def call_seconds(self) -> float:
+        """The least time of a call of an empty program with the same arguments and results."""
+        args = self._arguments(1e-3)
+        zeros = lambda args: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
+        idle = jax.jit(zeros).lower(args).compile()
+        return min(seconds_of(lambda: idle(args)) for _ in range(50))
+
+    def _arguments(self, tolerance, ts=None, q=None, v=None):
+        start = self._motion.start
+        ts = self._motion.ts if ts is None else ts
+        given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
+        return [jnp.asarray(x) for x in parted((*given, start.params))[1]]
+
+    def _compile(self, robust):
+        motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
+        static, _ = parted(given)
+
+        def solve(args):
+            tolerance, ts, q, v, params = static.together(args)
+            # Decreasing times must be known at compile time.
+            ts = motion.ts if runs_backward(motion.ts) else ts
+            return integrate(
+                motion.system, q, v, params, ts=ts, method=self._method, throw=False, rtol=tolerance, **motion.options
+            )
+
+        def program(args):
+            trajectory, _, regular = reporting(solve)(args)
+            return trajectory, regular
+
+        started = time.perf_counter()
+        with REGULAR_FIRST(not robust):
+            lowered = jax.jit(program, compiler_options=compiler_options()).lower(self._arguments(1e-3))
+        compiled = lowered.compile()
+        self.compile_seconds += time.perf_counter() - started
+        self._returned = lowered.out_info
+        return compiled
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    """The time of one call, until its result is ready."""
+    started = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - started
+
+
+class Times(NamedTuple):
+    """Seconds of a call: the median and the minimum."""
+
+    median: float
+    least: float
+
+
+def interleaved_times(calls: Sequence[Callable[[], Any]], first: Sequence[float], repeats: int) -> list[Times]:
+    """Times of calls made in turn, so that other load on the machine affects all of them equally.
+
+    `first` are the seconds of an earlier call of each; long ones are not called again.
+    """
+    turns: list[list[float]] = [[seconds] if seconds > ENOUGH else [] for seconds in first]
+    for _ in range(repeats):
+        for call, seconds in zip(calls, turns):
+            if sum(seconds) <= ENOUGH or len(seconds) == 1 and seconds[0] <= VERY_LONG:
+                if not seconds or seconds[-1] < SHORT:
+                    jax.block_until_ready(call())
+                seconds.append(seconds_of(call))
+    # The lower of two medians: disturbances only make a call longer.
+    return [Times(float(np.percentile(seconds, 50, method="lower")), min(seconds)) for seconds in turns]
+
+
+def without_overhead(seconds: float, call_seconds: float) -> float:
+    """The time of the solve itself: a measured time without the overhead of the call."""
+    return max(seconds - call_seconds, RESOLVED * call_seconds)

@@ -1,0 +1,183 @@
+"""The reference that errors are measured against, given or computed, and how far it can be trusted.
+
+A computed reference consists of two solves at the tightest tolerance by methods of different kinds. Their errors are
+unrelated, so the distance between them is the possible error of either. A given reference is checked, too: if solves at
+the tightest tolerances agree with each other, but all are far from it, the reference has that error.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax.integrate.trajectory.results import ended_well, message
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.numerics.methods.radau import Radau5
+from lagjax.system import coordinates
+from lagjax.work_precision import compared
+from lagjax.work_precision.compared import Compared, ComparedScales, ComparedStates
+from lagjax.work_precision.methods import TIGHTEST, usual
+from lagjax.work_precision.programs import ComparedMotion, TimedProgram
+
+# A given reference is wrong if it is this many times farther from solves than these are from each other.
+FARTHER = 10.0
+FIX_OF_FORM = "reference=traj, reference=(q, v) with each leaf at all ts, or reference=lambda ts: (q, v)"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference that errors are measured against.
+
+    - `how`: its origin, in words; `error`: its own possible relative error; 0 for a given one without contradiction.
+    - `agrees`: whether that error is small: below the square root of round-off.
+    """
+
+    how: str
+    error: float
+    agrees: bool
+
+    @property
+    def digits(self) -> int:
+        """The number of digits that can be trusted."""
+        return max(0, int(np.floor(-np.log10(self.error)))) if self.error > 0 else 16
+
+    def in_words(self) -> str:
+        """A description in one line."""
+        if self.error == 0:
+            return self.how
+        if not np.isfinite(self.error):
+            return f"{self.how}: NO digit can be trusted"
+        return f"{self.how} to {self.error:.1e}: {self.digits} digits can be trusted"
+
+
+class KnownAnswer:
+    """A reference answer: its states, their units, its origin, and its own error."""
+
+    def __init__(self, right: Compared, scales: ComparedScales, how: str, error: float, dtype):
+        self.right, self.scales, self.how, self.error, self._dtype = right, scales, how, error, dtype
+
+    def distance(self, found: Compared) -> float:
+        """The error of a computed motion."""
+        return self.scales.error(found, self.right)
+
+    def judged(self, tightest: list[Compared]) -> Reference:
+        """The reference, with its error estimated from solves at the tightest tolerances."""
+        error, how = self.error, self.how
+        if error == 0 and len(tightest) > 1:
+            one, other = tightest[:2]
+            apart = max(self.scales.error(one, other), float(np.finfo(self._dtype).eps))
+            off = min(self.distance(one), self.distance(other))
+            if not off <= FARTHER * apart:
+                how, error = f"{how}; solves that agree with each other to {apart:.0e} agree with it", off
+        return Reference(how, error, bool(error <= np.sqrt(np.finfo(self._dtype).eps)))
+
+
+def computed_reference(
+    motion: ComparedMotion, programs: Mapping[str, TimedProgram], solvers: Mapping[str, Any]
+) -> KnownAnswer:
+    """The reference that two methods of different kinds compute."""
+    dtype = motion.ts.dtype
+    kinds: dict[str, diffrax.AbstractSolver] = usual(motion.system, motion.start) | {"Radau5": Radau5()}
+    tolerance = TIGHTEST.get(dtype, 1e-2)
+    found, reasons, first = {}, [], None
+    for name, solver in kinds.items():
+        if len(found) == 2:
+            break
+        same = next((key for key, given in solvers.items() if type(given) is type(solver)), None)
+        program = TimedProgram(motion, solver) if same is None else programs[same]
+        first = program if first is None else first
+        trajectory = program(tolerance)
+        if bool(ended_well(trajectory.result)):
+            found[name] = compared.compared_of(trajectory, motion.options["events"])
+        else:
+            reasons.append(f"{name}: {message(trajectory.result)}")
+    if len(found) < 2 or first is None:
+        raise RuntimeError(
+            f"no two methods reached the end of this motion at {tolerance:.0e}, so there is no reference to compare "
+            f"with: {'; '.join(reasons)}\n"
+            "Usual cause: a start or parameters that cannot be integrated, a motion that ends in a singularity, or "
+            "stiffness.\n"
+            "Fix: look at lj.integrate(system, q0, v0, params, ts=ts), shorten ts, or give reference=."
+        )
+    (one, best), (two, other) = found.items()
+    scales = compared.scales_of(compared.states_during(motion, first), motion.ts)
+    apart = scales.error(best, other)
+    apart = apart if np.isfinite(apart) else float("inf")
+    how = f"{one} and {two} at {tolerance:.0e}, which agree"
+    # Even two solves that agree to the last digit have an error of one round-off.
+    return KnownAnswer(best, scales, how, max(apart, float(np.finfo(dtype).eps)), dtype)
+
+
+def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgram) -> KnownAnswer:
+    """A given reference; raise if it does not fit the motion."""
+    ts, dtype, events = motion.ts, motion.ts.dtype, motion.options["events"]
+    if isinstance(reference, Trajectory):
+        _check_trajectory(reference, motion)
+        right, how = compared.compared_of(reference, events), "the trajectory that was given"
+    else:
+        if events:
+            raise TypeError(
+                "with events the reference must be a lj.Trajectory, which has the times of events.\n"
+                "Fix: reference=lj.integrate(..., events=events, rtol=1e-13), or leave it out."
+            )
+        how = "the function that was given" if callable(reference) else "the states that were given"
+        states = reference(jnp.asarray(ts)) if callable(reference) else reference
+        right = compared.compared_of(ComparedStates(ts, *_as_states(states, motion), None), None)
+    if callable(reference) and not isinstance(reference, Trajectory):
+        samples = reference(jnp.linspace(ts[0], ts[-1], compared.SAMPLES, dtype=dtype))
+    else:
+        samples = compared.states_during(motion, program)
+    return KnownAnswer(right, compared.scales_of(samples, ts), how, 0.0, dtype)
+
+
+def _as_states(states, motion):
+    """(q, v) in the structure and shapes of the start, each leaf with an axis of times in front."""
+    if not (isinstance(states, (tuple, list)) and len(states) == 2):
+        raise TypeError(
+            f"the reference must give two things, coordinates and velocities, but gave {type(states).__name__}"
+            f"{f' of {len(states)}' if isinstance(states, (tuple, list)) else ''}.\nFix: {FIX_OF_FORM}."
+        )
+    count = len(motion.ts)
+    for which, tree, like in zip(("coordinates", "velocities"), states, motion.start[1:3]):
+        if jax.tree.structure(tree) != jax.tree.structure(like):
+            raise ValueError(
+                f"the reference's {which} are not in the structure of {'q0' if which == 'coordinates' else 'v0'}: "
+                f"{jax.tree.structure(tree)}, but {jax.tree.structure(like)} is needed.\n"
+                f"Usual cause: a vector instead of a dict, or another name.\nFix: {FIX_OF_FORM}."
+            )
+        for x, y, name in zip(jax.tree.leaves(tree), jax.tree.leaves(like), coordinates.names(like)):
+            if np.shape(x) != (count, *np.shape(y)):
+                raise ValueError(
+                    f"the reference's {which} have the shape {np.shape(x)} at '{name}', but {(count, *np.shape(y))} is "
+                    f"needed: a row for each of the {count} times.\n"
+                    f"Usual cause: the last state alone, or states at other times.\nFix: {FIX_OF_FORM}."
+                )
+    return states
+
+
+def _check_trajectory(reference, motion):
+    if reference.t.ndim != 1:
+        raise ValueError(
+            f"the reference is a batch of shape {reference.t.shape[:-1]}.\n"
+            "Fix: reference=jax.tree.map(lambda x: x[0], traj), one lane of it."
+        )
+    t, ts = np.asarray(reference.t), motion.ts
+    if t.shape != ts.shape or not np.allclose(t, ts, rtol=0, atol=8 * np.finfo(ts.dtype).eps * np.max(np.abs(ts))):
+        raise ValueError(
+            f"the reference has {len(t)} times from {t[0]:.6g} to {t[-1]:.6g}, but ts has {len(ts)} from {ts[0]:.6g} "
+            f"to {ts[-1]:.6g}.\nUsual cause: a trajectory with other outputs.\nFix: ts=traj.t."
+        )
+    if not bool(ended_well(reference.result)):
+        raise ValueError(
+            f"the reference did not reach its end: {message(reference.result)}\nFix: leave reference out, or repair it."
+        )
+    _as_states((reference.q, reference.v), motion)
+    missing = [name for name in motion.options["events"] or {} if name not in reference.events]
+    if missing:
+        raise ValueError(
+            f"the reference does not have the event {missing[0]!r}.\nFix: integrate it with events=events, too."
+        )

@@ -1,0 +1,319 @@
+"""Poincaré sections, periods and turning points against elliptic integrals, Kepler's law and effective potentials."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import lagjax as lj
+from lagjax.analysis import poincare
+from tests.systems import PARAMS, double_pendulum, pendulum
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+bottom = lambda t, q, v, p: q
+ALSO = {"turn": lj.turning_points()}
+
+
+def swing(q0, l, span=20.0):
+    """The pendulum from rest: its section at the bottom, and its turning points."""
+    params = {"g": PARAMS["g"], "l": l}
+    return lj.poincare(pendulum, q0, 0.0 * q0, params, section=bottom, ts=[0.0, span], events=ALSO, **TIGHT)
+
+
+def of_pendulum(q0, l):
+    """The period and its derivatives: T = 4 √(l/g) K(m), m = sin²(q0/2), dK/dm = (E - (1 - m) K) / (2 m (1 - m))."""
+    m, root = np.sin(q0 / 2) ** 2, np.sqrt(l / PARAMS["g"])
+    k, e = special.ellipk(m), special.ellipe(m)
+    slope = (e - (1 - m) * k) / (2 * m * (1 - m))
+    return 4 * root * k, 4 * root * slope * np.sin(q0) / 2, 2 * root * k / l
+
+
+# The pendulum.
+
+
+@pytest.mark.parametrize("q0", [0.5, 2.0, 3.0])
+def test_periods_of_the_pendulum(q0):
+    """Each period is the complete elliptic integral to 1e-9; twin: the period of small swings is off by more."""
+    section, exact = swing(q0, PARAMS["l"]), of_pendulum(q0, PARAMS["l"])[0]
+    count = int(section.count)
+    found = lj.periods(section)
+    assert count == int(20.0 / exact + 0.25) and found.shape == (499,)
+    np.testing.assert_allclose(found[: count - 1], exact, rtol=1e-9)
+    assert np.isnan(found[count - 1 :]).all()
+    assert abs(2 * np.pi * np.sqrt(PARAMS["l"] / PARAMS["g"]) / exact - 1) > 1e-2
+
+
+def test_states_at_the_bottom():
+    """At the bottom q is zero and v follows from the energy, ½ v² = (g/l) (1 - cos q0), from the third quarter on."""
+    found, period = swing(2.0, PARAMS["l"]).crossings.found(), of_pendulum(2.0, PARAMS["l"])[0]
+    np.testing.assert_allclose(found.q, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.v, np.sqrt(2 * PARAMS["g"] / PARAMS["l"] * (1 - np.cos(2.0))), rtol=1e-9)
+    np.testing.assert_allclose(found.t, period * (0.75 + np.arange(len(found.t))), rtol=1e-9)
+
+
+def test_turning_points_of_the_pendulum():
+    """Turning points are at the release and opposite, half a period apart; the release itself is not one."""
+    turns = swing(2.0, PARAMS["l"]).trajectory.events["turn"]
+    found = turns.found()
+    np.testing.assert_allclose(found.q, 2.0 * (-1.0) ** (1 + np.arange(len(found.t))), rtol=1e-9)
+    np.testing.assert_allclose(found.v, 0.0, atol=1e-13)
+    np.testing.assert_allclose(lj.periods(found), of_pendulum(2.0, PARAMS["l"])[0] / 2, rtol=1e-9)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_the_period():
+    """Derivatives of one period and of the mean period, by amplitude and length, forward and reverse."""
+
+    def period(x):
+        start = x[0], 0.0 * x[0], {"g": PARAMS["g"], "l": x[1]}
+        found = lj.periods(lj.poincare(pendulum, *start, section=bottom, ts=[0.0, 15.0], **TIGHT))
+        return jnp.stack([found[0], jnp.nanmean(found)])
+
+    x = jnp.array([2.5, PARAMS["l"]])
+    _, *slopes = of_pendulum(*x)
+    forward, (value, pull) = jax.jacfwd(period)(x), jax.vjp(period, x)
+    np.testing.assert_allclose(value, of_pendulum(*x)[0], rtol=1e-9)
+    for found in (forward[0], forward[1], pull(jnp.array([1.0, 0.0]))[0], pull(jnp.array([0.0, 1.0]))[0]):
+        np.testing.assert_allclose(found, slopes, rtol=1e-8)
+
+
+def by_hand(t):
+    """Crossings at these times."""
+    return lj.Crossings(t, t, t, {}, jnp.sum(jnp.isfinite(t)), jnp.asarray(False))
+
+
+def test_nothing_beyond_the_last_one_is_differentiated():
+    """Gradients of a sum of known periods are exact despite NaN times; twin: through a root of squares they are NaN."""
+    t = jnp.array([1.0, 2.5, 4.5, jnp.nan, jnp.nan])
+    total = lambda periods: jax.grad(lambda t: jnp.sum(periods(t)[:2]))(t)
+    np.testing.assert_array_equal(total(lambda t: lj.periods(by_hand(t))), [-1.0, 0.0, 1.0, 0.0, 0.0])
+    assert np.isnan(total(lambda t: jnp.sqrt(jnp.diff(t) ** 2))).any()
+    # A motion that runs backward has the same periods.
+    np.testing.assert_array_equal(lj.periods(by_hand(-t))[:2], [1.5, 2.0])
+    np.testing.assert_array_equal(jax.vmap(lambda t: lj.periods(by_hand(t)))(t[None])[0, :2], [1.5, 2.0])
+
+
+def test_what_is_printed():
+    """The print has counts, the mean period and its spread, the times' error and doubts; it also works while traced."""
+    section = swing(2.0, PARAMS["l"])
+    period = of_pendulum(2.0, PARAMS["l"])[0]
+    words = repr(section)
+    assert f"crossings   {int(section.count)}, at t = {0.75 * period:.9g}, " in words
+    assert f"period      {period:.9g} on average" in words and "standard deviation" in words
+    assert "uncertain   no" in words and "error       of the times at most" in words
+    jax.eval_shape(lambda q0: print(repr(swing(q0, 1.25))) or q0, 2.0)
+
+
+# Central motions.
+
+
+def central_lagrangian(t, q, v, p):
+    """A unit mass in a plane, attracted by -μ/r + ½ k r²."""
+    return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + p["mu"] / q["r"] - 0.5 * p["k"] * q["r"] ** 2
+
+
+central = lj.System(central_lagrangian)
+TURNS = {"turn": lj.turning_points("r"), "nearest": lj.turning_points("r", direction=1)}
+
+
+def radial(r, speed, mu, k, span):
+    """The radial turning points of a mass thrown at right angles from a distance r."""
+    start = {"r": r, "phi": 0.0 * r}, {"r": 0.0 * r, "phi": speed / r}
+    return lj.integrate(central, *start, {"mu": mu, "k": k}, ts=[0.0, span], events=TURNS, **TIGHT).events
+
+
+@pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (0.0, 0.75, 1.25), (1.25, 0.75, 0.5), (0.5, 0.25, 1.5)])
+def test_radial_turning_points(mu, k, speed):
+    """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
+    energy, h = 0.5 * speed**2 - mu + 0.5 * k, speed
+    roots = np.roots([0.5 * k, 0.0, -energy, -mu, 0.5 * h**2])
+    near, far = np.sort(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
+    found = radial(1.0, speed, mu, k, 30.0)
+    turns, nearest = found["turn"].found(), found["nearest"].found()
+    other = far if abs(near - 1) < 1e-9 else near
+    assert len(turns.t) > 2 and abs(far - near) > 0.1
+    np.testing.assert_allclose(turns.q["r"][0::2], other, rtol=1e-9)
+    np.testing.assert_allclose(turns.q["r"][1::2], 1.0, rtol=1e-9)
+    # Twin: with one direction there is only every second one, the nearest.
+    np.testing.assert_allclose(nearest.q["r"], near, rtol=1e-9)
+    np.testing.assert_array_equal(nearest.t, turns.t[int(other == far) :: 2][: len(nearest.t)])
+
+
+def kepler(speed, mu):
+    """T = 2π √(a³/μ), 1/a = 2/r - speed²/μ."""
+    return 2 * jnp.pi * (2 - speed**2 / mu) ** -1.5 / jnp.sqrt(mu)
+
+
+def test_radial_periods():
+    """Radial periods obey Kepler's third law, or are half a spring's period; twin: with both forces neither holds."""
+    period = lambda mu, k, speed: np.asarray(lj.periods(radial(1.0, speed, mu, k, 30.0)["nearest"]))[:2]
+    np.testing.assert_allclose(period(1.25, 0.0, 1.25), kepler(1.25, 1.25), rtol=1e-9)
+    np.testing.assert_allclose(period(0.0, 0.75, 1.25), np.pi / np.sqrt(0.75), rtol=1e-9)
+    assert np.all(abs(period(1.25, 0.75, 1.25) / [float(kepler(1.25, 1.25)), np.pi / np.sqrt(0.75)] - 1) > 0.05)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_keplers_period():
+    """Derivatives by the initial speed and by μ, forward and reverse."""
+    period = lambda x: lj.periods(radial(jnp.ones(()), x[0], x[1], 0.0, 30.0)["nearest"])[1]
+    x = jnp.array([1.25, 1.25])
+    exact = jax.grad(lambda x: kepler(*x))(x)
+    for mode in (jax.jacfwd, jax.grad):
+        np.testing.assert_allclose(mode(period)(x), exact, rtol=1e-7)
+
+
+# Sections of two degrees of freedom.
+
+
+def henon_heiles_lagrangian(t, q, v, p):
+    """Hénon & Heiles, U = ½ (x² + y²) + x² y - y³/3."""
+    x, y = q["x"], q["y"]
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (x**2 + y**2) - x**2 * y + y**3 / 3
+
+
+henon_heiles = lj.System(henon_heiles_lagrangian)
+ENERGY = 1 / 12
+KEPT = 12
+plane = lj.Crossing(lambda t, q, v, p: q["x"], direction=1, terminal=False, most=KEPT)
+back = {"back": lj.Crossing(lambda t, q, v, p: q["x"], direction=-1, terminal=False)}
+
+
+def orbit(y, span=70.0, **settings):
+    """A motion of the energy 1/12 from (0, y), thrown along x."""
+    vx = jnp.sqrt(2 * (ENERGY - y**2 / 2 + y**3 / 3))
+    start = {"x": 0.0 * y, "y": y}, {"x": vx, "y": 0.0 * y}
+    return lj.poincare(henon_heiles, *start, section=plane, ts=np.array([0.0, span]), events=back, **settings)
+
+
+@pytest.mark.slow
+def test_section_of_henon_and_heiles():
+    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points."""
+    section = orbit(0.125)
+    found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
+    assert len(found.t) == int(section.count) == 11
+    for crossed, sign in ((found, 1), (other, -1)):
+        np.testing.assert_allclose(crossed.q["x"], 0.0, atol=1e-14)
+        assert (sign * crossed.v["x"] > 0.1).all()
+        y, speed = crossed.q["y"], crossed.v["x"] ** 2 + crossed.v["y"] ** 2
+        np.testing.assert_allclose(0.5 * speed + y**2 / 2 - y**3 / 3, ENERGY, rtol=1e-8)
+    assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
+    # The kinetic energy of y varies, so that a wrong energy would be seen.
+    assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
+
+
+@pytest.mark.slow
+def test_more_than_there_is_room_for():
+    """Crossings that are not kept are warned of, printed and drawn; twin: no such note if there is room."""
+    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
+        section = orbit(0.125, span=120.0)
+    assert int(section.count) == 19 and np.isfinite(section.t).all() and section.t.shape == (KEPT,)
+    assert "19, of which the first 12 are kept" in repr(section)
+    assert "the first 12 of up to 19 crossings" in section.plot().get_suptitle()
+    room = orbit(0.125)
+    assert room.plot().get_suptitle() == "" and "kept" not in repr(room)
+    np.testing.assert_allclose(section.t[:11], room.t[:11], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_lanes():
+    """A batch equals a loop over its lanes, and prints and draws them."""
+    starts = jnp.array([0.125, -0.1, 0.2])
+    lanes = jax.jit(jax.vmap(lambda y: orbit(y, span=80.0)))(starts)
+    for i, y in enumerate(starts):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", lj.EventWarning)
+            alone = orbit(y, span=80.0)
+        assert int(lanes.count[i]) == int(alone.count)
+        for a, b in zip(jax.tree.leaves((lanes.t, lanes.q, lanes.v)), jax.tree.leaves((alone.t, alone.q, alone.v))):
+            np.testing.assert_allclose(a[i], b, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(lj.periods(lanes)[i], lj.periods(alone), rtol=1e-7)
+    words = repr(lanes)
+    assert "lanes       3" in words and f"{int(lanes.count.min())} to {int(lanes.count.max())} a lane" in words
+    (axis,) = lanes.plot().axes
+    assert len({line.get_color() for line in axis.lines}) == 3
+
+
+def test_pictures():
+    """One panel per coordinate that the section does not hold fixed, or the requested one."""
+    section = orbit(0.125)
+    (axis,) = section.plot().axes
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("q.y", "v.y")
+    found = section.crossings.found()
+    np.testing.assert_array_equal(axis.lines[0].get_xydata(), np.stack([found.q["y"], found.v["y"]], axis=1))
+    (axis,) = section.plot(x="t", y="q.x").axes
+    np.testing.assert_array_equal(axis.lines[0].get_xydata(), np.stack([found.t, found.q["x"]], axis=1))
+    with pytest.raises(ValueError, match="to plot 'q.z': there is none; there are t, q.x, q.y"):
+        section.plot(x="q.z", y="v.y")
+    with pytest.raises(ValueError, match="only one of them was given"):
+        section.plot(x="q.y")
+    with pytest.raises(ValueError, match="did not cross the section"):
+        orbit(0.125, span=1.0).plot()
+
+
+def test_angles_within_half_turns():
+    """Angles are shifted by whole turns, and ±π within round-off is one value; twin: one degree short of it is not."""
+    found = poincare._within_half_turns(np.array([7.0, -7.0, np.pi - 1e-9, np.pi + 1e-9, -np.pi, 3.1241]))
+    np.testing.assert_allclose(found, [7 - 2 * np.pi, 2 * np.pi - 7, -np.pi, -np.pi, -np.pi, 3.1241], atol=2e-9)
+
+
+def driven_lagrangian(t, q, v, p):
+    """A spring that a force drives."""
+    return 0.5 * v**2 - 0.5 * q**2 + p["force"] * q * jnp.cos(p["omega"] * t)
+
+
+def test_once_a_period_of_the_drive():
+    """The steady motion q = f cos(ωt) / (1 - ω²) is one point of the section; twin: with free motion added it moves."""
+    driven, f, omega = lj.System(driven_lagrangian), 0.5, 0.625
+    drive = lambda t, q, v, p: jnp.sin(p["omega"] * t)
+    run = lambda q0: lj.poincare(driven, q0, 0.0, {"force": f, "omega": omega}, section=drive, ts=[0.0, 62.0], **TIGHT)
+    steady, off = f / (1 - omega**2), 0.25
+    for q0 in (steady, steady + off):
+        found = run(q0).crossings.found()
+        t = 2 * np.pi / omega * (1 + np.arange(6))
+        np.testing.assert_allclose(found.t, t, rtol=1e-13)
+        np.testing.assert_allclose(found.q, steady + (q0 - steady) * np.cos(t), rtol=1e-9)
+        np.testing.assert_allclose(found.v, (steady - q0) * np.sin(t), atol=1e-9)
+    assert np.ptp(found.q) > off
+
+
+# Refused input.
+
+REFUSED = {
+    "no function": ({"section": 0.0}, TypeError, "a function of"),
+    "terminal": ({"section": lj.Crossing(bottom)}, ValueError, "ends the motion at its first crossing"),
+    "a vector": ({"section": lambda t, q, v, p: jnp.stack([q, v])}, ValueError, "event 'section' must return one"),
+    "the name": ({"section": bottom, "events": {"section": ALSO["turn"]}}, ValueError, "is named 'section'"),
+    "no events": ({"section": bottom, "events": [ALSO["turn"]]}, TypeError, "by name"),
+    "a coordinate": ({"section": bottom, "events": {"a": lj.turning_points("r")}}, ValueError, "of 'r': there is none"),
+}
+
+
+@pytest.mark.parametrize("given, error, words", REFUSED.values(), ids=REFUSED)
+def test_refused_in_words(given, error, words):
+    """Invalid sections are refused before anything is compiled."""
+    with pytest.raises(error, match=words) as raised:
+        lj.poincare(pendulum, 1.0, 0.0, PARAMS, ts=[0.0, 1.0], **given)
+    assert "Fix:" in str(raised.value)
+
+
+def test_refused_elsewhere():
+    """Refused: turning points without a name among several coordinates, periods of other things, unrecorded events."""
+    start = jnp.zeros(2), jnp.ones(2)
+    with pytest.raises(ValueError, match=r"There are q\[0\], q\[1\]") as raised:
+        events = {"turn": lj.turning_points()}
+        lj.integrate(
+            double_pendulum, *start, dict.fromkeys(("m1", "m2", "l1", "l2", "g"), 1.0), ts=[0.0, 1.0], events=events
+        )
+    assert 'lj.turning_points("q[0]")' in str(raised.value)
+    with pytest.raises(TypeError, match="by its name, not as int"):
+        lj.turning_points(0)
+    section = swing(2.0, PARAMS["l"])
+    with pytest.raises(TypeError, match="not from a Trajectory"):
+        lj.periods(section.trajectory)
+    with pytest.raises(ValueError, match="only one crossing was kept"):
+        lj.periods(by_hand(jnp.ones(1)))
+    with pytest.raises(ValueError, match="no event 'top'; recorded: 'section', 'turn'"):
+        lj.PoincareSection(section.trajectory, "top")

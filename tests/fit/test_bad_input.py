@@ -1,0 +1,93 @@
+"""Wrong records, names and guesses raise errors in the user's words."""
+
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.fit.cases import HUNG, PENDULUM, hung, pendulum
+
+T = np.linspace(0.0, 1.0, 20)
+Q = np.cos(T)
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: lj.Record(T[::-1], q=Q), "must increase, but t"),
+        (lambda: lj.Record(np.where(T > 0.5, np.nan, T), q=Q), "NaN"),
+        (lambda: lj.Record(T, q=Q[:-1]), r"shape \(19,\), but the record has 20 times"),
+        (lambda: lj.Record(T, q={"theta": Q[None]}), "'theta' has the shape"),
+        (lambda: lj.Record(T, q=np.where(T > 0.5, np.inf, Q)), "infinity"),
+        (lambda: lj.Record(T), "no measurement"),
+        (lambda: lj.Record([0.0], q=[1.0]), "two or more"),
+        (lambda: lj.Record(T, q=Q, hold_v=True), "v0 is known, but it is not given"),
+        (lambda: lj.Record(T, q={"theta": Q}, hold_q="theta"), "q0 is known"),
+    ],
+)
+def test_records(make, words):
+    """A record that makes no sense raises an error that says why."""
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+RECORD = lj.Record(T, q=Q)
+
+
+@pytest.mark.parametrize(
+    "arguments, error, words",
+    [
+        ((RECORD, PENDULUM, {"free": "length"}), ValueError, "free names 'length'.*'l'"),
+        ((RECORD, PENDULUM, {"free": "l[0]"}), ValueError, r"free names 'l\[0\]'.*elements as 'm\[1\]'"),
+        ((lj.Record(T, q=np.nan * Q), PENDULUM, {}), ValueError, "all measurements are NaN"),
+        ((RECORD, PENDULUM | {"m": 1}, {"free": "m"}), ValueError, "whole number"),
+        ((RECORD, PENDULUM, {"bounds": {"l": (2.0, None)}}), ValueError, "'l' starts at 1.25.*inside its bounds"),
+        ((RECORD, PENDULUM, {"bounds": {"l": 2.0}}), ValueError, "must be a pair"),
+        ((RECORD, PENDULUM, {"priors": {"l": (1.0, 0.1)}}), ValueError, "prior must be weighed.*sigma"),
+        ((RECORD, PENDULUM, {"loss": "huber"}), ValueError, "how large an ordinary error is"),
+        ((RECORD, PENDULUM, {"loss": "cubic"}), ValueError, "'squares'"),
+        ((RECORD, PENDULUM, {"observe": lambda t, q, v, params: q}), ValueError, "belong together"),
+        ((RECORD, PENDULUM, {"ts": T}), ValueError, "'ts' cannot be given"),
+        ((RECORD, PENDULUM, {"optimiser": "adam"}), TypeError, "optax.adam"),
+        ((RECORD, PENDULUM, {"window": 0.01}), ValueError, "shorter than two intervals"),
+        ((Q, PENDULUM, {}), TypeError, "lj.Record"),
+        ((lj.Record(T, q={"theta": Q}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "was measured as"),
+        ((lj.Record(T, v=Q), PENDULUM, {}), ValueError, "no guess of its start"),
+        ((lj.Record(T, q=Q, v=Q), PENDULUM, {}), ValueError, "several kinds.*sigma"),
+        ((lj.Record(T, q=Q, sigma={"v": 0.1}), PENDULUM, {}), ValueError, "sigma has no entry 'q'"),
+        ((lj.Record(T, q=Q, sigma=-1.0), PENDULUM, {}), ValueError, "sigma must be positive"),
+        ((lj.Record(T, q=Q, params={"mass": 2.0}), PENDULUM, {}), ValueError, "'mass', which is not in params"),
+        ((lj.Record(T, q=Q, params={"m": 2.0}), PENDULUM, {}), ValueError, "which the fit is to find"),
+        ((lj.Record(T, end={"t": 1.0}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "event"),
+        (([RECORD, lj.Record(T, v=Q)], PENDULUM, {}), ValueError, "record 1 holds 'v'"),
+        (([RECORD, lj.Record(T, q=Q, sigma=1.0)], PENDULUM, {}), ValueError, "record 0 has no sigma"),
+    ],
+)
+def test_arguments(arguments, error, words):
+    """Arguments that do not match are named before anything is compiled."""
+    records, params, options = arguments
+    with pytest.raises(error, match="(?s)" + words):
+        lj.fit(pendulum, records, params, **options)
+
+
+def test_wrong_names_of_coordinates_and_constraints():
+    """Measurements of names that the motion does not have are refused."""
+    start = dict(q0={"x": 2.0, "y": 0.0}, v0={"x": 0.0, "y": 0.0})
+    for measured in ({"q": {"z": Q}}, {"multipliers": {"rope": Q}}):
+        with pytest.raises(ValueError, match="but the motion has no such name"):
+            lj.fit(hung, lj.Record(T, **measured, **start), HUNG)
+
+
+@pytest.mark.slow
+def test_a_guess_that_cannot_move():
+    """A guess from which the motion fails at once gives an error with the message of `integrate`."""
+    with pytest.raises(ValueError, match="(?s)from the guess the motion of record 0 fails.*mass matrix"):
+        lj.fit(pendulum, RECORD, PENDULUM | {"l": 0.0}, free="g")
+
+
+@pytest.mark.slow
+def test_wrapped_angles():
+    """An angle that jumps by a turn gives a warning."""
+    angle = np.linspace(0.0, 9.0, 60)
+    wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
+    with pytest.warns(lj.FitWarning, match="np.unwrap"):
+        lj.identifiability(pendulum, lj.Record(np.linspace(0.0, 1.0, 60), q=wrapped), PENDULUM, free="g")

@@ -1,0 +1,509 @@
+"""What a fit finds, and what it says about what it cannot find."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.optimize import least_squares
+
+import lagjax as lj
+from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit.problem.initial_states import _parabola
+from lagjax.fit.problem.residuals import WHOLE, _counts, equations
+from lagjax.fit.result.warnings import caveats
+from lagjax.fit.search import search
+from lagjax.fit.search.search import linearised
+from lagjax.numerics.windowed_least_squares import Unknowns
+from lagjax.scenes import rolling_hoop
+from tests.counting import compiles
+from tests.fit.cases import CASES, HUNG, PENDULUM, hung, pendulum, swing
+from tests.tiers import exhaustive_but
+
+TS = np.linspace(0.0, 5.0, 100)
+GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
+FREE = ["c", "l"]
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """A pendulum's angle and rate at `TS`."""
+    traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
+    return np.asarray(traj.q), np.asarray(traj.v)
+
+
+def noisy(x, sigma=0.01, seed=0):
+    """Values with normal errors."""
+    return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
+
+
+def test_finds_parameters_and_start(swinging, capsys):
+    """Without errors or a guess of the start: parameters and start to 1e-8. The fit shows its steps."""
+    record = lj.Record(TS, q=swinging[0])
+    found = lj.fit(pendulum, record, GUESS, free=FREE, progress=True)
+    shown = capsys.readouterr().err
+    assert f"{int(found.steps)} steps" in shown and "stage 3 of 3, cost" in shown
+    assert bool(found.converged) and found.names == ("c", "l")
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    np.testing.assert_allclose([found.q0[0], found.v0[0]], [1.0, 0.0], atol=1e-8)
+    assert found.params["l"] == found.values[1] and found.params["m"] == 1.0
+    # Twin: another friction law does not fit.
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
+        stuck = lj.fit(pendulum, record, GUESS | {"c": 0.2}, free=["l"], bounds={"l": (0.0, None)})
+    assert stuck.rms()["q"] > 1e-2 and not capsys.readouterr().err
+
+
+@pytest.mark.exhaustive
+def test_against_scipy(swinging):
+    """Estimates and covariance agree with SciPy's least squares with numerical slopes."""
+    data = noisy(swinging[0])
+    found = lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, bounds={"l": (0.0, None)})
+    solve = jax.jit(
+        lambda x: lj.integrate(pendulum, x[2], x[3], PENDULUM | {"c": x[0], "l": x[1]}, ts=TS, throw=False).q
+    )
+    theirs = least_squares(
+        lambda x: (np.asarray(solve(x)) - data) / 0.01, [0.1, 1.3, 1.0, 0.0], x_scale=[0.1, 1, 1, 1], xtol=1e-12,
+        ftol=1e-12,
+    )  # fmt: skip
+    ours = np.array([*found.values, found.q0[0], found.v0[0]])
+    np.testing.assert_allclose(ours, theirs.x, atol=1e-6)
+    covariance = np.linalg.inv(theirs.jac.T @ theirs.jac)
+    np.testing.assert_allclose(found.covariance, covariance[:2, :2], rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(float(found.start_sd[0][0]), np.sqrt(covariance[2, 2]), rtol=1e-3)
+    np.testing.assert_allclose(found.chi2, 2 * theirs.cost, rtol=1e-8)
+    assert abs(float(found.correlation[0, 1])) < 1 and float(found.correlation[1, 1]) == pytest.approx(1)
+    assert int(found.freedom) == 96
+    # Without sigma, errors estimated from the residuals give nearly the same.
+    alone = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, bounds={"l": (0.0, None)})
+    np.testing.assert_allclose(alone.values, found.values, rtol=1e-6)
+    np.testing.assert_allclose(float(alone.noise), np.sqrt(float(found.chi2) / 96) * 0.01, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_gaps_and_several_runs(swinging):
+    """Only missing values are left out; another run may have its own start, length and mass."""
+    angle = swinging[0].copy()
+    angle[10:20] = np.nan
+    other = lj.integrate(pendulum, -0.4, 1.0, PENDULUM | {"m": 2.0}, ts=TS[:60])
+    records = [lj.Record(TS, q=angle), lj.Record(TS[:60], q=np.asarray(other.q), params={"m": 2.0})]
+    found = lj.fit(pendulum, records, GUESS, free=FREE)
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    np.testing.assert_allclose(np.array(found.q0), [1.0, -0.4], atol=1e-8)
+    assert int(found.freedom) == 90 + 60 - 6
+    residuals = found.residuals(0)["q"]
+    assert residuals.shape == (100,) and np.isnan(residuals[10:20]).all() and np.isfinite(residuals).sum() == 90
+    assert "record 1" in repr(found)
+    # Twin: with the other run's mass forgotten it does not fit.
+    wrong = lj.fit(pendulum, [records[0], lj.Record(TS[:60], q=np.asarray(other.q))], GUESS, free=FREE)
+    assert wrong.rms()["q"] > 1e-3
+
+
+@pytest.mark.exhaustive
+def test_identifiability_before_and_after(swinging):
+    """A swing determines g/l and c/(m l²); what is not determined gets no uncertainty."""
+    record = lj.Record(TS, q=noisy(swinging[0]))
+    told = lj.identifiability(pendulum, record, PENDULUM)
+    assert told.rank == 2 and told.combined()[0] == "g/l"
+    assert "g/l" in repr(told)
+    with pytest.warns(lj.FitWarning, match="do not determine"):
+        found = lj.fit(pendulum, record, PENDULUM)
+    assert np.isnan(found.sd).all() and np.isfinite(found.start_sd[0][0])
+    assert "not determined" in repr(found)
+    np.testing.assert_allclose(found.values[1] / found.values[2], 9.81 / 1.25, rtol=0.01)
+    # Twin: with l known, g and c are determined; m and c only as a ratio.
+    assert lj.identifiability(pendulum, record, PENDULUM, free=["g", "c"]).rank == 2
+    assert lj.identifiability(pendulum, record, PENDULUM, free=["m", "c"]).combined() == ["c/m"]
+    # The scale of L is not determined: all but one common factor.
+    scaled = lambda t, q, v, p: 0.5 * p["inertia"] * v**2 + p["weight"] * jnp.cos(q)
+    rubbed = lj.System(scaled, dissipation=lambda t, q, v, p: 0.5 * p["drag"] * v**2)
+    told = lj.identifiability(rubbed, record, {"inertia": 1.0, "weight": 8.0, "drag": 0.1})
+    assert "one common factor of all" in repr(told)
+    # A parameter that L does not contain.
+    more = PENDULUM | {"colour": 3.0}
+    assert lj.identifiability(pendulum, record, more, free=["g", "colour"]).unseen() == ["colour"]
+
+
+@pytest.mark.exhaustive
+def test_a_measured_force_shows_the_mass():
+    """A motion does not determine the scale of L, but a multiplier does."""
+    case = CASES["pendulum on a rod"]
+    traj = case.truth()
+    record = lambda **measured: lj.Record(
+        case.ts, **measured, q0=case.q0, v0=case.v0, sigma={"q": 0.01, "multipliers": 0.1}
+    )
+    free = ["g", "l", "m"]
+    assert lj.identifiability(hung, record(q=traj.q), HUNG, free=free).unseen() == ["m"]
+    assert lj.identifiability(hung, record(q=traj.q, multipliers=traj.multipliers), HUNG, free=free).rank == 3
+
+
+@pytest.mark.exhaustive
+def test_a_start_on_constraints_is_as_uncertain_as_they_are():
+    """A bob released at the rod's side is as uncertain as the rod's length; the angle gives exactly the same."""
+    case = CASES["pendulum on a rod"]
+    data = case.noisy({"q": case.truth().q}, jax.random.key(1))["q"]
+    # Only a guess of y is given, which is off the rod.
+    record = lj.Record(case.ts, q={"x": data["x"]}, q0={"x": 1.9, "y": 0.1}, sigma=0.02)
+    found = lj.fit(hung, record, HUNG | {"l": 2.1}, free=["g", "l"])
+    (q_sd,), (v_sd,) = found.start_sd
+    x = lambda t, q, v, params: params["l"] * jnp.sin(q)
+    swung = lj.Record(case.ts, observed=data["x"], q0=1.4, v0=0.0, sigma=0.02)
+    angle = lj.fit(lj.System(swing), swung, {"m": 1.5, "g": 9.81, "l": 2.1}, free=["g", "l"], observe=x)
+    np.testing.assert_allclose(found.values, angle.values, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance, angle.covariance, rtol=1e-3, atol=1e-9)
+    of = angle.evaluation.covariance
+    joint = np.block([[of.shared, of.local_shared[0].T], [of.local_shared[0], of.local[0]]])
+    state = lambda l, q, v: jnp.stack([l * jnp.sin(q), -l * jnp.cos(q), l * jnp.cos(q) * v, l * jnp.sin(q) * v])
+    slope = jnp.stack(jax.jacfwd(state, (0, 1, 2))(angle.values[1], angle.q0[0], angle.v0[0]), axis=1)
+    slope = np.concatenate([np.zeros((4, 1)), slope], axis=1)
+    expected = np.sqrt(np.diag(slope @ joint @ slope.T))
+    np.testing.assert_allclose([q_sd["x"], q_sd["y"], v_sd["x"], v_sd["y"]], expected, rtol=1e-2)
+    # Twin: if the length were known, so would be the distance.
+    slope[:, 1] = 0
+    assert np.sqrt(slope[0] @ joint @ slope[0]) < 0.2 * expected[0]
+
+
+@pytest.mark.slow
+def test_a_start_that_the_data_do_not_see():
+    """The start of an unmeasured, uncoupled coordinate is not determined; without a guess of it the fit is refused."""
+    both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2
+    ts = np.linspace(0.0, 4.0, 60)
+    record = lj.Record(ts, q={"a": np.cos(2 * ts)}, q0={"a": 1.0, "b": 0.5})
+    found = lj.fit(lj.System(both), record, {"k": 3.0})
+    np.testing.assert_allclose(found.values, [4.0], rtol=1e-8)
+    assert np.isnan(found.start_sd[0][0]["b"]) and np.isfinite(found.start_sd[0][0]["a"])
+    assert "b(0)    0.5 (not determined)" in repr(found)
+    with pytest.raises(ValueError, match="(?s)asks for 'b'.*start of record 0 was read off what it measures, 'a'"):
+        lj.fit(lj.System(both), lj.Record(ts, q={"a": np.cos(2 * ts)}), {"k": 3.0})
+
+
+class Springs(NamedTuple):
+    """Parameters that are not a dictionary."""
+
+    m: Any
+    walls: dict
+
+
+springs = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p.m * v**2) - 0.5 * jnp.sum(p.walls["k"] * q**2))
+SPRINGS = Springs(jnp.array([1.0, 2.0]), {"k": jnp.array([3.0, 5.0])})
+
+
+@pytest.mark.exhaustive
+def test_elements_of_any_pytree():
+    """One entry of an array is fitted, the others stay; bounds by element; a run with its own parameters."""
+    ts = np.linspace(0.0, 4.0, 60)
+    heavy = SPRINGS._replace(m=jnp.array([1.5, 2.0]))
+    runs = [lj.integrate(springs, jnp.ones(2), jnp.zeros(2), p, ts=ts).q for p in (SPRINGS, heavy)]
+    records = [lj.Record(ts, q=runs[0]), lj.Record(ts, q=runs[1], params={"m": heavy.m})]
+    guess = SPRINGS._replace(walls={"k": jnp.array([3.0, 4.0])})
+    found = lj.fit(springs, records, guess, free="walls.k[1]", bounds={"walls.k[1]": (0.0, None)})
+    assert found.names == ("walls.k[1]",)
+    np.testing.assert_allclose(found.params.walls["k"], [3.0, 5.0], rtol=1e-8)
+    np.testing.assert_array_equal(found.params.m, SPRINGS.m)
+
+
+@pytest.mark.exhaustive
+def test_what_the_residuals_tell():
+    """As many unknowns as measurements leave no uncertainty; residuals on a curve are not measurement errors."""
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
+    with pytest.warns(lj.FitWarning, match="as many unknowns as measurements.*\n.*sigma="):
+        found = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6]), {"k": 1.0})
+    assert np.isnan(found.sd).all() and np.isnan(found.start_sd[0][0])
+    # Twin: the same with the size of the errors given.
+    told = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6], sigma=0.01), {"k": 1.0})
+    assert np.isfinite(told.sd).all()
+    clean = lj.integrate(spring, 1.0, 0.0, {"k": 4.0}, ts=TS).q
+    data = noisy(np.asarray(clean) + 0.3 * np.cos(9 * TS), 0.02)
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
+        lj.fit(spring, lj.Record(TS, q=data), {"k": 3.0})
+    # Twin: residuals as large, but uncorrelated.
+    lj.fit(spring, lj.Record(TS, q=noisy(np.asarray(clean), 0.25)), {"k": 3.0})
+
+
+@pytest.mark.exhaustive
+def test_observation_velocity_and_end():
+    """Fits to observed positions, to velocities and to a time of departure find what these determine."""
+    measured = lambda t, q, v, params: {"x": params["l"] * jnp.sin(q), "y": -params["l"] * jnp.cos(q)}
+    traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
+    seen = jax.vmap(lambda t, q, v: measured(t, q, v, PENDULUM))(traj.t, traj.q, traj.v)
+    record = lj.Record(TS, observed=seen, q0=0.9, v0=0.1)
+    found = lj.fit(pendulum, record, GUESS, free=["c", "g", "l"], observe=measured)
+    np.testing.assert_allclose(found.values, [0.05, 9.81, 1.25], rtol=1e-8)
+    record = lj.Record(TS, v=traj.v, q0=0.9, v0=0.0, hold_v=True)
+    found = lj.fit(pendulum, record, GUESS, free=FREE)
+    np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    assert float(found.v0[0]) == 0.0 and float(found.start_sd[1][0]) == 0.0
+
+    q0, v0 = rolling_hoop.start(rolling_hoop.PARAMS, 1.3)
+    until = np.array([0.0, 3.0])
+    left = lj.integrate(rolling_hoop.system, q0, v0, rolling_hoop.PARAMS, ts=until, events=rolling_hoop.DEPARTURE)
+    record = lj.Record(until, end={"t": left.end.t}, q0=q0, v0=v0, hold_q=True, hold_v=True, sigma=1e-3)
+    guess = rolling_hoop.PARAMS | {"g": 8.0}
+    found = lj.fit(rolling_hoop.system, record, guess, free="g", events=rolling_hoop.DEPARTURE)
+    np.testing.assert_allclose(found.values, [rolling_hoop.PARAMS["g"]], rtol=1e-8)
+    # The time scales as 1/sqrt(g): its slope is -t/2g, and so is the uncertainty.
+    np.testing.assert_allclose(found.sd, 1e-3 * 2 * rolling_hoop.PARAMS["g"] / float(left.end.t), rtol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_a_long_record_wants_a_growing_horizon():
+    """A fit of 27 periods at once ends in a wrong minimum; growing parts, joined windows and many starts do not."""
+    ts = np.linspace(0.0, 60.0, 1500)
+    known = PENDULUM | {"c": 0.01}
+    truth = lj.integrate(pendulum, 1.0, 0.0, known, ts=ts)
+    record = lj.Record(ts, q=noisy(np.asarray(truth.q)))
+    fit = lambda guess, **more: lj.fit(pendulum, record, known | {"l": guess}, free="l", **more)
+    found = fit(0.9)
+    np.testing.assert_allclose(found.values, [1.25], rtol=1e-3)
+    joined = fit(0.9, window=5.0)
+    np.testing.assert_allclose(joined.values, found.values, rtol=1e-5)
+    np.testing.assert_allclose(joined.sd, found.sd, rtol=0.02)
+    assert joined.freedom == found.freedom
+    apart = fit(0.9, window=5.0, joined=False)
+    np.testing.assert_allclose(apart.values, [1.25], rtol=0.01)
+    assert float(apart.sd[0]) > 2 * float(found.sd[0])
+    # Twin: at once and without restarts the search fails.
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
+        lost = fit(0.9, grow=False, restarts=0)
+    assert lost.rms()["q"] > 0.1
+    # Many starts succeed.
+    best = fit(1.15, grow=False, restarts=30, spread=0.3)
+    np.testing.assert_allclose(best.values, found.values, rtol=1e-5)
+    assert best.costs is not None and len(best.costs) == 31
+    assert int(np.sum(best.costs > 2 * best.cost)) > 5
+
+
+@pytest.mark.exhaustive
+def test_outliers_priors_and_bounds(swinging):
+    """A robust loss tolerates outliers; a prior counts as a measurement; a reached bound is named."""
+    data = noisy(swinging[0])
+    wild = data.copy()
+    wild[::10] += 1.5
+    record = lambda x: lj.Record(TS, q=x, q0=1.0, v0=0.0, sigma=0.01)
+    fit = lambda x, **more: lj.fit(pendulum, record(x), GUESS, free=FREE, **more)
+    clean, robust = fit(data), fit(wild, loss="cauchy")
+    with pytest.warns(lj.FitWarning, match="times as large as sigma says"):
+        plain = fit(wild)
+    off = lambda found: np.max(np.abs(found.values - clean.values) / clean.sd)
+    assert off(plain) > 10 and off(robust) < 2
+    assert np.all(robust.sd > clean.sd) and np.all(robust.sd < 2 * clean.sd)
+    astray = eqx.tree_at(lambda found: found.unknowns.shared, clean, jnp.array([0.05, 1e9]))
+    assert "'l' was guessed to be 1.4, and ended at 1e+09" in caveats(astray)[0] and not caveats(clean)
+
+    known = fit(data, priors={"l": (1.248, 0.0005)})
+    weights = np.array([1 / clean.sd[1] ** 2, 1 / 0.0005**2])
+    expected = np.average([clean.values[1], 1.248], weights=weights)
+    assert float(known.values[1]) == pytest.approx(expected, abs=2e-5)
+    assert abs(float(clean.values[1]) - expected) > 2e-4
+    assert float(known.sd[1]) < 0.0005
+    with pytest.warns(lj.FitWarning) as told:
+        held = fit(data, bounds={"l": (1.3, 2.0)})
+    assert any("'l' ended at a bound" in str(warning.message) for warning in told)
+    assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
+
+
+@pytest.mark.exhaustive
+def test_outliers_from_far(swinging, monkeypatch):
+    """With outliers, even as the first value, a robust loss still gets from a bad guess to the truth."""
+    rng = np.random.default_rng(2)
+    wild = swinging[0] + 0.002 * rng.normal(size=100)
+    wild[::7] += rng.normal(size=15)
+    guess, start = GUESS | {"l": 1.9}, {"q0": 0.3, "v0": 2.0}
+    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=wild, sigma=0.002, **start), guess, free=FREE, **more)
+    found = fit(loss="cauchy")
+    assert bool(found.converged) and np.max(found.sd) < 1e-3 and abs(float(found.q0[0]) - 1.0) < 0.005
+    np.testing.assert_allclose(found.values, [0.05, 1.25], atol=3 * np.max(found.sd))
+    # Without a guess of the start, it is not read off the outlier.
+    start.clear()
+    np.testing.assert_allclose(fit(loss="huber").values, [0.05, 1.25], atol=4 * np.max(found.sd))
+    # Twin: with an ordinary error of one sigma from the beginning, all data look like outliers.
+    start.update({"q0": 0.3, "v0": 2.0})
+    monkeypatch.setattr(search, "_ordinary", lambda *state: 1.0)
+    with pytest.warns(lj.FitWarning) as told:
+        # Another number of iterations makes it trace again.
+        astray = fit(loss="cauchy", iterations=99, restarts=0)
+    assert any("times as large as sigma says" in str(warning.message) for warning in told)
+    assert not np.allclose(astray.values, found.values, atol=0.1)
+
+
+@pytest.mark.parametrize("wild", [0, 3, 6])
+def test_a_start_is_read_off_without_wild_values(wild):
+    """An outlier among the first seven samples hardly changes the position and velocity that are read off."""
+    t = 0.05 * np.arange(40.0)
+    x = 1.0 + 0.5 * t - 2.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=40)
+    x[wild] += 3.0
+    q, v = _parabola(t, x, np.arange(40))
+    assert abs(q - 1.0) < 0.01 and abs(v - 0.5) < 0.1
+    # Twin: least squares follow the outlier; a parabola through samples far apart keeps them all.
+    near = np.polynomial.Polynomial.fit(t[:7], x[:7], 2)
+    assert abs(near(0.0) - 1.0) > 0.1 or abs(near.deriv()(0.0) - 0.5) > 1.0
+    t, far = np.arange(7.0), np.cos(0.8 * np.arange(7.0))
+    near = np.polynomial.Polynomial.fit(t, far, 2)
+    np.testing.assert_allclose(_parabola(t, far, np.arange(7))[0], near(0.0))
+
+
+def problem(case, measured, **options):
+    """The arrays of a fit."""
+    record = lj.Record(case.ts, **measured, q0=case.q0, v0=case.v0, sigma=case.sigma)
+    return problem_of(case.system, record, case.guess(), sorted(case.free), None, None, None, "squares", None, options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", exhaustive_but(("pendulum",), ("pendulum", "pendulum on a rod", "rolling hoop")))
+def test_slopes_three_ways(name):
+    """Slopes of all residuals, including measured multipliers: forward, reverse, and by differences.
+
+    The steps do not depend on the varied unknowns, so the differenced function is smooth. For times of events, see the
+    rolling hoop.
+    """
+    case = CASES[name]
+    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(0.01)}
+    p = problem(case, case.measured(case.truth()), **fixed)
+    u = p.start
+    flat, back = ravel_pytree(u)
+    slopes = linearised(p, u, WHOLE, "squares").slopes
+    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_local[0]], axis=1)
+    rows = lambda x: equations(p, back(x), WHOLE).rows[0]
+    direction = np.random.default_rng(0).normal(size=forward.shape[0])
+    pulled = jax.jit(jax.grad(lambda x: direction @ rows(x)))(flat)
+    np.testing.assert_allclose(pulled, direction @ forward, rtol=1e-9, atol=1e-9 * np.max(np.abs(direction @ forward)))
+    at = jax.jit(rows)
+    for i in range(len(flat)):
+        step = np.zeros(len(flat))
+        step[i] = 1e-3 * max(abs(float(flat[i])), 0.1)
+        two = lambda h: (np.asarray(at(flat + h * step)) - np.asarray(at(flat - h * step))) / (2 * h * step[i])
+        difference = (4 * two(0.5) - two(1.0)) / 3
+        scale = max(np.max(np.abs(forward[:, i])), 1e-3 * np.max(np.abs(forward)))
+        np.testing.assert_allclose(difference, forward[:, i], atol=1e-7 * scale, rtol=0)
+
+
+@pytest.mark.slow
+def test_inside_a_program(swinging):
+    """Fits of many measurements in one program give the same as one by one."""
+    data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])
+
+    def estimate(x):
+        return lj.fit(pendulum, lj.Record(TS, q=x, q0=1.0, v0=0.0), GUESS, free=FREE).values
+
+    together = jax.jit(jax.vmap(estimate))(data)
+    np.testing.assert_allclose(together[1], estimate(data[1]), rtol=1e-7)
+    assert np.ptp(np.asarray(together)[:, 1]) > 1e-5
+
+
+@pytest.mark.exhaustive
+def test_other_optimisers(swinging):
+    """Another least-squares solver, and minimisers with reverse-mode derivatives, end at the same point."""
+    data = noisy(swinging[0])
+    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
+    ours = fit()
+    dogleg = fit(optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
+    np.testing.assert_allclose(dogleg.values, ours.values, rtol=1e-5)
+    bfgs = fit(optimiser=optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
+    np.testing.assert_allclose(bfgs.values, ours.values, rtol=1e-3)
+    np.testing.assert_allclose(bfgs.sd, ours.sd, rtol=1e-2)
+    adam = optx.OptaxMinimiser(optax.adam(0.02), rtol=1e-5, atol=1e-5)
+    slow = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, optimiser=adam, iterations=2000, grow=False)
+    np.testing.assert_allclose(slow.values[1], ours.values[1], rtol=1e-2)
+
+
+@pytest.mark.exhaustive
+def test_log_likelihood(swinging):
+    """The likelihood is largest at the estimates, and falls by a half at one standard deviation."""
+    record = lj.Record(TS, q=swinging[0], sigma=0.01, q0=1.0, v0=0.0, hold_q=True, hold_v=True)
+    found = lj.fit(pendulum, record, PENDULUM | {"l": 1.3}, free="l")
+    density = jax.jit(found.log_likelihood)
+    best = float(density(found.sampling))
+    assert best == pytest.approx(-0.5 * float(found.chi2), abs=1e-9)
+    moved = float(density({"l": found.values[0] + found.sd[0]}))
+    assert moved - best == pytest.approx(-0.5, rel=0.01)
+    slope = jax.grad(lambda l: found.log_likelihood({"l": l}))(found.values[0] + found.sd[0])
+    assert float(slope * found.sd[0]) == pytest.approx(-1.0, rel=0.02)
+
+
+def test_prints_and_plots(swinging):
+    """The table has estimates with uncertainties in the user's units; the figure has one row per channel."""
+    found = lj.fit(pendulum, lj.Record(TS, q=noisy(swinging[0])), GUESS, free=FREE, units={"l": "m"})
+    lines = repr(found).splitlines()
+    assert lines[0].startswith("Fit: converged")
+    assert any(line.split()[:1] == ["l"] and "±" in line and line.endswith("m") for line in lines)
+    assert "96 degrees of freedom" in repr(found) and "NOT white" not in repr(found)
+    assert abs(found.whiteness()["q"]) < 0.3 and found.rms()["q"] == pytest.approx(0.01, rel=0.2)
+    assert len(found.plot().axes) == 2
+    assert np.max(np.abs(np.asarray(found.motion().q) - (noisy(swinging[0]) + found.residuals()["q"]))) < 1e-8
+    # Twin: a slow error is not white.
+    slow = lj.fit(pendulum, lj.Record(TS, q=swinging[0] + 0.02 * np.sin(TS)), GUESS, free=FREE)
+    assert "NOT white" in repr(slow) and slow.whiteness()["q"] > 0.5
+
+
+def test_called_again_it_compiles_nothing(swinging):
+    """A second fit compiles nothing, even with fewer samples, another guess or other data; padding does not count.
+
+    Printing compiles nothing, either, except one program for the starts and their slopes the first time.
+    """
+
+    def of(n, guess=GUESS):
+        data = {} if n % 2 else {"sigma": 1e-5 * n}
+        return lj.fit(pendulum, lj.Record(TS[:n], q=swinging[0][:n], **data), guess, free=FREE)
+
+    repr(of(99))
+    found = of(100)
+    with compiles() as programs:
+        repr(found)
+    assert len(programs) <= 1
+    with compiles() as programs:
+        again = {100: of(100), 98: of(98), 97: of(97, GUESS | {"l": 1.3})}
+        assert all("freedom" in repr(found) and len(found.plot().axes) == 2 for found in again.values())
+    assert programs == []
+    for n, found in again.items():
+        assert bool(found.converged) and found.residuals()["q"].shape == (n,) and float(found.freedom) == n - 4
+        np.testing.assert_allclose(found.values, [0.05, 1.25], rtol=1e-8)
+    # Twin: a compilation is counted.
+    with compiles() as programs:
+        jax.jit(lambda x: x + np.pi)(1.0)
+    assert len(programs) == 1
+
+
+def test_all_samples_of_a_whole_record_count():
+    """The last sample counts even if first time plus length is rounded to less than its time. Twin: the sum."""
+    random = np.random.default_rng(0)
+    times = [np.sort(random.uniform(0.1, 10.0, 5)) for _ in range(100)]
+    assert all(np.all(_counts(t, 3, 1.0) == (t <= t[3])) for t in times)
+    assert not all(np.all((t <= t[0] + 1.0 * (t[3] - t[0])) == (t <= t[3])) for t in times)
+
+
+@pytest.mark.slow
+def test_a_fit_sees_what_has_changed():
+    """A fit uses the current value of a number that L reads from outside: w² = k times that number."""
+    strength, t = np.array([1.0]), np.linspace(0.0, 4.0, 30)
+    spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * strength[0] * params["k"] * q**2)
+    of = lambda: lj.fit(spring, lj.Record(t, q=np.cos(2.0 * t)), {"k": 3.0}).values[0]
+    np.testing.assert_allclose(of(), 4.0, rtol=1e-7)
+    strength[0] = 2.0
+    np.testing.assert_allclose(of(), 2.0, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_unknowns_of_a_start_keep_to_the_constraints():
+    """A start satisfies the constraints for any unknowns and parameters."""
+    case = CASES["pendulum on a rod"]
+    p = problem(case, {"q": case.truth().q})
+    assert p.start.local.shape == (1, 2)
+    state = jax.jit(lambda u: p.setting(u.shared, u.local[0], 0, WHOLE)[2])
+    for own in ([0.3, -0.5], [-0.5, 1.0]):
+        u = Unknowns(jnp.array([2.4, 1.0]), jnp.array([own]))
+        q, v = state(u)
+        assert abs(q["x"] ** 2 + q["y"] ** 2 - 2.4**2) < 1e-12
+        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
+
+
+@pytest.mark.exhaustive
+def test_log_likelihood_of_several_runs(swinging):
+    """With two records, the likelihood at the estimates is that of the sum of squares of both."""
+    records = [lj.Record(TS, q=noisy(swinging[0], seed=i), q0=1.0, v0=0.0, sigma=0.01) for i in (1, 2)]
+    found = lj.fit(pendulum, records, GUESS, free=FREE)
+    assert float(found.log_likelihood(found.sampling)) == pytest.approx(-0.5 * float(found.chi2), rel=1e-9)

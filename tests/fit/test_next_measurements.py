@@ -1,0 +1,314 @@
+"""What to measure next: predicted standard deviations agree with formulas and with repeated fits."""
+
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import lagjax as lj
+from lagjax.fit.uncertainty.candidates import assess, eliminate_unknowns, sd_after_each, sd_of
+from tests.counting import compiles
+from tests.fit.cases import CASES, HUNG, PENDULUM, hung, pendulum
+
+LEAST = 1e-7
+T, LONG = np.linspace(0.0, 2.0, 21), np.linspace(0.0, 4.0, 21)
+SIGMA = 0.01
+fall = lj.System(lambda t, q, v, p: 0.5 * v**2 + p["g"] * q)
+fallen = lj.Record(T, q=5.0 * T**2, sigma=SIGMA)
+# A spring that a known force may pull: without it only k/m is determined.
+pulled = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v["x"] ** 2 - 0.5 * p["k"] * q["x"] ** 2 + p["F"] * q["x"])
+PULLED = {"m": 1.0, "k": 4.0, "F": 0.0}
+
+
+def parabola(t):
+    """The slopes of q = q0 + v0 t + g t²/2 by g, q0 and v0."""
+    return np.stack([t**2 / 2, np.ones_like(t), t], axis=1) / SIGMA
+
+
+def sds(rows):
+    """Standard deviations from normal equations."""
+    return np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
+
+
+def two_runs(first, second, held=False):
+    """The slopes of two falls with the same g; the start of the second is unknown or held."""
+    rows = np.zeros((len(first) + len(second), 3 if held else 5))
+    rows[: len(first), :3] = first
+    rows[len(first) :, 0] = second[:, 0]
+    rows[len(first) :, 3:] = second[:, 1 : 1 if held else 3]
+    return rows
+
+
+@pytest.mark.parametrize("rank", [5, 3, 2])
+@pytest.mark.parametrize("m", [1, 3])
+def test_one_time_after_the_other(rank, m):
+    """The formula for single times agrees with solving all equations, even if something is not determined."""
+    random = np.random.default_rng(rank + m)
+    known = random.normal(size=(7, rank)) @ random.normal(size=(rank, 5))
+    rows = random.normal(size=(40, m, 5))
+    for direction in (np.eye(5)[0], known[0], known[0] + rows[0, 0]):
+        found = sd_after_each(direction, known, rows, LEAST)
+        each = [sd_of(direction, np.concatenate([known, block]), LEAST) for block in rows]
+        np.testing.assert_allclose(found, each, rtol=1e-8)
+        # Twin: with fewer known equations.
+        assert np.isinf(each).all() or not np.allclose(
+            sd_after_each(direction, known[1:], rows, LEAST), each, rtol=1e-3
+        )
+    assert np.all(np.isfinite(sd_after_each(known[0], known, rows, LEAST)))
+    one = sd_after_each(known[0] + rows[0, 0], known, rows, LEAST)
+    assert np.isfinite(one[0]) and (np.isinf(one[1:]).all() == (rank + m < 5))
+
+
+def test_unknowns_of_no_interest_are_eliminated():
+    """Elimination keeps all information on the other unknowns; a column of zeros does not count as an unknown."""
+    random = np.random.default_rng(0)
+    of, others = random.normal(size=(20, 2)), random.normal(size=(20, 3))
+    left = eliminate_unknowns(of, np.concatenate([others, np.zeros((20, 1)), others[:, :1]], axis=1))
+    both = np.concatenate([of, others], axis=1)
+    np.testing.assert_allclose(sds(left), sds(both)[:2], rtol=1e-10)
+    # Twin: with the eliminated unknowns known.
+    assert np.all(sds(of) < 0.99 * sds(both)[:2])
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_best_times_against_all_choices(count):
+    """Exchanges find the best of all sets of times, for random slopes and for a parabola (its ends and middle)."""
+    along = np.array([1.0, 0.0, 0.0])
+    random = np.random.default_rng(1)
+    cases = [parabola(np.linspace(0.0, 2.0, 11)), *(random.normal(size=(11, 3)) for _ in range(6))]
+    for i, rows in enumerate(cases):
+        candidate = assess(
+            "a run", np.linspace(0.0, 2.0, 11), rows[:, None], np.zeros((1, 3)), along, np.ones(3), {}, LEAST
+        )
+        times, sd = candidate.at_best(count)
+        all_of_them = [sd_of(along, rows[list(places)], LEAST) for places in combinations(range(11), count)]
+        assert sd <= 1.02 * min(all_of_them) and sd < np.median(all_of_them)
+        if i == 0:
+            # (q(0) - 2 q(1) + q(2)) / 1² has the error √6 σ; a fourth time lies near the middle, which weighs most.
+            np.testing.assert_allclose(times[[0, 1, -1]], [0.0, 1.0 if count == 3 else 0.8, 2.0], atol=0.21)
+            if count == 3:
+                np.testing.assert_allclose(sd, np.sqrt(6) * SIGMA, rtol=1e-10)
+        with pytest.raises(ValueError, match="11 times, and the best 12"):
+            candidate.at_best(12)
+
+
+@pytest.mark.slow
+def test_falling():
+    """The error of g after another fall with an unknown or known start, a longer one, or one more measurement."""
+    zeros = {"q": np.zeros(21), "q0": 0.0, "v0": 0.0, "sigma": SIGMA}
+    others = {"again": lj.Record(T, **zeros), "longer": lj.Record(LONG, **zeros)}
+    others["from a stand"] = lj.Record(LONG, **zeros, hold_q=True, hold_v=True)
+    ask = lambda **more: lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g", **more).next
+    told, first = ask(candidates=others), parabola(T)
+    assert [c.name for c in told.candidates] == ["from a stand", "longer", "again"]
+    np.testing.assert_allclose(told.now, sds(first)[0], rtol=1e-9)
+    np.testing.assert_allclose(told["again"].sd, told.now / np.sqrt(2), rtol=1e-9)
+    np.testing.assert_allclose(told["longer"].sd, sds(two_runs(first, parabola(LONG)))[0], rtol=1e-9)
+    known = sds(two_runs(first, parabola(LONG), held=True))[0]
+    np.testing.assert_allclose(told["from a stand"].sd, known, rtol=1e-9)
+    # Twin: with a known start the longer fall would be far better.
+    assert known < 0.8 * told["longer"].sd
+    times, sd = told["longer"].at_best(3)
+    np.testing.assert_allclose(times, [0.0, 2.0, 4.0])
+    np.testing.assert_allclose(sd, sds(two_runs(first, parabola(times)))[0], rtol=1e-9)
+    assert "longer" in repr(told) and "(measured: q to 0.01)" in repr(told)
+    with compiles() as programs:
+        again = ask(candidates={"twice": lj.Record(2 * T, **zeros)})
+    assert programs == [] and again.best.name == "twice"
+
+    told = ask()
+    assert {c.name for c in told.candidates} == {"q", "v"} and told.best.times[0] == told["q"].t[-1] == pytest.approx(
+        4.1
+    )
+    after = [sds(np.concatenate([first, parabola(np.array([t]))]))[0] for t in told["q"].t]
+    np.testing.assert_allclose(told["q"].alone, after, rtol=1e-8)
+    assert "q at t = 4.1" in repr(told)
+    # Twin: without the further measurement.
+    assert not np.allclose(told["q"].alone, told.now, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_what_is_not_determined():
+    """A spring determines only k/m; a run with a known force would determine k, as the formula says, another not."""
+    t = np.linspace(0.0, 6.0, 40)
+    of = lambda force: lj.Record(
+        t, q={"x": np.zeros(40)}, q0={"x": 0.5}, v0={"x": 0.0}, sigma=0.01, params={"F": force}
+    )
+    ask = lambda **more: lj.identifiability(pulled, of(0.0), PULLED, free=["k", "m"], **more)
+    asked = ask(shrink="k", candidates={"free": of(0.0), "pulled": of(2.0)})
+    told = asked.next
+    assert asked.combined() == ["k/m"] and np.isinf(told.now)
+    assert told.best.name == "pulled" and np.isinf(told["free"].sd)
+    words = repr(asked)
+    assert "'k' is not determined by these data" in words and "not determined" in words.splitlines()[-2]
+
+    def rows(x, start, force):
+        k, m = x
+        w, rest = jnp.sqrt(k / m), force / k
+        return (rest + (start[0] - rest) * jnp.cos(w * t) + start[1] / w * jnp.sin(w * t)) / 0.01
+
+    x, start = jnp.array([4.0, 1.0]), jnp.array([0.5, 0.0])
+    slopes = [jax.jacfwd(rows, (0, 1))(x, start, force) for force in (0.0, 2.0)]
+    both = np.zeros((80, 6))
+    both[:40, :2], both[:40, 2:4] = slopes[0]
+    both[40:, :2], both[40:, 4:] = slopes[1]
+    np.testing.assert_allclose(told.best.sd, sds(both)[0], rtol=1e-6)
+    # The frequency, a function of the parameters, is determined: it has its own formula, and late times are best.
+    w = lambda params: jnp.sqrt(params["k"] / params["m"])
+    told = ask(shrink=w).next
+    alone = both[:40, [0, 2, 3]]
+    np.testing.assert_allclose(told.now, sds(alone)[0] * 0.5 / np.sqrt(4.0), rtol=1e-6)
+    assert told.best.times[0] > 8.0 and told.best.sd < 0.7 * told.now
+    for wrong, words in ((lambda p: p["F"], "does not depend on the fitted"), (lambda p: jnp.ones(2), "single number")):
+        with pytest.raises(ValueError, match=words):
+            ask(shrink=wrong)
+    # Twin: a candidate with the same force determines the mass no better.
+    assert np.isinf(ask(shrink="m", candidates={"free": of(0.0)}).next.best.sd)
+
+
+@pytest.mark.slow
+def test_a_pendulum_in_air_against_scipy():
+    """Further positions and velocities for friction agree with slopes by differences of SciPy's motion."""
+    ts, free = np.linspace(0.0, 5.0, 40), ["c", "l"]
+    record = lj.Record(ts, q=np.zeros(40), q0=1.0, v0=0.0, sigma={"q": 0.01, "v": 0.03})
+    told = lj.identifiability(pendulum, record, PENDULUM, free=free, shrink="c").next
+
+    def motion(x):
+        rate = x[0] / (PENDULUM["m"] * x[1] ** 2)
+        field = lambda t, y: [y[1], -PENDULUM["g"] / x[1] * np.sin(y[0]) - rate * y[1]]
+        return solve_ivp(field, (0.0, 20.0), x[2:], "DOP853", told["q"].t, rtol=1e-12, atol=1e-13).y
+
+    x = np.array([0.05, 1.25, 1.0, 0.0])
+    slopes = np.stack([(motion(x + d) - motion(x - d)) / 2e-4 for d in 1e-4 * np.eye(4)], axis=-1)
+    first = slopes[0, :40] / 0.01
+    np.testing.assert_allclose(told.now, sds(first)[0], rtol=1e-5)
+    for name, of, sigma in (("q", slopes[0], 0.01), ("v", slopes[1], 0.03)):
+        after = [sds(np.concatenate([first, row[None] / sigma]))[0] for row in of]
+        np.testing.assert_allclose(told[name].alone, after, rtol=1e-5)
+        assert told[name].times[0] == told[name].t[np.argmin(after)] and told[name].sigma == {name: sigma}
+    # Twin: with the error of the positions.
+    assert not np.allclose(
+        told["v"].alone, [sds(np.concatenate([first, r[None] / 0.01]))[0] for r in slopes[1]], rtol=1e-3
+    )
+
+
+@pytest.mark.exhaustive
+def test_it_comes_true():
+    """Repeated fits with the best candidate measured have the predicted spread of friction."""
+    ts, late = np.linspace(0.0, 3.0, 30), np.linspace(0.0, 8.0, 30)
+    run = lambda t, q, q0, **more: lj.Record(t, q=q, q0=q0, v0=0.0, sigma=0.02, **more)
+    zeros, free = np.zeros(30), ["c", "l"]
+    candidates = {
+        "small and long": run(late, zeros, 0.5),
+        "large and long": run(late, zeros, 2.0),
+        "as now": run(ts, zeros, 1.0),
+    }
+    told = lj.identifiability(
+        pendulum, run(ts, zeros, 1.0), PENDULUM, free=free, shrink="c", candidates=candidates
+    ).next
+    assert told.best.name == "large and long" and told["as now"].sd == pytest.approx(told.now / np.sqrt(2))
+    clean = [lj.integrate(pendulum, q0, 0.0, PENDULUM, ts=t).q for q0, t in ((1.0, ts), (2.0, late))]
+
+    def repeat(point):
+        keys = jax.random.split(jax.random.key(point["seed"]))
+        data = [x + 0.02 * jax.random.normal(key, x.shape) for key, x in zip(keys, clean)]
+        both = [run(t, x, q0) for t, x, q0 in zip((ts, late), data, (1.0, 2.0))]
+        fit = lambda records: lj.fit(pendulum, records, PENDULUM, free=free, restarts=0).values[0]
+        return {"now": fit(both[:1]), "after": fit(both)}
+
+    found = lj.sweep(repeat, {"seed": np.arange(400)}, progress=False).values
+    # A standard deviation of 400 values is known to 3.5 %.
+    assert np.std(found["now"]) == pytest.approx(told.now, rel=0.12)
+    assert np.std(found["after"]) == pytest.approx(told.best.sd, rel=0.12)
+    # Twin: the prediction for the second-best candidate differs.
+    assert told.candidates[1].sd > 1.3 * told.best.sd
+
+
+@pytest.mark.exhaustive
+def test_constraints_forces_and_observations():
+    """On a rod only its force determines the mass; the system in the angle gives the same errors of g."""
+    case = CASES["pendulum on a rod"]
+    start = {"q0": case.q0, "v0": case.v0}
+    zeros = {"x": np.zeros(60), "y": np.zeros(60)}
+    record = lj.Record(case.ts, q=zeros, **start, sigma=0.02)
+    candidates = {
+        "motion": lj.Record(case.ts, q=zeros, **start, sigma=0.02),
+        "force": lj.Record(case.ts, multipliers={"rod": np.zeros(60)}, **start, sigma=0.1),
+    }
+    told = lj.identifiability(hung, record, HUNG, free=["g", "l", "m"], shrink="m", candidates=candidates).next
+    assert np.isinf(told.now) and told.best.name == "force" and np.isinf(told["motion"].sd)
+    further = lj.identifiability(hung, record, HUNG, free=["g", "l"], shrink="g").next
+    assert {c.name for c in further.candidates} == {"x", "y", "v.x", "v.y"}
+    # The system in the angle, observed by x and y.
+    place = lambda t, q, v, p: {"x": p["l"] * jnp.sin(q), "y": -p["l"] * jnp.cos(q)}
+    of_angle = lj.System(lambda t, q, v, p: 0.5 * p["m"] * p["l"] ** 2 * v**2 + p["m"] * p["g"] * p["l"] * jnp.cos(q))
+    seen = lj.Record(case.ts, observed=zeros, q0=np.pi / 2, v0=0.0, sigma={"observed": 0.02})
+    angle = lj.identifiability(of_angle, seen, HUNG, free=["g", "l"], observe=place, shrink="g").next
+    assert {c.name for c in angle.candidates} == {"x", "y"}
+    np.testing.assert_allclose(angle.now, further.now, rtol=1e-5)
+    for name in ("x", "y"):
+        np.testing.assert_allclose(angle[name].alone, further[name].alone, rtol=1e-5)
+
+
+@pytest.mark.exhaustive
+def test_windows_runs_without_sigma_and_several():
+    """Without sigma results are multiples of an error; records are distinguished; each window has its own start."""
+    plain = lj.identifiability(fall, lj.Record(T, q=5.0 * T**2), {"g": 9.81}, shrink="g").next
+    scaled = lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g").next
+    assert not plain.absolute and {c.name for c in plain.candidates} == {"q"}
+    np.testing.assert_allclose([plain.now * SIGMA, plain.best.sd * SIGMA], [scaled.now, scaled["q"].sd], rtol=1e-8)
+    assert "errors of a measurement" in repr(plain)
+    times, sd = plain["q"].at_best(2)
+    np.testing.assert_allclose(sd * SIGMA, scaled["q"].at_best(2)[1], rtol=1e-8)
+
+    records = [fallen, lj.Record(LONG, q=5.0 * LONG**2, sigma=0.1)]
+    told = lj.identifiability(fall, records, {"g": 9.81}, shrink="g").next
+    assert {c.name for c in told.candidates} == {f"{x} of record {r}" for x in "qv" for r in (0, 1)}
+    rows = two_runs(parabola(T), parabola(LONG) / 10)
+    np.testing.assert_allclose(told.now, sds(rows)[0], rtol=1e-8)
+    further = np.zeros((len(told["q of record 1"].t), 5))
+    further[:, [0, 3, 4]] = parabola(told["q of record 1"].t) / 10
+    after = [sds(np.concatenate([rows, row[None]]))[0] for row in further]
+    np.testing.assert_allclose(told["q of record 1"].alone, after, rtol=1e-8)
+    # Twin: with the error of the other record.
+    assert not np.allclose(told["q of record 0"].alone, told["q of record 1"].alone[:42], rtol=1e-3)
+
+    cut = lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g", window=1.0, candidates={"again": fallen}).next
+    halves = [parabola(t - t[0])[:, [0, 1, 2]] for t in (T[:10], T[10:])]
+    np.testing.assert_allclose(cut.now, sds(two_runs(*halves))[0], rtol=1e-8)
+    np.testing.assert_allclose(cut.best.sd, cut.now / np.sqrt(2), rtol=1e-8)
+
+
+RUN = {"q0": 0.0, "v0": 0.0}
+
+
+@pytest.mark.parametrize(
+    "more, error, words",
+    [
+        ({"shrink": "h"}, ValueError, "shrink names 'h', which is not among the fitted parameters: 'g'"),
+        ({"candidates": {"a": fallen}}, ValueError, 'shrink="g"'),
+        ({"shrink": "g", "free": []}, ValueError, "no parameter is fitted"),
+        ({"shrink": "g", "candidates": {}}, ValueError, "candidates is empty"),
+        ({"shrink": "g", "candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
+        (
+            {"shrink": "g", "candidates": {"a": lj.Record(T, q=T, **RUN)}},
+            ValueError,
+            "'a' has no sigma, and the records",
+        ),
+        ({"shrink": "g", "candidates": {"a": lj.Record(T, q=T * np.nan, sigma=1.0, **RUN)}}, ValueError, "are NaN"),
+    ],
+)
+def test_words(more, error, words):
+    """Arguments that make no sense raise errors in the user's words."""
+    with pytest.raises(error, match=words):
+        lj.identifiability(fall, fallen, {"g": 9.81}, **more)
+
+
+def test_words_where_it_is_traced():
+    """Inside a program it raises an error, since it needs numbers."""
+    of = lambda q: lj.identifiability(fall, lj.Record(T, q=q, sigma=SIGMA), {"g": 9.81}, shrink="g").next.now
+    with pytest.raises(TypeError, match="not in jit, vmap or lj.sweep"):
+        jax.jit(of)(5.0 * T**2)

@@ -1,0 +1,162 @@
+"""Fits find the global minimum from inaccurate guesses, or say that they did not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import lagjax as lj
+from lagjax.fit import fit as engine
+from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit.problem.residuals import dampened
+from lagjax.fit.search.search import CHANCE, _exceeded_by_chance, _undampened, misfit
+from lagjax.numerics.windowed_least_squares import WindowedEquations
+
+TS, SIGMA = np.linspace(0.0, 15.0, 200), 0.02
+TRUE = {"w2": 9.0, "c": 0.3, "A": 1.2, "W": 2.0}
+GUESS = {"w2": 8.0, "c": 0.2, "A": 1.0, "W": 1.9}
+VALUES = np.array([TRUE[name] for name in sorted(TRUE)])
+
+
+def pushed(t, q, v, p):
+    """L of a pendulum with a time-dependent force, which the first part of a record hardly determines."""
+    return 0.5 * v**2 + p["w2"] * jnp.cos(q) + p["A"] * jnp.cos(p["W"] * t) * q
+
+
+driven = lj.System(pushed, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """The driven pendulum's angle."""
+    return lj.integrate(driven, 0.8, 0.0, TRUE, ts=TS).q
+
+
+def measured(clean, seed):
+    """Measurements with errors."""
+    return clean + SIGMA * jax.random.normal(jax.random.key(seed), clean.shape)
+
+
+@pytest.mark.exhaustive
+def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
+    """A growing part of this record once led to a negative driving frequency; now the first search succeeds."""
+    record = lj.Record(TS, q=measured(clean, 11), sigma=SIGMA)
+    found = lj.fit(driven, record, GUESS)
+    assert bool(found.converged) and found.result == lj.RESULTS.successful
+    assert np.all(np.abs(found.values - VALUES) < 4 * found.sd) and np.max(found.sd) < 0.05
+    assert np.isfinite(found.costs[0]) and np.all(np.isnan(found.costs[1:]))
+    # Twin: without a hold it fails; then the search of the whole record from the guess succeeds.
+    monkeypatch.setattr(engine, "HOLD_REACH", 1e9)
+    again = lj.fit(driven, record, GUESS)
+    assert float(again.costs[0]) > 10 * float(found.cost) and np.all(np.isnan(again.costs[2:]))
+    np.testing.assert_allclose(again.costs[1], found.cost, rtol=1e-6)
+    np.testing.assert_allclose(again.values, found.values, rtol=1e-5)
+    assert bool(again.converged) and "1 of 2 starts ended here" in repr(again)
+
+
+@pytest.mark.exhaustive
+def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
+    """Positions do not determine the mass of a pendulum on a rod: it stays near its guess and affects nothing else."""
+    free = lambda t, q, v, p: p["m"] * (0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"])
+    rod = lj.System(free, {"rod": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1.0)})
+    ts = np.linspace(0.0, 3.0, 40)
+    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"m": 1.0, "g": 9.8}, ts=ts).q
+    errors = 0.01 * np.random.default_rng(0).normal(size=(2, ts.size))
+    record = lj.Record(ts, {"x": motion["x"] + errors[0], "y": motion["y"] + errors[1]})
+
+    def fitted(**free):
+        with pytest.warns(lj.FitWarning, match="do not determine all"):
+            return lj.fit(rod, record, {"m": 2.0, "g": 9.0}, restarts=0, **free)
+
+    found = fitted()
+    assert abs(float(found.params["m"]) - 2.0) < 0.2 and "(not determined)" in repr(found)
+    alone = lj.fit(rod, record, {"m": 2.0, "g": 9.0}, free="g", restarts=0)
+    np.testing.assert_allclose(found.params["g"], alone.params["g"], rtol=1e-8)
+    np.testing.assert_allclose(found.sd[found.names.index("g")], alone.sd[0], rtol=1e-3)
+    # Twin: without a hold at the end it goes astray.
+    monkeypatch.setattr(engine, "FINAL_HOLD", 0.0)
+    with pytest.warns(lj.FitWarning, match="went astray"):
+        assert not abs(float(fitted().params["m"]) - 2.0) < 10.0
+
+
+@pytest.mark.slow
+def test_what_contradicts_sigma_is_no_success(clean):
+    """A missing effect or errors larger than sigma: not converged, with a warning, from every start."""
+    data = measured(clean, 3) + SIGMA * np.sin(7 * TS)
+    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
+        found = lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), GUESS)
+    assert bool(found.rested) and not bool(found.converged) and found.result == lj.RESULTS.misfit
+    assert "NOT measurement errors" in repr(found) and np.all(np.isfinite(found.costs))
+    larger = lambda times: clean + times * (measured(clean, 3) - clean)
+    with pytest.warns(lj.FitWarning, match="of 'q' are 2 times as large as sigma says"):
+        found = lj.fit(driven, lj.Record(TS, q=larger(2.0), sigma=SIGMA), GUESS)
+    assert not bool(found.converged)
+    # Twin: errors a little larger than sigma give no warning.
+    assert bool(lj.fit(driven, lj.Record(TS, q=larger(1.2), sigma=SIGMA), GUESS).converged)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("known", [True, False])
+def test_in_a_sweep(clean, known):
+    """50 repeats from guesses up to 30 % off, and 50 with a missing effect: the status tells them apart."""
+
+    def run(point):
+        random = jax.random.split(jax.random.key(point["seed"]))
+        data = clean + SIGMA * jax.random.normal(random[0], clean.shape)
+        data = jnp.where(point["other"], data + 0.3 * jnp.sin(7 * TS), data)
+        off = 1 + 0.3 * jax.random.uniform(random[1], (4,), minval=-1.0, maxval=1.0)
+        guess = {name: TRUE[name] * factor for name, factor in zip(sorted(TRUE), off)}
+        found = lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA if known else None), guess)
+        return found.values, found.sd, found.converged
+
+    swept = lj.sweep(run, {"other": np.array([False, True]), "seed": np.arange(50)}, progress=False)
+    values, sd, converged = swept.values
+    np.testing.assert_array_equal(swept.ok, [[True] * 50, [False] * 50])
+    np.testing.assert_array_equal(converged, swept.ok)
+    assert np.all(np.abs(values[0] - VALUES) < 5 * sd[0]) and np.all(sd[0] < 0.05)
+    # The estimates are available, for users who know what their system leaves out.
+    assert np.all(np.isfinite(values[1])) and swept.counts()["successful"] == 50
+    assert any("not measurement errors" in words for words in swept.counts())
+
+
+def spring_problem(count, sigma, loss="squares"):
+    """A fit of a spring, for which the tests make up residuals."""
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
+    t = np.linspace(0.0, 10.0, count)
+    record = lj.Record(t, q=np.cos(t), sigma=sigma)
+    return problem_of(spring, record, {"k": 1.0}, None, None, None, None, loss, None, {})
+
+
+@pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.exhaustive), "cauchy"])
+def test_false_alarms(loss):
+    """Of thousands of fits with errors as stated, none is rejected, and hardly any is searched further."""
+    problem = spring_problem(104, 0.01, loss)
+    rows = jnp.asarray(dampened(np.random.default_rng(0).normal(size=(3000, 1, 104)), loss))
+    zero = jnp.zeros((1, 0)), jnp.zeros(1)
+    judged = jax.jit(jax.vmap(lambda rows: misfit(problem, WindowedEquations(rows, *zero))))
+    assert not np.any(judged(rows).any) and np.mean(judged(rows).doubtful) < 0.02
+    # Twins: larger errors, and a curve, are always noticed.
+    plain = np.random.default_rng(1).normal(size=(300, 1, 104))
+    larger = dampened(jnp.asarray((2.5 if loss == "squares" else 4.5) * plain), loss)
+    assert np.all(judged(larger).large)
+    curve = 1.5 * np.sin(np.linspace(0.0, 20.0, 104))
+    assert np.all(judged(dampened(jnp.asarray(plain + 2 * curve), loss)).any)
+
+
+def test_quantiles_and_inverses():
+    """The limit of chance is that of SciPy's chi-squared distribution; `_undampened` inverts `dampened`."""
+    for n in (1.0, 4.0, 10.0, 300.0):
+        exact = chi2.isf(2.87e-7, n) / n
+        assert abs(float(_exceeded_by_chance(n, CHANCE)) / exact - 1) < 0.2
+    r = np.geomspace(1e-6, 1e4, 50)
+    for loss in ("huber", "soft_l1", "cauchy"):
+        np.testing.assert_allclose(_undampened(dampened(r, loss), loss), r, rtol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_a_start_read_off_traced_measurements(clean):
+    """Inside a program the start is read off as outside."""
+    fit = lambda data: lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), TRUE).values
+    data = measured(clean, 0)
+    np.testing.assert_allclose(jax.jit(fit)(data), fit(data), rtol=1e-6)

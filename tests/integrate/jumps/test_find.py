@@ -1,0 +1,153 @@
+"""Jumps and kinks in programs: which are found, the smooth functions of each mode, guards, times."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.analysis.formulations import hamiltonian as legendre
+from lagjax.integrate.jumps.find import Given, found, with_jumps_in_time
+
+KNOTS, HEIGHTS = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
+free = lambda t, q, v, params: 0.5 * v**2
+JUMPING = {
+    "where": lambda t, q, v, p: jnp.where(q > p, -3.0 * q, q**2),
+    "opposite": lambda t, q, v, p: jnp.where(p <= q, 1.0, v),
+    "sign": lambda t, q, v, p: -jnp.sign(v) * q,
+    "abs": lambda t, q, v, p: v * jnp.abs(v - q),
+    "maximum": lambda t, q, v, p: jnp.where(q > 0, -jnp.maximum(8 * q + v, 0.0), 0.0),
+    "minimum": lambda t, q, v, p: jnp.minimum(q, v**2),
+    "clip": lambda t, q, v, p: jnp.clip(3 * q, -p, p),
+    "floor": lambda t, q, v, p: jnp.floor(2 * q) * v,
+    "ceil": lambda t, q, v, p: jnp.ceil(q - v),
+    "round": lambda t, q, v, p: jnp.round(5 * q),
+    "remainder": lambda t, q, v, p: jnp.mod(q, 0.7),
+    "whole": lambda t, q, v, p: (10 * q).astype(int) * 0.1,
+    "table": lambda t, q, v, p: jnp.interp(q, KNOTS, HEIGHTS),
+    "relu": lambda t, q, v, p: jax.nn.relu(q) - jax.nn.relu(-v),
+    "cond": lambda t, q, v, p: jax.lax.cond(q > v, jnp.sin, jnp.cos, q),
+    "heaviside": lambda t, q, v, p: jnp.heaviside(q, 0.5) * v,
+    "moving edge": lambda t, q, v, p: jnp.where(q > jnp.sin(t), q, -v),
+}
+
+
+def jumps_of(force, params=0.3, lagrangian=free):
+    """The system and its jumps."""
+    system = lj.System(lagrangian, force=force)
+    number = jnp.asarray(0.1)
+    return system, found(system, number, number, number, jnp.asarray(params))
+
+
+def given_at(system, jumps, *state):
+    """The parameters with the modes at a state."""
+    modes = jumps.modes(system, *state)
+    return Given(state[-1], modes, jnp.zeros(jumps.count, bool), jnp.asarray(False))
+
+
+@pytest.mark.parametrize("name", JUMPING)
+def test_in_its_mode_a_force_is_itself(name):
+    """At random states: value and derivatives in the state's own mode; guards above zero; a crossed one below.
+
+    Twin: with another mode the value is another one.
+    """
+    force, rng, differs = JUMPING[name], np.random.default_rng(1), 0
+    system, jumps = jumps_of(force)
+    smooth, guards = jumps.smooth(system), jumps.numbers(system, 0)
+    smooth_force = smooth.force
+    assert smooth_force is not None
+    beyond = jumps.numbers(system, 1)
+    slope = jax.jit(jax.grad(lambda q, v, t, p: smooth_force(t, q, v, p), argnums=(0, 1)))
+    right = jax.jit(jax.grad(lambda q, v, t, p: force(t, q, v, p), argnums=(0, 1)))
+    for t, q, v in rng.uniform(-1.5, 1.5, (12, 3)):
+        state = jnp.asarray(t), jnp.asarray(q), jnp.asarray(v), jnp.asarray(0.3)
+        given = given_at(system, jumps, *state)
+        np.testing.assert_allclose(smooth_force(*state[:3], given), force(*state), rtol=1e-14, atol=1e-14)
+        np.testing.assert_allclose(slope(q, v, t, given), right(q, v, t, state[-1]), rtol=1e-14, atol=1e-14)
+        assert all(guard(*state[:3], given) >= 0 for guard in guards)
+        for i, (guard, other) in enumerate(zip(guards, beyond)):
+            crossed = given._replace(modes=given.modes.at[i].set(other(*state[:3], given)))
+            assert guard(*state[:3], crossed) <= 0
+            differs += not np.isclose(smooth_force(*state[:3], crossed), force(*state))
+    assert differs > 0
+
+
+def test_what_is_found():
+    """One mode for each pair of numbers, whichever way and in which function they are compared; none that is decided.
+
+    Twin: another pair is another mode.
+    """
+    friction = lambda t, q, v, p: -jnp.sign(v) - jnp.where(v > 0, 1.0, jnp.where(v < 0, -1.0, 0.0)) + jnp.maximum(-v, 0)
+    assert jumps_of(friction)[1].count == 1
+    assert jumps_of(lambda t, q, v, p: friction(t, q, v, p) + jnp.sign(v - q))[1].count == 2
+    smooth = (
+        lambda t, q, v, p: 1 / jnp.where(jnp.sqrt(q**2) > 0, jnp.sqrt(q**2), 1.0),
+        lambda t, q, v, p: jnp.arccos(jnp.clip(jnp.cos(q), -1.0, 1.0)),
+        lambda t, q, v, p: jnp.hypot(q, 1.0) + jax.nn.softplus(v) + jax.nn.logsumexp(jnp.stack([q, v])),
+        lambda t, q, v, p: jnp.where(p > 0, q, v) + jnp.where(q == 0, 1.0, q),
+        lambda t, q, v, p: jnp.sin(q),
+    )
+    assert [jumps_of(force)[1] for force in smooth] == [None] * len(smooth)
+
+
+def test_what_is_not_followed_is_said():
+    """Comparisons in loops, the largest of an array, many at once; twin: what is followed is not among them."""
+    loop = lambda t, q, v, p: jax.lax.fori_loop(0, 3, lambda i, x: jnp.where(x > 0, x - 1.0, x), q)
+    many = lambda t, q, v, p: jnp.sum(jnp.maximum(jnp.arange(100.0) * q, 0.0))
+    largest = lambda t, q, v, p: jnp.max(jnp.stack([q, v, 1.0]))
+    for force, words in ((loop, "loop"), (many, "100 numbers"), (largest, "largest of an array")):
+        _, jumps = jumps_of(force)
+        assert words in " ".join(jumps.missed) and jumps.count == 0
+    assert jumps_of(JUMPING["where"])[1].missed == ()
+    text = str(lj.explain(lj.System(free, force=largest), 0.0, 1.0, 1.0))
+    assert "not followed" in text
+    text = str(lj.explain(lj.System(free, force=JUMPING["maximum"]), 0.0, 1.0, 1.0))
+    assert "a comparison of q in the force; max of q, v in the force" in text and "not followed" not in text
+
+
+def times_of(force, params, last=10.0):
+    """The times at which a force jumps because of t, increasing."""
+    system, jumps = jumps_of(force, params)
+    zero = jnp.asarray(0.0)
+    ts = jnp.array([0.0, last])
+    at = lambda params: with_jumps_in_time(jumps, None, system, zero, zero, jnp.asarray(params), ts)[0]
+    return jax.jit(lambda params: jnp.sort(at(params)))
+
+
+def test_times_of_jumps():
+    """A pulse, a relay, a square wave, a table of times: exact times and their derivatives up to the second.
+
+    Twin: for the relay these are not zero.
+    """
+    pulse = lambda t, q, v, p: jnp.where((t > p) & (t < p + 0.05), 1.0, 0.0)
+    np.testing.assert_array_equal(times_of(pulse, 4.0)(4.0), [4.0, 4.05])
+    relay = times_of(lambda t, q, v, p: jnp.sign(jnp.sin(p * t)), 5.0)
+    right = np.arange(1, 16) * np.pi / 5.0
+    np.testing.assert_allclose(relay(5.0)[1:16], right, rtol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(relay)(5.0)[1:16], -right / 5.0, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(relay))(5.0)[1:16], 2 * right / 25.0, rtol=1e-9)
+    wave = times_of(lambda t, q, v, p: jnp.where(t % p < 0.3, 1.0, 0.0), 1.0, last=2.5)
+    found = np.unique(np.round(wave(1.0), 14))
+    np.testing.assert_allclose(found, [0.3, 1.0, 1.3, 2.0, 2.3, 2.5], rtol=1e-13)
+    table = times_of(lambda t, q, v, p: jnp.interp(t, p * KNOTS, HEIGHTS), 2.0)
+    # The first knot lies before the motion; unused places hold its end.
+    assert {1.0, 4.0} <= set(np.round(np.asarray(table(2.0)), 12)) <= {-2.0, 0.0, 1.0, 4.0, 10.0}
+
+
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_solver_of_ours_is_no_jump(marked, monkeypatch):
+    """Routh's function of a kinetic energy that is not quadratic, found by Newton's method: only the jump in V counts.
+
+    Twin: whether the method arrived is a comparison, if it is not said to be a judgement.
+    """
+    if not marked:
+        for name in ("_regular", "_reached"):
+            monkeypatch.setattr(legendre, name, getattr(legendre, name).__wrapped__)
+
+    def lagrangian(t, q, v, p):
+        slow = 1 - 0.01 * (v["r"] ** 2 + (q["r"] * v["angle"]) ** 2)
+        return -100 * jnp.sqrt(slow) - 0.3 * jnp.maximum(q["r"] - 2.0, 0.0)
+
+    radial, params = lj.routhian(lj.System(lagrangian), "angle"), {"params": None, "momenta": {"angle": 1.2}}
+    jumps = found(radial, jnp.asarray(0.0), {"r": jnp.asarray(1.0)}, {"r": jnp.asarray(0.0)}, params)
+    assert jumps is not None and (len(jumps.slots) + len(jumps.missed) == 1) == marked

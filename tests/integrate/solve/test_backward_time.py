@@ -1,0 +1,197 @@
+"""Decreasing times: compared with SciPy and with the forward motion, through events, derivatives and batches."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.solve.backward_time import Reflected, reflect_system
+from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
+
+DOWN = np.linspace(2.0, 0.0, 9)
+TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+
+
+def sledge_lagrangian(t, q, v, params):
+    """A sledge on a slope, pushed along x periodically in t."""
+    kinetic = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * v["angle"] ** 2
+    return kinetic + (params["m"] * params["g"] + params["push"] * jnp.sin(3.0 * t)) * q["x"]
+
+
+def edge(t, q, v, params):
+    """The blade does not move sideways."""
+    return v["x"] * jnp.sin(q["angle"]) - v["y"] * jnp.cos(q["angle"])
+
+
+def drag(t, q, v, params):
+    """Rayleigh's function, of the motion and of the turning; it grows with time."""
+    return 0.5 * params["c"] * (1.0 + t) * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * 0.3 * v["angle"] ** 2
+
+
+def wind(t, q, v, params):
+    """A torque that depends on time and velocity."""
+    return {"x": 0.0, "y": 0.0, "angle": 0.4 * jnp.cos(t + 1.0) + 0.1 * v["angle"] ** 2}
+
+
+sledge = lj.System(sledge_lagrangian, {"edge": lj.Nonholonomic(edge)}, force=wind, dissipation=drag)
+SLEDGE = {"m": 1.5, "g": 2.0, "push": 0.75, "c": 0.5}
+
+
+def test_a_driven_and_damped_pendulum():
+    """Backward in time damping adds energy: states agree with SciPy's, and a forward run returns to the start."""
+    solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
+    system = lj.System(
+        lambda t, q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q) + jnp.sin(2.0 * t) * q,
+        dissipation=lambda t, q, v, params: 0.5 * params["c"] * v**2,
+    )
+    params = {"k": 4.0, "c": 0.5}
+    by_hand = lambda t, y: [y[1], -4.0 * np.sin(y[0]) + np.sin(2.0 * t) - 0.5 * y[1]]
+    y = solve_ivp(by_hand, (2, 0), [0.3, 0.7], "DOP853", DOWN, rtol=1e-12, atol=1e-12).y
+    back = lj.integrate(system, 0.3, 0.7, params, ts=DOWN, **TIGHT)
+    np.testing.assert_allclose([back.q, back.v], y, atol=1e-9)
+    assert back.t[-1] == back.end.t == 0.0 and back.v[-1] == back.end.v and "(at t" not in repr(back)
+
+
+@pytest.mark.slow
+def test_against_scipy():
+    """A driven, damped, nonholonomic motion backward: states and multipliers are those of the equations by hand.
+
+    Along the blade u' = ((m g + F) cos angle - c (1 + t) u)/m, and λ = -m u w - (m g + F) sin angle.
+    """
+    solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
+    m, g, push, c = SLEDGE.values()
+    along = lambda t: m * g + push * np.sin(3 * t)
+
+    def by_hand(t, y):
+        _, _, angle, u, w = y
+        du = (along(t) * np.cos(angle) - c * (1 + t) * u) / m
+        return [u * np.cos(angle), u * np.sin(angle), w, du, 0.4 * np.cos(t + 1) + 0.1 * w**2 - 0.3 * w]
+
+    angle, u, w = 0.4, 1.25, 0.8
+    y = solve_ivp(by_hand, (2, 0), [0.3, -0.2, angle, u, w], "DOP853", DOWN, rtol=1e-12, atol=1e-12).y
+    traj = lj.integrate(
+        sledge, {"x": 0.3, "y": -0.2, "angle": angle}, {"x": u * np.cos(angle), "y": u * np.sin(angle), "angle": w},
+        SLEDGE, ts=DOWN, **TIGHT,
+    )  # fmt: skip
+    for name, expected in zip(("x", "y", "angle"), y):
+        np.testing.assert_allclose(traj.q[name], expected, atol=1e-9)
+    np.testing.assert_allclose(traj.v["y"], y[3] * np.sin(y[2]), atol=1e-9)
+    np.testing.assert_allclose(
+        traj.multipliers["edge"], -m * y[3] * y[4] - along(DOWN) * np.sin(y[2]), atol=1e-8
+    )  # fmt: skip
+    np.testing.assert_array_equal(traj.t, DOWN)
+    assert traj.system is not sledge and traj.system == sledge and float(traj.residual()) < 1e-14
+
+
+@pytest.mark.slow
+def test_each_part_is_reflected():
+    """The reflected system has the system's accelerations and multipliers; with any one sign left out it has not."""
+    state = {"x": 0.1, "y": 0.2, "angle": 0.7}, {"x": 0.9 * np.cos(0.7), "y": 0.9 * np.sin(0.7), "angle": 0.6}
+    negative = jax.tree.map(lambda x: -x, state[1])
+    right = lj.accelerations(sledge, 1.3, *state, SLEDGE)
+    reflected = reflect_system(sledge)
+    at = lambda system: lj.accelerations(system, -1.3, state[0], negative, SLEDGE)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14), at(reflected), right)
+    wrong = (
+        lj.System(sledge_lagrangian, reflected.constraints, reflected.force, reflected.dissipation),
+        lj.System(
+            reflected.lagrangian, {"edge": lj.Nonholonomic(Reflected(edge))}, reflected.force, reflected.dissipation
+        ),
+        lj.System(reflected.lagrangian, reflected.constraints, wind, reflected.dissipation),
+        lj.System(reflected.lagrangian, reflected.constraints, reflected.force, Reflected(drag)),
+    )  # fmt: skip
+    differs = lambda a, b: max(jax.tree.leaves(jax.tree.map(lambda a, b: float(abs(a - b)), a, b))) > 1e-3
+    assert all(differs(at(system), right) for system in wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"dt0": 0.01, "max_step": 0.1},
+        pytest.param({"drift": "baumgarte"}, marks=pytest.mark.exhaustive),
+        pytest.param({"method": lj.Radau5()}, marks=pytest.mark.exhaustive),
+    ],
+    ids=str,
+)
+def test_there_and_back(options):
+    """A rod pendulum runs forward, and from its end backward to its start, with the same multipliers."""
+    there = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=DOWN[::-1], rtol=1e-9, atol=1e-9, **options)
+    back = lj.integrate(rod_pendulum, there.end.q, there.end.v, PARAMS, ts=DOWN, rtol=1e-9, atol=1e-9, **options)
+    motions = ((traj.q, traj.v, traj.multipliers) for traj in (there, back))
+    for a, b in zip(*map(jax.tree.leaves, motions)):
+        np.testing.assert_allclose(a[::-1], b, atol=1e-6)
+    assert float(back.residual()) < (1e-6 if "drift" in options else 1e-14) and float(back.drift()) < 1e-6
+
+
+@pytest.mark.exhaustive
+def test_fixed_steps_backward():
+    """A user's controller is reversed together with the times: 200 steps of 0.01."""
+    traj = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN, dt0=0.01, stepsize_controller=diffrax.ConstantStepSize())
+    assert int(traj.stats["num_steps"]) == 200
+    np.testing.assert_allclose(traj.q, lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN).q, atol=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_events_backward():
+    """Thrown up to 0 at t = 2 with v = -10: backward it rises to 3.75 at t = 1.5; the direction is that of the run."""
+    stone = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
+    level = lambda direction: diffrax.Event(lambda t, y, params, **kwargs: y[0] - 3.75, direction=direction)
+    run = lambda event: lj.integrate(stone, 0.0, -10.0, ts=DOWN, event=event, max_step=0.05).end
+    up, down = run(level(True)), run(level(False))
+    np.testing.assert_allclose([up.t, up.q, up.v], [1.5, 3.75, -5.0], atol=1e-12)
+    np.testing.assert_allclose([down.t, down.q, down.v], [0.5, 3.75, 5.0], atol=1e-12)
+    late = diffrax.Event(lambda t, y, params, **kwargs: (t - 1.75) + 0.0 * y[1])
+    np.testing.assert_allclose(run(late).t, 1.75, atol=1e-12)
+    moving = diffrax.Event(lambda t, y, params, **kwargs: y[1] + 4.0)
+    np.testing.assert_allclose(run(moving).t, 1.4, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_and_lanes_backward():
+    """Forward, reverse and second derivatives, `jit` and `vmap`: q = q2 cos(k (t - 2)) + v2/k sin(k (t - 2))."""
+    spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params["k"] * q) ** 2)
+
+    def first(x, t_start=2.0, plain=jnp):
+        ts = x.get("t", t_start) * np.linspace(1.0, 0.25, 4)
+        if plain is None:
+            return x["q"] * jnp.cos(x["k"] * (ts[-1] - ts[0])) + x["v"] / x["k"] * jnp.sin(x["k"] * (ts[-1] - ts[0]))
+        return lj.integrate(spring, x["q"], x["v"], {"k": x["k"]}, ts=ts, **TIGHT).q[-1]
+
+    x = {"q": 0.75, "v": -0.5, "k": 1.25}
+    exact = lambda x: first(x, plain=None)
+    for derivative in (jax.grad, jax.jacfwd, lambda f: jax.jit(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
+        found, expected = derivative(first)(x), derivative(exact)(x)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-8), found, expected)
+    # With respect to the times themselves, and for a batch of starts.
+    by_time = jax.grad(first)(x | {"t": 2.0})["t"]
+    np.testing.assert_allclose(by_time, jax.grad(exact)(x | {"t": 2.0})["t"], atol=1e-9)
+    lanes = jax.vmap(lambda q: first(x | {"q": q}))(jnp.linspace(0.0, 1.0, 5))
+    np.testing.assert_allclose(lanes, jax.vmap(lambda q: exact(x | {"q": q}))(jnp.linspace(0.0, 1.0, 5)), atol=1e-9)
+
+
+def test_a_direction_that_is_not_known():
+    """Decreasing times that are only known at run time are refused; the message says how to pass them."""
+    run = jax.jit(lambda end: lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=jnp.stack([2.0, end]), throw=False).result)
+    assert run(0.0) == lj.RESULTS.unordered and "NumPy array" in lj.RESULTS[run(0.0)]
+    assert run(2.5) == lj.RESULTS.successful
+
+
+@pytest.mark.exhaustive
+def test_times_closed_over_inside_jit():
+    """The direction of JAX arrays that a traced function closes over is known while tracing."""
+    for ts in (jnp.asarray(DOWN), jnp.asarray(DOWN[::-1])):
+        run = lambda q: lj.integrate(pendulum, q, 1.0, PARAMS, ts=ts).q
+        np.testing.assert_allclose(jax.jit(run)(0.5), run(0.5), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_backward_motion_is_drawn():
+    """The film of a backward motion is the film of the forward motion, reversed."""
+    positions = lambda t, q, params: (jnp.sin(q), -jnp.cos(q))
+    back = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=np.linspace(2.0, 0.0, 201))
+    there = lj.integrate(pendulum, back.q[-1], back.v[-1], PARAMS, ts=np.linspace(0.0, 2.0, 201))
+    films = [traj.animate(positions).points[""] for traj in (back, there)]
+    np.testing.assert_allclose(films[0], films[1][::-1], atol=1e-7)

@@ -1,0 +1,296 @@
+"""Motions over the jumps of their forces: closed forms, their derivatives of first and second order, and sliding."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.solve import over_jumps
+
+kinetic = lambda t, q, v, params: 0.5 * v**2
+# A brake of 3 from q = edge on: with the start at q = 0 and s = t - edge/v0, q = edge + v0 s - 3/2 s².
+brake = lj.System(kinetic, force=lambda t, q, v, p: jnp.where(q > p["edge"], -p["by"], 0.0))
+ONE = jnp.array([0.0, 1.0])
+
+
+def braked(v0, edge=1.0, by=3.0, **options):
+    """The velocity at t = 1: v0 - by (1 - edge/v0)."""
+    return lj.integrate(brake, 0.0, v0, {"edge": edge, "by": by}, ts=ONE, **options).v[-1]
+
+
+def test_a_brake():
+    """The velocity, and twin: a brake of another strength."""
+    np.testing.assert_allclose(braked(2.0), 0.5, rtol=1e-13)
+    np.testing.assert_allclose(braked(2.0, by=1.0), 1.5, rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_brake():
+    """By the velocity, the edge and the strength, in both modes.
+
+    Twin: with the jump ignored the derivative by v0 is one, and that by the edge zero.
+    """
+    right = lambda v0, edge, by: v0 - by * (1 - edge / v0)
+    at = (2.0, 1.0, 3.0)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = derivative(braked, argnums=(0, 1, 2))(*at)
+        np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1, 2))(*at), rtol=1e-9)
+    ignored = partial(braked, jumps="ignored")
+    assert abs(jax.jacfwd(ignored)(2.0) - 1.0) < 1e-6 and jax.grad(ignored, argnums=1)(*at) == 0.0
+
+
+@pytest.mark.exhaustive
+def test_more_derivatives_of_a_brake():
+    """In lanes, and the second ones; twin: the first one in another lane."""
+    right = lambda v0, edge, by: v0 - by * (1 - edge / v0)
+    lanes = jnp.array([1.8, 2.0, 2.3])
+    found = jax.jit(jax.vmap(jax.grad(braked)))(lanes)
+    np.testing.assert_allclose(found, jax.vmap(jax.grad(lambda v: right(v, 1.0, 3.0)))(lanes), rtol=1e-9)
+    assert abs(found[0] - found[1]) > 0.1
+    # 2 by edge/v0³
+    np.testing.assert_allclose(jax.grad(jax.grad(braked))(2.0), 0.75, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_wall_that_does_not_pull():
+    """A spring with a damper that pushes only: the velocity afterwards is linear in that before.
+
+    Twin: without the jumps' part the derivative is far off.
+    """
+    m, k, c = 0.5, 800.0, 8.0
+    force = lambda t, q, v, p: jnp.where(q > 0, -jnp.maximum(k * q + c * v, 0.0), 0.0)
+    wall = lj.System(lambda t, q, v, p: 0.5 * m * v**2, force=force)
+    after = lambda v0, **options: lj.integrate(wall, -0.5, v0, ts=ONE, **options).v[-1]
+    value = after(2.0)
+    np.testing.assert_allclose(jax.grad(after)(2.0), value / 2.0, rtol=1e-9)
+    assert abs(jax.grad(partial(after, jumps="ignored"))(2.0) - value / 2.0) > 0.1
+
+
+@pytest.mark.slow
+def test_a_pulse_between_two_steps():
+    """A push shorter than a step, with its derivatives by its two ends; twin: ignored, it is missed."""
+    pushed = lj.System(kinetic, force=lambda t, q, v, p: jnp.where((t > p[0]) & (t < p[1]), 1.0, 0.0))
+    end = lambda lo, hi, **options: lj.integrate(pushed, 0.0, 0.0, (lo, hi), ts=[0.0, 10.0], **options).q[-1]
+    right = lambda lo, hi: (hi - lo) * (10.0 - (lo + hi) / 2)
+    np.testing.assert_allclose(end(4.0, 4.05), right(4.0, 4.05), rtol=1e-12)
+    found = jax.grad(end, argnums=(0, 1))(4.0, 4.05)
+    np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1))(4.0, 4.05), rtol=1e-11)
+    assert end(4.0, 4.05, jumps="ignored") == 0.0
+
+
+@pytest.mark.slow
+def test_a_rocket_switched_off():
+    """Derivatives of all outputs by the time of the switch: F (t - off)/m; twin: zero where it is ignored."""
+    rocket = lj.System(lambda t, q, v, p: v**2, force=lambda t, q, v, p: jnp.where(t < p, 3.0, 0.0))
+    ts = jnp.array([0.0, 0.5, 0.98, 1.5, 2.0])
+    places = lambda off, **options: lj.integrate(rocket, 0.0, 0.0, off, ts=ts, **options).q
+    right = 1.5 * jnp.maximum(ts - 0.98, 0.0)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(places)(0.98), right, rtol=1e-11, atol=1e-13)
+    assert jnp.all(jax.jacfwd(partial(places, jumps="ignored"))(0.98) == 0)
+
+
+MASS, SPRING, GRAVITY = 1.0, 100.0, 9.81
+
+
+def rest_of_block(mu, amplitude=0.5):
+    """Where a block on a spring with dry friction comes to rest, after how many half swings."""
+    lost = mu * MASS * GRAVITY / SPRING
+    n = np.ceil((amplitude / lost - 1) / 2)
+    return (-1) ** n * (amplitude - 2 * n * lost), n
+
+
+def block(force=None, dissipation=None):
+    """A block on a spring."""
+    return lj.System(lambda t, q, v, p: 0.5 * MASS * v**2 - 0.5 * SPRING * q**2, force=force, dissipation=dissipation)
+
+
+@pytest.mark.slow
+def test_dry_friction():
+    """`sign(v)`: the block rests where it must, from when it must, with the derivative by the coefficient of friction.
+
+    Twins: without sliding the motion is not followed to its rest; the usual tanh creeps 9 % off.
+    """
+    rubbed = block(lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.sign(v))
+    right, n = rest_of_block(0.3)
+    stop = n * np.pi / np.sqrt(SPRING / MASS)
+    end = lambda mu: lj.integrate(rubbed, 0.5, 0.0, mu, ts=jnp.array([0.0, stop - 1e-3, stop, 4.0]))
+    traj = end(0.3)
+    np.testing.assert_allclose(traj.q[2:], right, rtol=1e-7)
+    assert abs(traj.v[1]) > 1e-3 and np.max(np.abs(traj.v[2:])) < 1e-9 and not traj.stats["lost_jumps"]
+    slope = -((-1) ** n) * 2 * n * MASS * GRAVITY / SPRING
+    np.testing.assert_allclose(jax.grad(lambda mu: end(mu).q[-1])(0.3), slope, rtol=1e-8)
+    creeping = block(lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.tanh(v / 1e-3))
+    crept = lj.integrate(creeping, 0.5, 0.0, 0.3, ts=[0.0, 4.0], method=lj.Radau5()).q[-1]
+    assert abs(crept - right) > 0.05 * abs(right)
+
+
+@pytest.mark.slow
+def test_friction_in_other_words(monkeypatch):
+    """Nested `where`, and |v| in Rayleigh's function; twin: a motion that may not slide is not followed to its rest."""
+    size = 0.3 * MASS * GRAVITY
+    nested = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
+    rayleigh = block(dissipation=lambda t, q, v, p: size * jnp.abs(v))
+    for system in (nested, rayleigh):
+        traj = lj.integrate(system, 0.5, 0.0, ts=[0.0, 4.0])
+        np.testing.assert_allclose(traj.q[-1], rest_of_block(0.3)[0], rtol=1e-7)
+    monkeypatch.setattr(over_jumps, "slidable", lambda jumps, system: ())
+    other = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
+    lost = lj.integrate(other, 0.5, 0.0, ts=[0.0, 4.0], throw=False, max_steps=10_000)
+    assert not lost.q[-1] == traj.q[-1]
+
+
+@pytest.mark.slow
+def test_stick_and_slip():
+    """A block pulled by a spring on a floor with friction: it sticks, and slips u (s - sin(ω s)/ω) at a time.
+
+    Twin: pulled twice as fast.
+    """
+    pulled = lj.System(
+        lambda t, q, v, p: 0.5 * v**2 - 0.5 * 4.0 * (q - p["u"] * t) ** 2,
+        force=lambda t, q, v, p: -p["mu"] * jnp.sign(v),
+    )
+
+    def right(t, u, mu):
+        q = 0.0
+        while True:
+            # The spring is as strong as friction.
+            begin = (mu / 4.0 + q) / u
+            if t <= begin:
+                return q
+            if t <= begin + np.pi:
+                return q + u * ((t - begin) - np.sin(2 * (t - begin)) / 2)
+            q += u * np.pi
+
+    ts = np.linspace(0.0, 12.0, 13)
+    traj = lj.integrate(pulled, 0.0, 0.0, {"u": 0.5, "mu": 1.0}, ts=ts)
+    np.testing.assert_allclose(traj.q, [right(t, 0.5, 1.0) for t in ts], rtol=1e-8, atol=1e-9)
+    assert traj.stats["num_jumps"] >= 6
+    assert abs(traj.q[-1] - right(12.0, 1.0, 1.0)) > 1
+
+
+@pytest.mark.slow
+def test_a_relay_that_slides():
+    """u = -4 sign(q + v/2): after the first jump the motion stays on q + v/2 = 0, where q decays by e in 1/2.
+
+    Twin: with a force of 1 it cannot stay at first.
+    """
+    relay = lj.System(kinetic, force=lambda t, q, v, p: -p * jnp.sign(q + 0.5 * v))
+    ts = np.array([0.0, 1.0, 2.0, 4.0])
+    begin = (-2 + np.sqrt(12)) / 4
+    right = (1 - 2 * begin**2) * np.exp(-2 * (ts[1:] - begin))
+    np.testing.assert_allclose(lj.integrate(relay, 1.0, 0.0, 4.0, ts=ts).q[1:], right, rtol=1e-8)
+    assert abs(lj.integrate(relay, 1.0, 0.0, 1.0, ts=ts).q[1] - right[0]) > 0.01
+
+
+@pytest.mark.slow
+def test_two_blocks_at_once():
+    """Two blocks that slide and rest together, from one array of signs, in lanes of different friction."""
+    blocks = lj.System(
+        lambda t, q, v, p: 0.5 * MASS * jnp.sum(v**2) - 0.5 * SPRING * jnp.sum(q**2),
+        force=lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.sign(v),
+    )
+    end = lambda mu: lj.integrate(blocks, jnp.array([0.5, 0.45]), jnp.zeros(2), mu, ts=jnp.array([0.0, 4.0])).q[-1]
+    coefficients = np.array([0.3, 0.35])
+    found = jax.jit(jax.vmap(end))(jnp.asarray(coefficients))
+    right = [[rest_of_block(mu, x)[0] for x in (0.5, 0.45)] for mu in coefficients]
+    np.testing.assert_allclose(found, right, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_table():
+    """A force from a table: as from the straight lines between its knots; derivative against a difference quotient."""
+    knots, heights = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
+    tabled = lj.System(kinetic, force=lambda t, q, v, p: p * jnp.interp(q, knots, heights))
+    end = lambda p, **options: lj.integrate(tabled, 1.5, 0.0, p, ts=jnp.array([0.0, 5.0]), **options)
+    exact = end(1.0, jumps="ignored", rtol=1e-12)
+    found = end(1.0)
+    np.testing.assert_allclose(found.q[-1], exact.q[-1], rtol=1e-8)
+    assert found.stats["num_steps"] < end(1.0, jumps="ignored").stats["num_steps"]
+    h = 1e-4
+    quotient = (end(1.0 + h, rtol=1e-12).q[-1] - end(1.0 - h, rtol=1e-12).q[-1]) / (2 * h)
+    np.testing.assert_allclose(jax.grad(lambda p: end(p).q[-1])(1.0), quotient, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_many_numbers():
+    """A gradient by thirty numbers, which replays the steps of each leg; twin: one more number than counted."""
+    rubbed = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, force=lambda t, q, v, p: -jnp.sum(p) * jnp.sign(v))
+    end = lambda p: lj.integrate(rubbed, 1.0, 0.0, p, ts=jnp.array([0.0, 2.0])).q[-1]
+    # Rest at the far turning point of a half swing would be at -1 + 2 p; here q = p - (1 - p) cos t until pi.
+    found = jax.grad(end)(jnp.full(30, 0.1 / 30))
+    np.testing.assert_allclose(found, 1 - np.cos(2.0), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_fit():
+    """The edge and the strength of a brake from its motion without noise; twin: where they started."""
+    ts, true = np.linspace(0.0, 2.0, 21), {"edge": 0.73, "by": 1.7}
+    traj = lj.integrate(brake, 0.0, 2.0, true, ts=ts)
+    fit = lj.fit(brake, lj.Record(ts, traj.q, q0=0.0, v0=2.0), {"edge": 0.5, "by": 1.0})
+    np.testing.assert_allclose([fit.params["edge"], fit.params["by"]], [0.73, 1.7], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_events_and_constraints():
+    """Events are recorded over all legs; a bead on a rod with friction comes to rest where friction holds it."""
+    rod = lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1)
+    bead = lj.System(
+        lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - GRAVITY * q["y"],
+        {"rod": rod},
+        force=lambda t, q, v, p: {"x": -0.9 * jnp.sign(v["x"]), "y": 0.0 * v["y"]},
+    )
+    start = {"x": 0.5, "y": -np.sqrt(0.75)}, {"x": 0.0, "y": 0.0}
+    passes = {"low": lj.Crossing(lambda t, q, v, p: q["x"], terminal=False)}
+    traj = lj.integrate(bead, *start, ts=[0.0, 1.0, 5.0], events=passes)
+    # Friction along x holds the bead where |tan| of its angle is at most 0.9/g.
+    assert abs(traj.q["x"][-1] / traj.q["y"][-1]) < 0.9 / GRAVITY and abs(traj.v["x"][-1]) < 1e-12
+    assert int(traj.events["low"].count) == 2 and np.all(np.diff(traj.events["low"].found().t) > 0)
+    np.testing.assert_allclose(traj.events["low"].found().q["x"], 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_state_on_a_jump_throughout():
+    """A guard that stays at zero costs no steps and changes nothing; twin: that the motion is there at all."""
+    flat = lj.System(
+        lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * q["x"] ** 2,
+        force=lambda t, q, v, p: {"x": 0.0 * q["x"], "y": -10 * jnp.maximum(q["y"], 0.0)},
+    )
+    traj = lj.integrate(flat, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, ts=[0.0, 20.0])
+    np.testing.assert_allclose(traj.q["x"][-1], np.cos(20.0), rtol=1e-9)
+    assert traj.stats["num_steps"] < 40
+
+
+@pytest.mark.slow
+def test_what_cannot_be_followed_is_said():
+    """A comparison in a loop, and more jumps than are followed; a value of `jumps` that does not exist."""
+    loop = lj.System(kinetic, force=lambda t, q, v, p: jax.lax.fori_loop(0, 2, lambda i, x: jnp.where(x > 0, -x, x), q))
+    with pytest.warns(lj.JumpWarning, match="a comparison inside a loop"):
+        lj.integrate(loop, 1.0, 0.0, ts=[0.0, 1.0])
+    ringing = lj.System(
+        lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, force=lambda t, q, v, p: -0.01 * jnp.where(q > 0, 1.0, 0.3)
+    )
+    with pytest.warns(lj.JumpWarning, match="after 1000 jumps"):
+        traj = lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 4000.0], estimate_error=False)
+    assert traj.stats["num_jumps"] == 1000 and np.isfinite(traj.q[-1])
+    with pytest.raises(ValueError, match="jumps must be 'found' or 'ignored'"):
+        lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 1.0], jumps=[0.5])
+
+
+@pytest.mark.slow
+def test_a_push_sets_a_block_free():
+    """A block rests until a push in time is stronger than friction; derivatives by the push's ends and strength.
+
+    With d the duration it slides (F - 1) d²/2 during the push and ((F - 1) d)²/2 afterwards. Twin: a weak push.
+    """
+    pushed = lj.System(kinetic, force=lambda t, q, v, p: -jnp.sign(v) + jnp.where((t > p[0]) & (t < p[1]), p[2], 0.0))
+    end = lambda *p: lj.integrate(pushed, 0.0, 0.0, p, ts=jnp.array([0.0, 1.2, 3.0])).q[-1]
+    right = lambda a, b, strength: (strength - 1) / 2 * (b - a) ** 2 + ((strength - 1) * (b - a)) ** 2 / 2
+    at = (1.0, 1.5, 2.0)
+    np.testing.assert_allclose(end(*at), right(*at), rtol=1e-12)
+    found = jax.jacfwd(end, argnums=(0, 1, 2))(*at)
+    np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1, 2))(*at), rtol=1e-9)
+    assert abs(end(1.0, 1.5, 0.5)) < 1e-12

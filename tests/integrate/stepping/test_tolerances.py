@@ -1,0 +1,221 @@
+"""Tolerances from a motion's own size: the same motion in any units, and numbers without a size of their own."""
+
+import warnings
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.stepping.tolerances import PerCoordinateTolerance, Tolerances, rounding, scales_of, shared
+from lagjax.numerics.methods.radau import SimplifiedNewton
+
+# The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
+UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}
+rod = lj.System(
+    lambda t, q, v, p: 0.5 * p["m"] * jnp.sum(v**2) - p["m"] * p["g"] * q[1],
+    constraints={"rod": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - p["l"] ** 2)},
+)
+# A length and an angle: a mass on a spring that turns.
+turning = lj.System(
+    lambda t, q, v, p: (
+        0.5 * p["m"] * (v["r"] ** 2 + (q["r"] * v["psi"]) ** 2)
+        - 0.5 * p["k"] * (q["r"] - p["l"]) ** 2
+        + p["m"] * p["g"] * q["r"] * jnp.cos(q["psi"])
+    )
+)
+driven = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["push"] * q)
+
+
+def on_rod(length=1.0, time=1.0, **options):
+    """Swings of a pendulum in Cartesian coordinates, in these units of length and time."""
+    g, ts = length / time**2, np.linspace(0.0, 20.0, 9) * time
+    q0 = length * np.array([np.sin(1.25), -np.cos(1.25)])
+    return lj.integrate(rod, q0, np.zeros(2), {"m": 2.0, "l": length, "g": g}, ts=ts, **options)
+
+
+def on_spring(length=1.0, time=1.0, **options):
+    """Swings of a mass on a spring: a length and an angle, of which only the length changes with the unit."""
+    params = {"m": 2.0, "l": length, "k": 32.0 / time**2, "g": length / time**2}
+    q0, v0 = {"r": 1.25 * length, "psi": 0.0}, {"r": 0.0, "psi": 1.5 / time}
+    return lj.integrate(turning, q0, v0, params, ts=np.linspace(0.0, 20.0, 9) * time, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+def test_any_units():
+    """Any units give the same digits and steps; twin: an absolute tolerance loses a motion of nanometres."""
+    usual = on_rod()
+    for name, (length, time) in UNITS.items():
+        other = on_rod(length, time)
+        assert int(other.stats["num_steps"]) == int(usual.stats["num_steps"]), name
+        np.testing.assert_allclose(other.q / length, usual.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(other.v * time / length, usual.v, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.max(other.error.q) / length, np.max(usual.error.q), rtol=1e-3)
+        assert float(other.scaled_error) < 1e-3
+    lost = on_rod(2.0**-30, atol=1e-9)
+    assert np.max(np.abs(lost.q / 2.0**-30 - usual.q)) > 1e-3 and float(lost.scaled_error) > 1
+
+
+@pytest.mark.slow
+def test_an_angle_beside_a_length():
+    """The unit of length does not affect the angle's tolerance, except for round-off among very light masses."""
+    usual = on_spring()
+    for name, (length, time) in UNITS.items():
+        other = on_spring(length, time)
+        assert abs(int(other.stats["num_steps"]) - int(usual.stats["num_steps"])) <= 2, name
+        np.testing.assert_allclose(other.q["psi"], usual.q["psi"], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(other.q["r"] / length, usual.q["r"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("start", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], ids=["extent", "speed", "push"])
+def test_small_motions(start):
+    """Motions of a nanometre by extent, speed or force agree with the closed form to nine digits."""
+    (q0, v0, push), t = 1e-9 * np.array(start), np.linspace(0.0, 200.0, 11)
+    traj = lj.integrate(driven, q0, v0, {"push": push}, ts=t)
+    expected = push + (q0 - push) * np.cos(t) + v0 * np.sin(t)
+    np.testing.assert_allclose(traj.q, expected, rtol=0, atol=1e-9 * 1e-9)
+    np.testing.assert_allclose(traj.q, expected, rtol=0, atol=5 * float(np.max(traj.error.q)))
+
+
+def test_given_tolerances_stay():
+    """A given atol stays in the user's units; the print tells it from tolerances by size."""
+    given, own = on_rod(atol=1e-9), on_rod()
+    assert given.tolerance[1].shape == (2,) and own.tolerance[1].shape == (2, 2)
+    assert "atol 1e-09" in str(given) and "atol by size" in str(own)
+
+
+def weighed(size, error, sizes_so_far=None, mass=(1.0, 1.0), rtol=1e-9):
+    """The weighed error, (2, 2), of one step of length 1 from and to coordinates and velocities of this size."""
+    y = tuple(jnp.asarray(row) for row in size)
+    scales = scales_of(jnp.asarray(mass), *y, jnp.zeros(2), 1.0)
+    if sizes_so_far is not None:
+        scales = scales._replace(first=jnp.asarray(sizes_so_far))
+    weighing = PerCoordinateTolerance(
+        diffrax.PIDController(rtol=rtol, atol=rtol),
+        Tolerances(jnp.full(2, rtol), jnp.full(2, rtol)),
+        scales,
+        (False, False),
+    )
+    error, _ = weighing._weighed(jnp.asarray(1.0), y, y, tuple(jnp.asarray(row) for row in error), scales.first)
+    own = rtol * (1 + np.abs(np.asarray(size)))
+    return np.asarray(error) / own
+
+
+def test_each_by_its_own_size():
+    """An error of rtol |y| counts as one whatever |y| is; |y| is at least a thousandth of the largest so far."""
+    size = np.array([[1e-12, 1e9], [3e-12, 2e9]])
+    np.testing.assert_allclose(weighed(size, 1e-9 * size, mass=(1e18, 1e-24)), 1.0, rtol=1e-2)
+    died_out = weighed(1e-6 * np.ones((2, 2)), 1e-12 * np.ones((2, 2)), sizes_so_far=np.ones((2, 2)))
+    np.testing.assert_allclose(died_out, 1.0, rtol=1e-2)
+
+
+def test_what_others_round_off():
+    """A coordinate at round-off has the others' round-off as its tolerance, scaled by the masses."""
+    size = np.array([[1e3, 1e-16], [1.0, 1e-19]])
+    assert np.all(weighed(size, np.array([[0.0, 1e-13], [0.0, 1e-16]])) < 1)
+    # With 1e12 times the mass, a millionth of the other's motion is as much to it.
+    assert weighed(size, np.array([[0.0, 1e-13], [0.0, 0.0]]), mass=(1.0, 1e12))[0, 1] > 1
+
+
+def test_scales_have_units():
+    """Scales follow the units of length and time; twin: changing one coordinate's unit does not affect the others."""
+    mass, q, v, a = jnp.asarray([4.0, 0.25]), jnp.asarray([3.0, 0.0]), jnp.asarray([0.0, 0.5]), jnp.asarray([1.0, 2.0])
+    usual = scales_of(mass, q, v, a, 10.0)
+    length, time = 2.0**-20, 2.0**12
+    other = scales_of(mass / length**2 * time**2, length * q, length / time * v, length / time**2 * a, 10.0 * time)
+    np.testing.assert_allclose(other.time, time * usual.time, rtol=1e-14)
+    rates = np.array([[length], [length / time]])
+    np.testing.assert_allclose(other.first, rates * np.asarray(usual.first), rtol=1e-14)
+    np.testing.assert_allclose(
+        rounding(shared(other, other.first)), rates * np.asarray(rounding(shared(usual, usual.first))), rtol=1e-14
+    )
+    unit = np.array([1.0, 2.0**20])
+    mixed = scales_of(mass / unit**2, unit * q, unit * v, unit * a, 10.0)
+    np.testing.assert_allclose(mixed.time, usual.time, rtol=1e-14)
+    np.testing.assert_allclose(shared(mixed, mixed.first)[:, 0], shared(usual, usual.first)[:, 0], rtol=1e-14)
+
+
+def test_regular_in_any_units():
+    """A mass of a gram on a rod of a light year is not singular; twin: a coordinate without mass is."""
+    q0 = 2.0**54 * np.array([np.sin(1.25), -np.cos(1.25)])
+    a, _ = lj.accelerations(rod, 0.0, q0, np.zeros(2), {"m": 1e-3, "l": 2.0**54, "g": 1.0})
+    np.testing.assert_allclose(a @ q0 / 2.0**54, 0.0, atol=1e-14)
+    with pytest.raises(ValueError, match="singular"):
+        lj.accelerations(rod, 0.0, q0, np.zeros(2), {"m": 0.0, "l": 2.0**54, "g": 1.0})
+
+
+def test_at_rest_until_a_force_sets_in():
+    """The size of a motion whose force sets in later is unknown at the start: it is computed without a warning."""
+    late = lj.System(
+        lambda t, q, v, p: 0.5 * v**2 - 0.5 * (q - p["rest"]) ** 2,
+        force=lambda t, q, v, p: jnp.where(t > 5.25, 10.0, 0.0),
+    )
+    for rest in (0.0, 1.0):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            traj = lj.integrate(late, rest, 0.0, {"rest": rest}, ts=np.array([0.0, 6.0]), max_step=0.5)
+        np.testing.assert_allclose(traj.q[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
+
+
+@pytest.mark.exhaustive
+def test_at_round_off_without_mass():
+    """A coordinate that is zero within round-off and has no mass to compare it by does not stop the motion."""
+    beside = lj.Holonomic(lambda t, q, p: q[2] - 3.0 * (q[0] ** 2 + q[1] ** 2 - 1.0))
+    massless = lj.System(
+        lambda t, q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2) - q[1],
+        constraints={"rod": lj.Holonomic(lambda t, q, p: q[0] ** 2 + q[1] ** 2 - 1.0), "beside": beside},
+    )
+    q0 = np.array([np.sin(1.25), -np.cos(1.25), 0.0])
+    traj = lj.integrate(massless, q0, np.zeros(3), ts=np.linspace(0.0, 20.0, 9))
+    np.testing.assert_allclose(traj.q[:, :2], on_rod().q, rtol=0, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_rest_at_zero_in_any_units():
+    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps.
+
+    Twin: with a root finder whose tolerance is of the order of a metre, nanometres take other steps.
+    """
+    late = lj.System(
+        lambda t, q, v, p: 0.5 * v**2,
+        force=lambda t, q, v, p: p["unit"] * t**3 - 100 * q - 50 * v - 1e3 * q**3 / p["unit"] ** 2,
+    )
+
+    def of(unit, method):
+        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=method, rtol=1e-6)
+        return float(traj.q[-1]) / unit, int(traj.stats["num_steps"])
+
+    in_metres = lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-6, atol=1e-9))
+    (q, steps), (absolute, of_absolute) = of(1.0, lj.Radau5()), of(1.0, in_metres)
+    for unit in (2.0**-30, 2.0**54):
+        found, count = of(unit, lj.Radau5())
+        assert count == steps
+        np.testing.assert_allclose(found, q, rtol=1e-13)
+    found, count = of(2.0**-30, in_metres)
+    assert abs(found / absolute - 1) > 1e-10 or count != of_absolute
+
+
+@pytest.mark.slow
+def test_off_a_constraint_at_zero_in_any_units():
+    """How far a start at zero may be off a constraint follows from its acceleration, in any unit of length.
+
+    Twin: without a force there is no size, and what is refused in metres is not in nanometres.
+    """
+    pair = lj.System(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) + p["push"] * q[0],
+        constraints={"bar": lj.Holonomic(lambda t, q, p: q[0] - q[1] - p["gap"])},
+    )
+
+    def accepted(gap, push, unit):
+        params = {"gap": gap * unit, "push": push * unit}
+        traj = lj.integrate(pair, np.zeros(2), np.zeros(2), params, ts=np.array([0.0, 1.0]), throw=False)
+        return bool(traj.result == lj.RESULTS.successful)
+
+    units = (1.0, *(length for length, _ in UNITS.values()))
+    assert all(accepted(1e-8, 1.0, unit) and not accepted(1e-6, 1.0, unit) for unit in units)
+    assert accepted(1e-6, 0.0, UNITS["nanometres"][0]) and not accepted(1e-6, 0.0, 1.0)
+    with pytest.raises(ValueError, match="off the constraints: 'bar' = -9.31e-16"):
+        params = {"gap": 1e-6 * 2.0**-30, "push": 2.0**-30}
+        lj.integrate(pair, np.zeros(2), np.zeros(2), params, ts=np.array([0.0, 1.0]))

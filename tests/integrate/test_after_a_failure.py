@@ -1,0 +1,130 @@
+"""After a failure nothing is finite; guards that touch zero; the verdict does not depend on units."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.trajectory.error_report import in_units_of
+
+ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
+bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))
+zeno = lj.Hybrid({"flying": ball}, [bounce], most_switches=50)
+PARAMS = {"g": 10.0}
+TS = np.array([0.0, 1.0, 3.5])
+
+
+def finite_after(traj, t):
+    """The names of the fields that hold a finite number at outputs, crossings or switches after a time."""
+    found = []
+    rows = {"q": traj.q, "v": traj.v, "multipliers": traj.multipliers}
+    if traj.error is not None:
+        rows |= {"error.q": traj.error.q, "error.v": traj.error.v}
+    late = np.asarray(traj.t) > t
+    for name, tree in rows.items():
+        found += [name for x in jax.tree.leaves(tree) if np.isfinite(np.asarray(x)[..., late]).any()]
+    events = dict(traj.events) | ({"switches": traj.switches} if isinstance(traj, lj.HybridTrajectory) else {})
+    for name, crossings in events.items():
+        times = np.asarray(crossings.t)
+        found += [name] if np.any(times[np.isfinite(times)] > t + 1e-9) else []
+    return found
+
+
+def test_bounces_that_accumulate():
+    """A ball (e = 0.5, from 5 at g = 10) bounces infinitely often until t = 3; from there on nothing is finite.
+
+    Twin: with e = 1 it bounces three times until 3.5 and is known throughout.
+    """
+    traj = lj.integrate(zeno, 5.0, 0.0, PARAMS, ts=TS, throw=False)
+    assert traj.result == lj.RESULTS.too_many_switches and np.isinf(traj.scaled_error)
+    np.testing.assert_allclose(traj.end.t, 3.0, rtol=1e-9)
+    assert np.isfinite(traj.q[:2]).all() and not finite_after(traj, 3.0)
+    with pytest.raises(RuntimeError, match="(?s)infinitely many switches.*each takes 0.5 of.*about t = 3\\b"):
+        lj.integrate(zeno, 5.0, 0.0, PARAMS, ts=TS)
+    with pytest.raises(ValueError, match="ended at t = 3"):
+        traj.at(3.2)
+    elastic = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, 1.0))])
+    traj = lj.integrate(elastic, 5.0, 0.0, PARAMS, ts=TS)
+    np.testing.assert_allclose(traj.q, [5.0, 0.0, 5.0 * (1 - 0.25)], atol=1e-8)
+
+
+@pytest.mark.slow
+def test_bounces_that_accumulate_in_lanes():
+    """The same for lanes, under jit, and in a sweep."""
+    run = lambda h: lj.integrate(zeno, h, 0.0, PARAMS, ts=TS, throw=False)
+    traj = jax.jit(jax.vmap(run))(np.array([5.0, 4.0]))
+    assert np.isnan(traj.q[:, 2]).all() and np.isinf(traj.scaled_error).all() and np.isfinite(traj.q[:, 0]).all()
+    swept = lj.sweep(lambda point: run(point["h"]).q[-1], {"h": np.array([5.0, 4.0])}, progress=False)
+    assert np.isnan(swept.values).all()
+
+
+row = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
+gaps = [
+    lj.Switch("fly", to="fly", when=lj.touches(lambda t, q, p, i=i: q[i + 1] - q[i] - 0.2, lambda s: 1.0 + 0 * s))
+    for i in range(2)
+]
+cradle = lj.Hybrid({"fly": row}, gaps)
+
+
+@pytest.mark.parametrize(
+    "q, v, right, count",
+    [
+        ([-0.3, 0.1, 0.3], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2),
+        ([-0.3, -0.1, 0.3], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0], 2),
+        # A gap of +5.6e-17, and none that closes.
+        ([0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0),
+        ([0.1, 0.3, 0.5], [-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], 0),
+        # Twin: what closes hits at once.
+        ([0.1, 0.3, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2),
+        ([0.1, 0.3, 0.5], [1.0, 0.0, -1.0], [-1.0, 0.0, 1.0], 3),
+    ],
+)
+def test_balls_that_touch(q, v, right, count):
+    """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
+    traj = lj.integrate(cradle, np.array(q), np.array(v), ts=[0.0, 0.5])
+    np.testing.assert_allclose(traj.v[-1], right, atol=1e-14)
+    assert isinstance(traj, lj.HybridTrajectory)
+    assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
+
+
+def test_steps_that_collapse():
+    """A fall into a centre: nothing is finite after the failure; at(t) refuses."""
+    fall = lj.System(lambda t, q, v, p: 0.5 * v**2 + 1.0 / q)
+    events = {"low": lj.Crossing(lambda t, q, v, p: q - 0.5, terminal=False, most=4)}
+    ts = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+    traj = lj.integrate(fall, 1.0, 0.0, ts=ts, events=events, throw=False)
+    assert not lj.RESULTS.successful == traj.result and float(traj.end.t) < 1.2
+    assert not finite_after(traj, float(traj.end.t)) and np.isinf(traj.scaled_error)
+    assert np.isfinite(traj.q[:3]).all()
+
+
+pulse = lj.System(
+    lambda t, q, v, p: 0.5 * v**2 + q * p["F"] * jnp.where((t > p["lo"]) & (t < p["hi"]), 1.0, 0.0),
+)
+
+
+@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_number_that_is_zero_throughout(unit):
+    """A run that steps over a pulse is zero throughout; the error, 0.595, is then its size, in any unit of length.
+
+    Twin: with max_step the pulse is seen, and the same verdict says that all is well, in any unit.
+    """
+    params = {"F": unit, "lo": 4.0, "hi": 4.1}
+    # With `jump_ts` elsewhere, only the times that are named are steps' ends.
+    options = {"ts": [0.0, 10.0], "throw": False}
+    missed = lj.integrate(pulse, 0.0, 0.0, params, **options)
+    if float(missed.q[-1]) == 0.0:
+        np.testing.assert_allclose(missed.error.q[-1] / unit, 0.595, rtol=1e-6)
+        np.testing.assert_allclose(missed.scaled_error, 2000.0)
+    found = lj.integrate(pulse, 0.0, 0.0, params, max_step=0.05, **options)
+    np.testing.assert_allclose(found.q[-1] / unit, 0.595, rtol=1e-6)
+    assert float(found.scaled_error) < 1e-2
+
+
+def test_errors_of_zero_have_no_unit():
+    """Where a size is unknown the error is the size, in NumPy and in JAX; twin: an error of zero is none."""
+    for xp in (np, jnp):
+        found = in_units_of(xp, xp.asarray([0.595, 0.595e-6, 0.595e6, 0.0, 2.0]), xp.asarray([0.0, 0, 0, 0, 1]))
+        np.testing.assert_allclose(found, [2000, 2000, 2000, 0, 2])

@@ -1,0 +1,176 @@
+"""The overhead of a call: nothing is traced twice, and the robust solve is compiled only if it is needed."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.jaxtools import program_cache as kept
+from lagjax.jaxtools.tracing import is_eager
+from tests.counting import compiles
+from tests.systems import HORIZONTAL, PARAMS, TS, cartesian_lagrangian, pendulum, rod, rod_pendulum
+
+GRAVITY = 9.81
+traced = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, **kw: traced.append(name) if "jaxpr_trace" in name else None
+)
+drop = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * GRAVITY * q)
+
+
+def traces(call):
+    """Return the result of a call, and how often JAX traced something in it."""
+    before = len(traced)
+    found = call()
+    return found, len(traced) - before
+
+
+def test_a_second_call_traces_nothing():
+    """Numbers of any type trace at most L, if it reads a global; after the global has changed, all is traced again."""
+    fall = lambda q0, m, ts: lj.integrate(drop, q0, 0.0, {"m": m}, ts=ts).q[-1]
+    assert fall(1.0, 2.0, [0.0, 0.5, 1.0]) == pytest.approx(1.0 - 9.81 / 2, abs=1e-8)
+    for q0, m, ts in (
+        (1.5, 3.0, np.array([0.0, 0.25, 1.0])),
+        (np.float64(1.5), np.array(3.0), (0.0, 0.5, 1.0)),
+        (jnp.asarray(1.5, float), jnp.asarray(3.0, float), jnp.array([0.0, 0.5, 1.0])),
+    ):
+        found, count = traces(lambda: fall(q0, m, ts))
+        assert float(found) == pytest.approx(1.5 - 9.81 / 2, abs=1e-8) and count <= 1
+    swing = lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS).q[-1]
+    swing(0.5)
+    assert traces(lambda: swing(0.6))[1] == 0
+    globals()["GRAVITY"] = 1.62
+    found, count = traces(lambda: fall(1.5, 3.0, TS))
+    assert float(found) == pytest.approx(1.5 - 1.62 / 2, abs=1e-8) and count > 1
+
+
+def falling(g, shift=0.0):
+    """Return a system of newly made functions, which also close over a list."""
+    kept = [g]
+    return lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["m"] * kept[0] * (q - shift)), kept
+
+
+@pytest.mark.exhaustive
+def test_the_same_program_serves():
+    """One program serves any number of outputs, and functions that mean the same, but no others."""
+    at = np.linspace(0.0, 1.0, 100)
+    fall = lambda system, m=2.0, ts=at, **kw: np.asarray(lj.integrate(system, 1.0, 0.0, {"m": m}, ts=ts, **kw).q)
+    (first, kept), (again, kept_too) = falling(9.81), falling(9.81)
+    floor = lambda level=0.0: {"floor": lj.Crossing(lambda t, q, v, p: q - level)}
+    expected = fall(first)
+    with_event = fall(first, events=floor())
+    with compiles() as count:
+        np.testing.assert_allclose(fall(first, ts=np.linspace(0.0, 1.0, 101))[[0, -1]], expected[[0, -1]], atol=1e-9)
+        np.testing.assert_array_equal(fall(again), expected)
+        np.testing.assert_array_equal(fall(again, events=floor()), with_event)
+    assert not count and not np.isfinite(with_event[-1])
+    # Twins: another constant, another level, or a constant that has since changed, give another motion.
+    assert fall(falling(1.62)[0])[-1] == pytest.approx(1.0 - 1.62 / 2)
+    ended = lj.integrate(again, 1.0, 0.0, {"m": 2.0}, ts=at, events=floor(0.5)).end
+    assert float(ended.t) == pytest.approx(np.sqrt(1 / 9.81))
+    kept[0] = 1.62
+    np.testing.assert_array_equal(fall(again), expected)
+    assert fall(first)[-1] == pytest.approx(1.0 - 1.62 / 2)
+    kept_too[0] = 3.7
+    assert fall(again)[-1] == pytest.approx(1.0 - 3.7 / 2)
+
+
+def test_a_whole_number_that_counts_stays_whole():
+    """A whole number in params stays whole, as an index must; the motion is that of the float, also after a float."""
+    table = jnp.array([1.0, 4.0, 9.0])
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * table[p["which"]] * q**2)
+    swing = lambda k, which: float(lj.integrate(spring, 1.0, 0.0, {"k": k, "which": which}, ts=TS).q[-1])
+    assert swing(1.0, 1) == pytest.approx(np.cos(2.0 * TS[-1]), abs=1e-7)
+    assert swing(1, 2) == pytest.approx(np.cos(3.0 * TS[-1]), abs=1e-7)
+    assert swing(4, 1) == pytest.approx(np.cos(4.0 * TS[-1]), abs=1e-7)
+
+
+def test_another_function_is_looked_at():
+    """That shapes were once found correct says nothing about another start."""
+    lj.integrate(pendulum, 0.5, 0.0, PARAMS, ts=TS)
+    with pytest.raises(ValueError, match="energies left unsummed"):
+        lj.integrate(pendulum, np.array([0.5, 0.5]), np.zeros(2), PARAMS, ts=TS)
+
+
+@pytest.mark.exhaustive
+def test_equations_are_taken_for_regular_first():
+    """A rod is regular; a rod given twice is not, and the robust solve finds the same motion."""
+    once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
+    irregular = lambda: sum(getattr(program, "regular", True) is None for program in kept._programs.values())
+    before = irregular()
+    twice = lj.System(cartesian_lagrangian, {name: lj.Holonomic(rod) for name in ("rod", "spare")})
+    both, again = (lj.integrate(twice, *HORIZONTAL, PARAMS, ts=TS) for _ in range(2))
+    assert irregular() == before + 1 and np.array_equal(both.q["x"], again.q["x"])
+    np.testing.assert_allclose(both.q["x"], once.q["x"], atol=1e-8)
+    np.testing.assert_allclose(both.multipliers["rod"], 0.5 * once.multipliers["rod"], atol=1e-7)
+
+
+# In a process of its own, since memory maps come and go for other reasons, too.
+MANY = """
+import gc, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+import lagjax as lj
+from lagjax.jaxtools import program_cache as kept
+from lagjax.jaxtools.memory_maps import LIMIT, share_used
+kept.AT_MOST = int(sys.argv[1])
+used = []
+for i in [*range(6), 0]:
+    system = lj.System(lambda t, q, v, p, g=1.0 + i: 0.5 * p["m"] * v**2 - p["m"] * g * q)
+    last = lj.integrate(system, 1.0, 0.0, {"m": 2.0}, ts=np.linspace(0.0, 1.0, 8)).q[-1]
+    # A dropped program is compiled again.
+    assert abs(float(last) - (1.0 - (1.0 + i) / 2)) < 1e-8
+    gc.collect()
+    used.append(share_used() * int(LIMIT.read_text()))
+print(used[5] - used[2])
+"""
+
+
+@pytest.mark.exhaustive
+def test_programs_of_many_systems_are_dropped():
+    """The number of memory maps stays constant; the twin, which keeps all programs, needs more for each."""
+    grown = lambda kept: float(subprocess.check_output([sys.executable, "-c", MANY, kept], text=True))
+    assert grown("2") < 40 and grown("100") > 60
+
+
+@pytest.mark.exhaustive
+def test_regular_and_robust_agree():
+    """On regular equations both solves agree to round-off; a program that JAX traces uses the robust one."""
+    at_once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-12)
+    traced = jax.jit(lambda p: lj.integrate(rod_pendulum, *HORIZONTAL, p, ts=TS, rtol=1e-12))(PARAMS)
+    for one, other in zip(jax.tree.leaves((at_once.q, at_once.v, at_once.multipliers)),
+                          jax.tree.leaves((traced.q, traced.v, traced.multipliers))):  # fmt: skip
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
+
+
+def test_where_nothing_is_traced():
+    """`is_eager` is false inside all of JAX's transformations, even if no argument is traced."""
+    seen = []
+    look = lambda x: (seen.append(is_eager()), x)[1]
+    look(1.0)
+    for transform in (jax.jit, jax.grad, jax.vmap, jax.linearize):
+        transform(look, *([1.0] if transform is jax.linearize else []))
+        if transform is not jax.linearize:
+            transform(look)(jnp.ones(2) if transform is jax.vmap else 1.0)
+    look(1.0)
+    assert seen[0] and seen[-1] and not any(seen[1:-1])
+
+
+@pytest.mark.exhaustive
+def test_lanes_of_what_functions_close_over():
+    """Batched numbers that L and a guard close over, without `jit`: each lane uses its own. Twin: its neighbour's."""
+
+    def falls(g, level):
+        stone = lj.System(lambda t, q, v, p: 0.5 * v**2 - g * q)
+        events = {"level": lj.Crossing(lambda t, q, v, p: q - level)}
+        return lj.integrate(stone, 2.0, 0.0, ts=np.array([0.0, 9.0]), events=events, throw=False).end.t
+
+    g, level = jnp.array([1.0, 4.0, 16.0]), jnp.array([1.0, 0.5, -1.0])
+    found, expected = jax.vmap(falls)(g, level), np.sqrt(2 * (2.0 - level) / g)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert np.all(np.abs(found - np.roll(expected, 1)) > 0.1)

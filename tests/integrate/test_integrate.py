@@ -1,0 +1,376 @@
+"""`integrate`: accuracy, constraints, derivatives, batches, events, float32."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.jaxtools.jaxpr import length
+from tests.counting import compiles
+from tests.plain import not_plain
+from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
+
+# A wide swing, from 2 rad at 3 rad/s: nonlinear, and without a symmetry that would raise an order.
+SWING = (2.0, 3.0)
+SWING_TS = np.array([0.0, 0.26, 0.77, 1.01])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """The pendulum in its angle at 1e-13, checked against SciPy in `test_against_scipy`."""
+    return lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, rtol=1e-13, atol=1e-13)
+
+
+def test_against_scipy(exact):
+    """The angle agrees with SciPy's DOP853 on the hand-derived equation."""
+    integrate = pytest.importorskip("scipy.integrate")
+    k = PARAMS["g"] / PARAMS["l"]
+    solution = integrate.solve_ivp(
+        lambda t, y: [y[1], -k * np.sin(y[0])], (0, 1.01), SWING, "DOP853", SWING_TS, rtol=1e-13, atol=1e-13
+    )
+    np.testing.assert_allclose(exact.q, solution.y[0], atol=2e-12)
+    np.testing.assert_allclose(exact.v, solution.y[1], atol=1e-11)
+
+
+def test_constraints_hold_at_every_output():
+    """Position and velocity residuals are at round-off at a loose tolerance; without projection they drift."""
+    run = lambda drift: lj.integrate(
+        rod_pendulum, *HORIZONTAL, PARAMS, ts=np.linspace(0, 5, 8), rtol=1e-6, atol=1e-6, drift=drift
+    )
+    projected, free = run("project"), run("none")
+    assert float(projected.residual()) < 1e-14
+    assert float(free.residual()) > 1e-8
+
+
+def test_multipliers_belong_to_the_projected_states():
+    """λ at every output is the tension of the state there: -3 g cos(angle) / (2 l) for a release at 90 degrees."""
+    traj = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(
+        traj.multipliers["rod"], 3 * PARAMS["g"] * traj.q["y"] / PARAMS["l"] / (2 * PARAMS["l"]), atol=1e-9
+    )
+
+
+@pytest.mark.slow
+def test_gradients_in_both_modes():
+    """d(final state, multiplier)/d(start, params), forward and reverse, jitted or not, match a central difference."""
+
+    def outcome(x):
+        traj = lj.integrate(
+            rod_pendulum, {"x": x["l"], "y": 0.0}, {"x": 0.0, "y": x["vy"]}, {"g": x["g"], "l": x["l"]},
+            ts=np.array([0.0, 0.75]), rtol=1e-10, atol=1e-10,
+        )  # fmt: skip
+        return jnp.stack([traj.q["x"][-1], traj.multipliers["rod"][-1]])
+
+    x = {"g": 9.8125, "l": 1.25, "vy": -0.5}
+    outcome = jax.jit(outcome)
+    forward, reverse = jax.jacfwd(outcome)(x), jax.jacrev(outcome)(x)
+    step = 2.0**-13
+    for name in x:
+        # Fourth-order difference: its error (1e-13) and the integration's (1e-10 / step) are both below 1e-6.
+        at = lambda k: outcome(x | {name: x[name] + k * step})
+        difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+        np.testing.assert_allclose(forward[name], difference, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.exhaustive
+def test_second_derivative_forward():
+    """Forward over forward agrees with a central difference of first derivatives."""
+    final = lambda k: lj.integrate(
+        pendulum, 1.0, 0.0, {"g": k, "l": 1.25}, ts=np.array([0.0, 0.5]), rtol=1e-11, atol=1e-11
+    ).q[-1]
+    slope = jax.jit(jax.jacfwd(final))
+    second = jax.jacfwd(jax.jacfwd(final))(9.8125)
+    step = 1e-3
+    np.testing.assert_allclose(second, (slope(9.8125 + step) - slope(9.8125 - step)) / (2 * step), rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "adjoint",
+    [
+        diffrax.ForwardMode(),
+        pytest.param(diffrax.RecursiveCheckpointAdjoint(), marks=pytest.mark.exhaustive),
+        pytest.param(diffrax.BacksolveAdjoint(), marks=pytest.mark.exhaustive),
+    ],
+)
+def test_diffrax_adjoints_are_accepted(adjoint):
+    """Each adjoint gives the derivative of an oscillator's cos(2t) by its stiffness."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
+    mode = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    final = lambda k: lj.integrate(
+        system, 1.0, 0.0, k, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10, adjoint=adjoint
+    ).q[-1]
+    np.testing.assert_allclose(mode(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-7)
+
+
+@pytest.mark.optimised
+@pytest.mark.slow
+def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
+    """vmap gives each lane its own result; a lane with NaN parameters fails alone, with its reason."""
+    lengths = jnp.array([0.5, 1.25, jnp.nan, 2.0])
+    run = lambda l: lj.integrate(pendulum, 1.0, 0.0, {"g": 9.8125, "l": l}, ts=TS, throw=False)
+    batch = jax.vmap(run)(lengths)
+    alone = run(1.25)
+    np.testing.assert_allclose(batch.q[1], alone.q, rtol=1e-9)
+    assert int(batch.stats["num_steps"][1]) == int(alone.stats["num_steps"])
+    good = np.asarray(batch.result == lj.RESULTS.successful)
+    assert good.tolist() == [True, True, False, True]
+    assert bool((batch.result == lj.RESULTS.start_not_finite)[2])
+    assert np.all(np.isnan(batch.q[2]))
+    assert "3 successful" in repr(batch) and "not finite" in repr(batch)
+
+
+@pytest.mark.exhaustive
+def test_gradient_of_a_batch():
+    """The gradient of a sum over lanes is the sum of the lanes' gradients, with shared and with batched inputs."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+    final = lambda k, start: lj.integrate(
+        system, start, 0.0, {"k": k}, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10, throw=False
+    ).q[-1]
+    starts = jnp.array([0.5, 1.0, 2.0])
+    total = lambda k: jnp.sum(jax.vmap(lambda start: jax.jit(final)(k * start, start))(starts))
+    # q(1) = start cos(sqrt(k start)).
+    exact = jnp.sum(-(starts**2) * jnp.sin(jnp.sqrt(4 * starts)) / (2 * jnp.sqrt(4 * starts)))
+    np.testing.assert_allclose(jax.grad(total)(4.0), exact, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive),
+        pytest.param(jax.grad, marks=pytest.mark.exhaustive),
+        lambda f: jax.jit(jax.grad(f)),
+    ],
+)
+def test_gradient_by_a_closed_over_value(transform):
+    """A value that L closes over has its derivative; before such values were lifted, jit(grad) silently gave zero."""
+
+    def final(k):
+        oscillator = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * k * q**2)
+        return lj.integrate(oscillator, 1.0, 0.0, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10).q[-1]
+
+    np.testing.assert_allclose(transform(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_event_is_located_by_the_method():
+    """The rod pendulum passes the vertical at its quarter period, 1e-9 from the elliptic integral, and NaN follows."""
+    special = pytest.importorskip("scipy.special")
+    quarter = special.ellipk(0.5) * np.sqrt(PARAMS["l"] / PARAMS["g"])
+    event = diffrax.Event(lambda t, y, params, **kwargs: y[0]["x"])
+    traj = lj.integrate(
+        rod_pendulum, *HORIZONTAL, PARAMS, ts=np.array([0.0, 0.25, 2.0]), rtol=1e-11, atol=1e-11, event=event
+    )
+    assert abs(float(traj.end.t) - quarter) < 1e-9 * quarter
+    assert float(traj.end.q["x"]) == pytest.approx(0.0, abs=1e-14)
+    np.testing.assert_allclose(traj.end.multipliers["rod"], -3 * PARAMS["g"] / PARAMS["l"] / 2, rtol=1e-9)
+    assert np.isfinite(traj.q["x"]).tolist() == [True, True, False]
+    assert bool(traj.result == lj.RESULTS.event_occurred)
+
+
+@pytest.mark.exhaustive
+def test_lanes_with_and_without_an_event():
+    """A batch may mix lanes that reach the event, that do not, and that fail; a true-or-false condition works too."""
+    event = diffrax.Event({"bottom": lambda t, y, p, **kwargs: y[0], "late": lambda t, y, p, **kwargs: t > 1.5})
+    run = lambda q0, end: lj.integrate(
+        pendulum, q0, 0.0, PARAMS, ts=jnp.stack([jnp.zeros_like(end), end]), event=event, throw=False
+    )
+    batch = jax.jit(jax.vmap(run))(jnp.array([0.5, 0.5, jnp.nan, 3.14]), jnp.array([2.0, 0.25, 1.0, 2.0]))
+    results = [
+        batch.result == r for r in (lj.RESULTS.event_occurred, lj.RESULTS.successful, lj.RESULTS.start_not_finite)
+    ]
+    assert np.array(results).T.tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    assert abs(float(batch.end.q[0])) < 1e-12
+    assert float(batch.end.t[1]) == 0.25
+    assert float(batch.end.t[3]) == pytest.approx(1.5, abs=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_event_time_gradient():
+    """d(quarter period)/dl = T/(2 l), forward and reverse, through the event."""
+    event = diffrax.Event(lambda t, y, params, **kwargs: y[0])
+    time_of = lambda l: (
+        lj.integrate(
+            pendulum,
+            np.pi / 2,
+            0.0,
+            {"g": 9.8125, "l": l},
+            ts=np.array([0.0, 2.0]),
+            rtol=1e-11,
+            atol=1e-11,
+            event=event,
+        ).end.t
+    )
+    expected = float(time_of(1.25)) / 2.5
+    np.testing.assert_allclose(jax.jacfwd(time_of)(1.25), expected, rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(time_of)(1.25), expected, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "method",
+    [None, *(pytest.param(m, marks=pytest.mark.exhaustive) for m in (lj.Dopri8(), lj.Tsit5()))],
+    ids=["default", "8", "5"],
+)
+def test_float32_with_explicit_time(method):
+    """Stages at intermediate times stay in float32 even if JAX has float64 enabled."""
+    driven = lj.System(lambda t, q, v, params: 0.5 * v**2 + params * q * jnp.sin(3 * t))
+    ts = np.array([0.0, 1.0, 2.0], np.float32)
+    traj = lj.integrate(driven, np.float32(0.0), np.float32(0.0), np.float32(2.0), ts=ts, method=method)
+    assert traj.q.dtype == jnp.float32
+    np.testing.assert_allclose(traj.q, 2 * (ts / 3 - np.sin(3 * ts) / 9), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_float32_says_what_it_is():
+    """float32 runs in float32 at its own default tolerance, keeps the constraint to its round-off and says so."""
+    single = lambda tree: jax.tree.map(np.float32, tree)
+    traj = lj.integrate(rod_pendulum, *single(HORIZONTAL), single(PARAMS), ts=TS)
+    assert traj.q["x"].dtype == traj.t.dtype == traj.multipliers["rod"].dtype == jnp.float32
+    assert float(traj.residual()) < 1e-6
+    assert "float32" in repr(traj) and "rtol 1e-05" in repr(traj)
+    np.testing.assert_allclose(
+        traj.q["x"], 1.25 * np.sin(lj.integrate(pendulum, np.pi / 2, 0.0, PARAMS, ts=TS).q), atol=1e-3
+    )
+
+
+def test_one_compilation_for_all_tolerances_states_and_parameters():
+    """New numbers do not compile again: an L that reads the outside is traced once in each call, nothing else."""
+    traced, traces, compiled = [], [], []
+
+    def counted(t, q, v, params):
+        traced.append(1)
+        return 0.8125 * pendulum_lagrangian(t, q, v, params)  # No other test's: programs belong to what L computes.
+
+    system = lj.System(counted)
+    for i, tolerance in enumerate((1e-6, 1e-7, 1e-8)):
+        traced.clear()
+        with compiles() as found:
+            lj.integrate(system, 1.0 + i, 0.0, {"g": 9.0 + i, "l": 1.25}, ts=TS + i, rtol=tolerance, atol=tolerance)
+        traces.append(len(traced))
+        compiled.append(len(found))
+    assert traces == [1, 1, 1] and compiled[0] > 0 == sum(compiled[1:])
+
+
+def test_dissipation_and_force_in_motion():
+    """A driven, damped oscillator follows its exact solution."""
+    system = lj.System(
+        lambda t, q, v, params: 0.5 * v**2 - 0.5 * 4.0 * q**2,
+        force=lambda t, q, v, params: jnp.cos(3 * t),
+        dissipation=lambda t, q, v, params: 0.5 * 0.5 * v**2,
+    )
+    # Steady state: amplitude and phase of 1/(4 - 9 + 1.5 i).
+    response = 1 / (4 - 9 + 1.5j)
+    ts = np.array([0.0, 1.0, 5.0])
+    traj = lj.integrate(system, response.real, (3j * response).real, ts=ts, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(traj.q, (response * np.exp(3j * ts)).real, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_feedback_and_values_closed_over_where_equations_are_not_written_out():
+    """Baumgarte's rate, and a length that a constraint closes over inside `jit`, are arguments of the program."""
+    there = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
+    for drift in ("baumgarte", "none"):
+        traj = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, drift=drift)
+        np.testing.assert_allclose(traj.q["x"], there.q["x"], atol=1e-7)
+
+    @jax.jit
+    def closed_over(length):
+        rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - length**2)
+        system = lj.System(rod_pendulum.lagrangian, {"rod": rod})
+        return lj.integrate(system, {"x": length, "y": 0.0}, HORIZONTAL[1], PARAMS, ts=TS).q["x"]
+
+    np.testing.assert_allclose(closed_over(1.25), there.q["x"], atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_an_empty_batch():
+    """A batch without lanes gives no motions: with every kind of method, constraints, events, derivatives, printed."""
+    nobody = jnp.zeros(0)
+    run = lambda q, **options: lj.integrate(pendulum, q, 0.0, PARAMS, ts=TS, **options)
+    fell = diffrax.Event(lambda t, y, params, **kwargs: y[0] - 0.9)
+    for options in ({}, {"method": lj.Radau5()}, {"method": diffrax.Tsit5()}, {"event": fell}):
+        assert jax.vmap(lambda q: run(q, **options).q)(nobody).shape == (0, 4)
+    assert "lanes         0" in repr(jax.jit(jax.vmap(run))(nobody))
+    rods = jax.vmap(lambda x: lj.integrate(rod_pendulum, {"x": x, "y": 0.0}, HORIZONTAL[1], PARAMS, ts=TS).q["y"])
+    assert rods(nobody).shape == (0, 4)
+    assert jax.vmap(jax.grad(lambda q: run(q).q[-1]))(nobody).shape == (0,)
+    assert jax.grad(lambda q: jnp.sum(jax.vmap(lambda q: run(q).q[-1])(q)))(nobody).shape == (0,)
+    # The failure of one lane among others is still raised.
+    with pytest.raises(RuntimeError, match="not finite"):
+        jax.block_until_ready(jax.vmap(lambda q: run(q).q[-1])(jnp.array([1.0, jnp.nan])))
+
+
+@pytest.mark.slow
+def test_calls_of_the_host_are_the_users():
+    """A force from Python in one branch works in a motion and in a sweep; so does a check of the user's own."""
+    free = lambda t, q, v, p: 0.5 * v**2
+    shape = jax.ShapeDtypeStruct((), jnp.float64)
+
+    def push(t, q, v, p):
+        python = lambda t: jax.pure_callback(lambda t: np.ones_like(t), shape, t, vmap_method="expand_dims")
+        return jax.lax.cond(t < 0.5, python, lambda t: 0.0 * t, t)
+
+    ts = np.array([0.0, 0.5, 1.0])
+    pushed = lj.System(free, force=push)
+    np.testing.assert_allclose(lj.integrate(pushed, 0.0, 0.0, ts=ts).q, [0.0, 0.125, 0.375], atol=1e-9)
+    run = lambda point: lj.integrate(pushed, point["q"], 0.0, ts=ts).q[-1]
+    np.testing.assert_allclose(lj.sweep(run, {"q": [0.0, 1.0]}, progress=False).values, [0.375, 1.375], atol=1e-9)
+
+    checked = lj.System(free, force=lambda t, q, v, p: eqx.error_if(0 * q, q < -0.2, "through the wall"))
+    np.testing.assert_allclose(lj.integrate(checked, 0.0, 1.0, ts=ts).q, ts, rtol=1e-12)
+    with pytest.raises(Exception, match="through the wall"):
+        lj.integrate(checked, 0.0, -1.0, ts=ts)
+
+
+class OwnDopri8(diffrax.Dopri8):
+    """A user's subclass, which is used unchanged."""
+
+
+class OwnTsit5(diffrax.Tsit5):
+    """Another user's subclass."""
+
+
+SHIPPED = [
+    (diffrax.Dopri8(), lj.Dopri8(), OwnDopri8()),
+    pytest.param(diffrax.Tsit5(), lj.Tsit5(), OwnTsit5(), marks=pytest.mark.exhaustive),
+]
+
+
+def by_method(method, **options):
+    """The pendulum on a rod by a method, as a function of gravity."""
+    settings = dict(ts=np.linspace(0.0, 1.0, 3), rtol=1e-9, atol=1e-9, method=method, throw=False) | options
+    return lambda g: lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS | {"g": g}, **settings)
+
+
+@pytest.mark.slow
+@not_plain
+@pytest.mark.parametrize(("shipped", "ours", "own"), SHIPPED, ids=["Dopri8", "Tsit5"])
+def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
+    """A method of diffrax's gives our program, and says so; a subclass runs unchanged, with the same answer."""
+    g, name = jnp.asarray(PARAMS["g"]), type(ours).__name__
+    operations = lambda method: length(jax.make_jaxpr(lambda g: by_method(method)(g).q)(g).jaxpr)
+    assert operations(shipped) == operations(ours) != operations(own)
+    found, expected = by_method(shipped)(g), by_method(own)(g)
+    for mine, theirs in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((expected.q, expected.v))):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-8, atol=1e-8)
+    assert f"{name} (diffrax's, in lagjax's form), rtol" in repr(found)
+    assert "form)" not in repr(expected) + repr(by_method(ours)(g))
+
+
+@pytest.mark.slow
+def test_methods_with_options_stay():
+    """Other methods, those with an option set, and those that a condition evaluates are not replaced by ours."""
+    looped = diffrax.Dopri8(scan_kind="lax")
+    method_by = lambda method, **options: (
+        jax.eval_shape(by_method(method, **options), jnp.asarray(PARAMS["g"])).static.method
+    )
+    assert method_by(looped) == "Dopri8" and method_by(diffrax.Heun()) == "Heun"
+    event = diffrax.Event(lambda t, y, args, *, solver, **kwargs: y[0]["x"] < 0)
+    assert method_by(diffrax.Dopri8(), event=event) == "Dopri8"
+    for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.DirectAdjoint()):
+        assert "in lagjax's form" in method_by(diffrax.Dopri8(), adjoint=adjoint)

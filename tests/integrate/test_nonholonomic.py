@@ -1,0 +1,748 @@
+"""Velocity constraints in motion, against closed forms: rolling, skating, cruising, driven in time.
+
+Each system has its twin in NumPy: `M a = F + Aᵀ λ`, `A a = gamma` written out by hand and integrated by SciPy. The
+correct twin follows the closed form; with one of the usual errors built in, it deviates. So the closed form would show
+that error here too:
+
+    half Chetaev     the force of λ is ½ Aᵀ λ: phi differentiated as if it were linear in v
+    no ∂phi/∂t       gamma without the explicit time of phi
+    no (∂phi/∂q) v   gamma without the turning of phi's rows
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanics import saddle_point
+from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.projection import to_manifold
+from lagjax.system import constraints
+from lagjax.system.model import model_of
+from tests.tiers import exhaustive_but
+
+LOOSE, TIGHT = 1e-5, 1e-11
+# Below this a residual is round-off: coordinates and velocities are of the order of ten.
+ROUND_OFF = 1e-12
+
+
+def gudermannian(s):
+    """gd(s): its sine is tanh(s), its cosine sech(s)."""
+    return 2 * jnp.arctan(jnp.tanh(s / 2))
+
+
+def by_hand(equations, y0, ts, flaw=None):
+    """q, v and λ of `M a = F + Aᵀ λ`, `A a = gamma`, by SciPy.
+
+    `equations(t, q, v)` gives M, F, A and the two parts of gamma, `-∂phi/∂t` and `-(∂phi/∂q) v`.
+    """
+    integrate = pytest.importorskip("scipy.integrate")
+
+    def solve(t, y):
+        q, v = np.split(y, 2)
+        mass, force, rows, by_time, by_position = (np.asarray(part, float) for part in equations(t, q, v))
+        gamma = (flaw != "no d(phi)/dt") * by_time + (flaw != "no (d phi/dq) v") * by_position
+        acting = 0.5 * rows if flaw == "half Chetaev" else rows
+        matrix = np.block([[mass, -acting.T], [rows, np.zeros((len(rows), len(rows)))]])
+        return v, np.linalg.solve(matrix, np.concatenate([force, gamma]))
+
+    rhs = lambda t, y: np.concatenate([solve(t, y)[0], solve(t, y)[1][: y.size // 2]])
+    y = integrate.solve_ivp(rhs, (ts[0], ts[-1]), y0, "DOP853", ts, rtol=1e-12, atol=1e-12).y
+    multipliers = np.array([solve(t, column)[1][y.shape[0] // 2 :] for t, column in zip(ts, y.T)])
+    return (*np.split(y, 2), multipliers.T)
+
+
+def departure(found, expected):
+    """The largest difference between two lists of curves."""
+    return max(float(np.max(np.abs(np.asarray(a) - np.asarray(b)))) for a, b in zip(found, expected, strict=True))
+
+
+# A vertical disk on a plane: heading α, rolling angle φ; the plane may be inclined, with gravity g along x.
+
+
+def disk_lagrangian(t, q, v, params):
+    """L = ½ m (ẋ² + ẏ²) + ½ I φ̇² + ½ J α̇² + m g x."""
+    m = params["m"]
+    sliding = 0.5 * m * (v["x"] ** 2 + v["y"] ** 2) + m * params["g"] * q["x"]
+    return sliding + 0.5 * params["I"] * v["angle"] ** 2 + 0.5 * params["J"] * v["heading"] ** 2
+
+
+def disk_rolls(t, q, v, params):
+    """The point of contact is at rest: ẋ = R φ̇ cos α, ẏ = R φ̇ sin α."""
+    along = jnp.stack([jnp.cos(q["heading"]), jnp.sin(q["heading"])])
+    return jnp.stack([v["x"], v["y"]]) - params["R"] * v["angle"] * along
+
+
+vertical_disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(disk_rolls)})
+DISK = {"m": 1.5, "R": 0.75, "I": 0.5, "J": 0.25, "g": 0.0}
+DISK_START = {"turn": 1.75, "spin": 4.0, "heading": 0.375}
+
+
+def disk_exact(params, start, t):
+    """q, v, λ: α̇ = Ω constant, φ̇ = c + k sin α with k = m g R / ((m R² + I) Ω); circles for g = 0, then a drift."""
+    m, radius, turn, first = params["m"], params["R"], start["turn"], start["heading"]
+    heading = first + turn * t
+    k = m * params["g"] * radius / ((m * radius**2 + params["I"]) * turn)
+    c = start["spin"] - k * jnp.sin(first)
+    spin, spin_rate = c + k * jnp.sin(heading), k * turn * jnp.cos(heading)
+    x_of = lambda a: radius / turn * (c * jnp.sin(a) + 0.5 * k * jnp.sin(a) ** 2)
+    y_of = lambda a: radius / turn * (-c * jnp.cos(a) + k * (0.5 * a - 0.25 * jnp.sin(2 * a)))
+    q = {
+        "angle": c * t - k / turn * (jnp.cos(heading) - jnp.cos(first)),
+        "heading": heading,
+        "x": x_of(heading) - x_of(first),
+        "y": y_of(heading) - y_of(first),
+    }
+    v = {
+        "angle": spin,
+        "heading": turn * jnp.ones_like(t),
+        "x": radius * jnp.cos(heading) * spin,
+        "y": radius * jnp.sin(heading) * spin,
+    }
+    ax = radius * (jnp.cos(heading) * spin_rate - jnp.sin(heading) * turn * spin)
+    ay = radius * (jnp.sin(heading) * spin_rate + jnp.cos(heading) * turn * spin)
+    return q, v, m * jnp.stack([ax - params["g"], ay], axis=-1)
+
+
+def disk_by_hand(params):
+    """M, F, A and gamma of the vertical disk, coordinates (angle, heading, x, y)."""
+    m, radius = params["m"], params["R"]
+
+    def equations(t, q, v):
+        c, s = np.cos(q[1]), np.sin(q[1])
+        mass = np.diag([params["I"], params["J"], m, m])
+        rows = [[-radius * c, 0, 1, 0], [-radius * s, 0, 0, 1]]
+        return mass, [0, 0, m * params["g"], 0], rows, [0, 0], radius * v[0] * v[1] * np.array([-s, c])
+
+    return equations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("g", [0.0, 6.25])
+def test_vertical_disk(g):
+    """A rolling disk runs in circles, on an incline in cycloids; λ is the friction. It rolls at any tolerance."""
+    params, ts = DISK | {"g": g}, np.linspace(0.0, 6.0, 25)
+    q, v, force = jax.tree.map(np.asarray, disk_exact(params, DISK_START, ts))
+    first = lambda tree: {name: float(curve[0]) for name, curve in tree.items()}
+    run = lambda tol, ts: lj.integrate(vertical_disk, first(q), first(v), params, ts=ts, rtol=tol, atol=tol)
+    # Steps end at outputs: few of them leave long steps, which have errors.
+    tight, loose = run(TIGHT, ts), run(LOOSE, ts[::12])
+    for name in q:
+        np.testing.assert_allclose(tight.q[name], q[name], atol=1e-11)
+        np.testing.assert_allclose(tight.v[name], v[name], atol=1e-11)
+    np.testing.assert_allclose(tight.multipliers["rolling"], force, atol=1e-11)
+    speed = params["R"] * np.asarray(loose.v["angle"])
+    sliding = [loose.v[name] - speed * of(loose.q["heading"]) for name, of in (("x", np.cos), ("y", np.sin))]
+    assert np.max(np.abs(sliding)) < ROUND_OFF
+    assert 1e-8 < np.max(np.abs(loose.q["x"] - q["x"][::12])) < 1e-2
+
+
+def test_vertical_disk_would_show_an_error():
+    """The twin follows the closed form; without (∂phi/∂q) v it rolls straight on, half of Aᵀ doubles λ."""
+    params, ts = DISK | {"g": 6.25}, np.linspace(0.0, 6.0, 25)
+    q, v, force = jax.tree.map(np.asarray, disk_exact(params, DISK_START, ts))
+    expected = [np.stack(list(q.values())), np.stack(list(v.values())), force.T]
+    start = np.concatenate([part[:, 0] for part in expected[:2]])
+    run = lambda flaw=None: by_hand(disk_by_hand(params), start, ts, flaw)
+    assert departure(run(), expected) < 1e-9
+    assert departure(run("no (d phi/dq) v"), expected) > 1.0
+    assert departure(run("half Chetaev")[2], expected[2]) > 1.0
+
+
+# A sledge on one blade: contact point (x, y), heading α, centre of mass at the distance a ahead of the blade; gravity g
+# along x. With g = 0 it is Chaplygin's sleigh, with a = 0 the skate on an incline.
+
+
+def sledge_lagrangian(t, q, v, params):
+    """L = ½ m |ṙ_c|² + ½ I α̇² + m g x_c, r_c = r + a (cos α, sin α)."""
+    c, s = jnp.cos(q["heading"]), jnp.sin(q["heading"])
+    a, turn = params["a"], v["heading"]
+    kinetic = 0.5 * params["m"] * ((v["x"] - a * turn * s) ** 2 + (v["y"] + a * turn * c) ** 2)
+    return kinetic + 0.5 * params["I"] * turn**2 + params["m"] * params["g"] * (q["x"] + a * c)
+
+
+def blade(t, q, v, params):
+    """No sideways velocity: -ẋ sin α + ẏ cos α = 0."""
+    return -v["x"] * jnp.sin(q["heading"]) + v["y"] * jnp.cos(q["heading"])
+
+
+sledge = lj.System(sledge_lagrangian, {"blade": lj.Nonholonomic(blade)})
+# I = 3 m a² makes the sleigh's positions elementary: its heading is then 2 gd(s).
+SLEIGH = {"m": 1.25, "a": 0.5, "I": 3 * 1.25 * 0.5**2, "g": 0.0}
+SKATE = {"m": 1.25, "a": 0.0, "I": 0.625, "g": 9.8125}
+SLEDGE_TS = np.linspace(0.0, 4.0, 21)
+
+
+def sleigh_exact(params, t, speed=1.5, first=-1.25):
+    """(heading, x, y), their rates and λ of Chaplygin's sleigh: u = A tanh s, ω = (A/b) sech s, s = s₀ + a A t / b².
+
+    b² = (I + m a²)/m. u̇ = a ω², ω̇ = -(a/b²) u ω; the blade's force is m (u ω + a ω̇).
+    """
+    a, b = params["a"], np.sqrt(params["I"] / params["m"] + params["a"] ** 2)
+    s = first + a * speed * t / b**2
+    u, turn = speed * np.tanh(s), speed / b / np.cosh(s)
+    heading = b / a * np.asarray(gudermannian(s))
+    # b = 2 a: ẋ = u cos(2 gd s), ẏ = u sin(2 gd s), integrated over s.
+    x = b**2 / a * (np.tanh(s) ** 2 - np.log(np.cosh(s)))
+    y = b**2 / a * (np.asarray(gudermannian(s)) - np.tanh(s) / np.cosh(s))
+    v = np.stack([turn, u * np.cos(heading), u * np.sin(heading)])
+    return np.stack([heading, x, y]), v, params["m"] * u * turn * (1 - a**2 / b**2)
+
+
+def skate_exact(params, t, turn=1.5, speed=0.0):
+    """(heading, x, y), their rates and λ of the skate: α = ω t, u̇ = g cos α; from rest a cycloid, across the slope.
+
+    Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, §I.3 and §III.2.
+    """
+    k, heading = params["g"] / turn, turn * t
+    u = speed + k * np.sin(heading)
+    x = (speed * np.sin(heading) + 0.5 * k * np.sin(heading) ** 2) / turn
+    y = (speed * (1 - np.cos(heading)) + k * (0.5 * heading - 0.25 * np.sin(2 * heading))) / turn
+    v = np.stack([turn * np.ones_like(t), u * np.cos(heading), u * np.sin(heading)])
+    return np.stack([heading, x, y]), v, params["m"] * (u * turn + params["g"] * np.sin(heading))
+
+
+def sledge_by_hand(params):
+    """M, F, A and gamma of the sledge, coordinates (heading, x, y)."""
+    m, a, g = params["m"], params["a"], params["g"]
+
+    def equations(t, q, v):
+        c, s = np.cos(q[0]), np.sin(q[0])
+        mass = [[params["I"] + m * a**2, -m * a * s, m * a * c], [-m * a * s, m, 0], [m * a * c, 0, m]]
+        force = [-m * g * a * s, m * g + m * a * c * v[0] ** 2, m * a * s * v[0] ** 2]
+        return mass, force, [[0, -s, c]], [0], [(v[1] * c + v[2] * s) * v[0]]
+
+    return equations
+
+
+SLEDGES = [(SLEIGH, sleigh_exact), (SKATE, skate_exact)]
+
+
+def named(values):
+    """A vector (heading, x, y) by name."""
+    return dict(zip(("heading", "x", "y"), values))
+
+
+@pytest.mark.slow
+def test_sledge():
+    """Chaplygin's sleigh straightens out, the skate crosses the slope on a cycloid; λ is the blade's force."""
+    for params, exact in SLEDGES:
+        q, v, force = exact(params, SLEDGE_TS)
+        run = lambda tol: lj.integrate(sledge, named(q[:, 0]), named(v[:, 0]), params, ts=SLEDGE_TS, rtol=tol, atol=tol)
+        tight, loose = run(TIGHT), run(LOOSE)
+        found = [np.stack(list(tight.q.values())), np.stack(list(tight.v.values())), tight.multipliers["blade"]]
+        assert departure(found, [q, v, force]) < 2e-10
+        sideways = -loose.v["x"] * np.sin(loose.q["heading"]) + loose.v["y"] * np.cos(loose.q["heading"])
+        assert np.max(np.abs(sideways)) < ROUND_OFF
+        # The blade does no work.
+        assert float(tight.drift()) < 1e-10
+
+
+def test_sledge_would_show_an_error():
+    """The twins follow the closed forms; without (∂phi/∂q) v, or with half of Aᵀ, positions or λ leave them."""
+    for params, exact in SLEDGES:
+        q, v, force = exact(params, SLEDGE_TS)
+        start = np.concatenate([q[:, 0], v[:, 0]])
+        run = lambda flaw=None: by_hand(sledge_by_hand(params), start, SLEDGE_TS, flaw)
+        expected = [q, v, force[None]]
+        assert departure(run(), expected) < 1e-9
+        assert departure(run("no (d phi/dq) v")[:1], expected[:1]) > 0.1
+        assert departure(run("half Chetaev")[2], expected[2]) > 0.1
+
+
+@pytest.mark.slow
+def test_the_skate_does_not_go_downhill():
+    """From rest it never gets lower than g / (2 ω²), however long it slides: it drifts across, at g / (2 ω)."""
+    turn = 1.5
+    ts = np.linspace(0.0, 30.25 * np.pi / turn, SLEDGE_TS.size)
+    q, v, _ = skate_exact(SKATE, ts, turn)
+    traj = lj.integrate(sledge, named(q[:, 0]), named(v[:, 0]), SKATE, ts=ts, rtol=1e-10, atol=1e-10)
+    lowest = SKATE["g"] / (2 * turn**2)
+    assert float(np.max(traj.q["x"])) < lowest * (1 + 1e-9)
+    assert float(np.min(traj.q["x"])) > -1e-8
+    np.testing.assert_allclose(traj.q["y"][-1], SKATE["g"] / (2 * turn) * (ts[-1] - 0.5 / turn), rtol=1e-10)
+
+
+# A particle that keeps its speed in a uniform field: a velocity constraint that is not linear in the velocity.
+
+
+def thrown(t, q, v, params):
+    """L = ½ m |v|² - m g y."""
+    return params["m"] * (0.5 * jnp.dot(v, v) - params["g"] * q[1])
+
+
+def speed_kept(t, q, v, params):
+    """|v|² = c²."""
+    return jnp.dot(v, v) - params["c"] ** 2
+
+
+cruise = lj.System(thrown, {"cruise": lj.Nonholonomic(speed_kept)})
+CRUISE = {"m": 1.5, "g": 9.8125, "c": 4.0, "first": 1.375}
+
+
+def cruise_exact(params, t):
+    """q, v, μ: v = c (sech s, tanh s) with s = s₀ - g t / c, since ċ = 0 leaves ψ̇ = -(g/c) cos ψ; 2 c μ = m g sin ψ."""
+    g, c, first = params["g"], params["c"], params["first"]
+    s = first - g * t / c
+    x = c**2 / g * (gudermannian(first) - gudermannian(s))
+    y = c**2 / g * (jnp.log(jnp.cosh(first)) - jnp.log(jnp.cosh(s)))
+    v = c * jnp.stack([1 / jnp.cosh(s), jnp.tanh(s)], axis=-1)
+    return jnp.stack([x, y], axis=-1), v, params["m"] * g * jnp.tanh(s) / (2 * c)
+
+
+def cruise_by_hand(params):
+    """M, F, A and gamma of the cruising particle."""
+    m, g = params["m"], params["g"]
+    return lambda t, q, v: (m * np.eye(2), [0, -m * g], 2 * v[None], [0], [0])
+
+
+def cruise_run(params, ts, tol, **options):
+    """(q, v, μ) at `ts` from the closed form's start."""
+    q0, v0, _ = cruise_exact(params, jnp.zeros(()))
+    physical = {name: params[name] for name in ("m", "g", "c")}
+    traj = lj.integrate(cruise, q0, v0, physical, ts=ts, rtol=tol, atol=tol, **options)
+    return traj.q, traj.v, traj.multipliers["cruise"]
+
+
+@pytest.mark.exhaustive
+def test_cruise():
+    """Kept at its speed, the particle turns downwards as a gudermannian; values, forward derivatives, residual."""
+    ts = np.array([0.0, 0.5, 1.0, 2.0])
+    run = lambda params, tol: (cruise_run(params, ts, tol, adjoint=diffrax.ForwardMode()),) * 2
+    derivative = jax.jit(jax.jacfwd(run, has_aux=True))
+    slopes, values = derivative(CRUISE, jnp.asarray(TIGHT))
+    exact = lambda params: cruise_exact(params, jnp.asarray(ts))
+    for found, expected in zip(values, exact(CRUISE)):
+        np.testing.assert_allclose(found, expected, atol=2e-10)
+    for found, expected in zip(slopes, jax.jacfwd(exact)(CRUISE)):
+        for name in CRUISE:
+            np.testing.assert_allclose(found[name], expected[name], atol=2e-10)
+    _, (q, v, _) = derivative(CRUISE, jnp.asarray(LOOSE))
+    assert np.max(np.abs(np.sum(v**2, axis=-1) - CRUISE["c"] ** 2)) < ROUND_OFF
+    assert 1e-8 < np.max(np.abs(q - values[0])) < 1e-3
+
+
+def test_cruise_would_show_an_error():
+    """Half of Chetaev's force does not change the motion of a single constraint but doubles μ, where it is seen."""
+    ts = np.array([0.0, 0.5, 1.0, 2.0])
+    q, v, multiplier = (np.asarray(part).T for part in cruise_exact(CRUISE, ts))
+    start = np.concatenate([q[:, 0], v[:, 0]])
+    run = lambda flaw=None: by_hand(cruise_by_hand(CRUISE), start, ts, flaw)
+    assert departure(run(), [q, v, multiplier[None]]) < 1e-9
+    assert departure(run("half Chetaev")[2], multiplier[None]) > 0.5
+
+
+# A particle driven in time: v_y = x f(t), f = cos(ν t).
+
+
+def driving(t, q, v, params):
+    """v_y - x cos(ν t)."""
+    return v[1] - q[0] * jnp.cos(params["nu"] * t)
+
+
+driven = lj.System(thrown, {"drive": lj.Nonholonomic(driving)})
+DRIVEN = {"m": 1.5, "g": 9.8125, "nu": 2.5}
+
+
+def driven_exact(params, t, x=0.75, speed=1.25):
+    """q, v, λ: x runs freely, y = ∫ x cos(ν t) dt, λ = m (ẏ̇ + g) with ÿ = ẋ cos - ν x sin."""
+    nu, position = params["nu"], x + speed * t
+    c, s = np.cos(nu * t), np.sin(nu * t)
+    y = position * s / nu + speed * (c - 1) / nu**2
+    force = params["m"] * (speed * c - nu * position * s + params["g"])
+    return np.stack([position, y]), np.stack([speed * np.ones_like(t), position * c]), force
+
+
+@pytest.mark.slow
+def test_driven_in_time():
+    """A constraint with explicit time and place: ∂phi/∂t and (∂phi/∂q) v both enter motion and λ; neither is lost."""
+    ts = np.linspace(0.0, 4.0, 9)
+    q, v, force = driven_exact(DRIVEN, ts)
+    run = lambda tol: lj.integrate(driven, q[:, 0], v[:, 0], DRIVEN, ts=ts, rtol=tol, atol=tol)
+    tight, loose = run(TIGHT), run(LOOSE)
+    assert departure([tight.q.T, tight.v.T, tight.multipliers["drive"]], [q, v, force]) < 1e-9
+    assert np.max(np.abs(loose.v[:, 1] - loose.q[:, 0] * np.cos(DRIVEN["nu"] * ts))) < ROUND_OFF
+
+    def equations(t, q, v):
+        c, s = np.cos(DRIVEN["nu"] * t), np.sin(DRIVEN["nu"] * t)
+        force = [0, -DRIVEN["m"] * DRIVEN["g"]]
+        return DRIVEN["m"] * np.eye(2), force, [[0, 1]], [-DRIVEN["nu"] * q[0] * s], [v[0] * c]
+
+    start = np.concatenate([q[:, 0], v[:, 0]])
+    assert departure(by_hand(equations, start, ts), [q, v, force[None]]) < 1e-9
+    for flaw in ("no d(phi)/dt", "no (d phi/dq) v"):
+        assert departure(by_hand(equations, start, ts, flaw)[:1], [q]) > 0.3
+
+
+# A disk that may tilt: heading α, inclination θ of its plane (π/2 upright), rotation ψ about its axis. With
+# h = (cos α, sin α, 0) ahead, ℓ across, d = ℓ cos θ + ẑ sin θ from the contact to the centre and n = h × d the axis,
+# the angular velocity is ω = θ̇ h + α̇ sin θ d + (ψ̇ + α̇ cos θ) n.
+
+
+def tilting_lagrangian(t, q, v, params):
+    """L = ½ m |ṙ|² + ½ I₁ (θ̇² + α̇² sin²θ) + ½ I₃ (ψ̇ + α̇ cos θ)² - m g z."""
+    m, spin = params["m"], v["spin"] + v["heading"] * jnp.cos(q["tilt"])
+    across = v["tilt"] ** 2 + (v["heading"] * jnp.sin(q["tilt"])) ** 2
+    kinetic = 0.5 * m * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2)
+    return kinetic + 0.5 * params["I1"] * across + 0.5 * params["I3"] * spin**2 - m * params["g"] * q["z"]
+
+
+def touches(t, q, params):
+    """The lowest point of the rim is on the plane: z = R sin θ."""
+    return q["z"] - params["R"] * jnp.sin(q["tilt"])
+
+
+def contact_at_rest(t, q, v, params):
+    """The horizontal part of ṙ = R ω × d = R (θ̇ n - ω₃ h)."""
+    c, s = jnp.cos(q["heading"]), jnp.sin(q["heading"])
+    spin = v["spin"] + v["heading"] * jnp.cos(q["tilt"])
+    sideways = -v["tilt"] * jnp.sin(q["tilt"])
+    return jnp.stack(
+        [v["x"] - params["R"] * (-sideways * s - spin * c), v["y"] - params["R"] * (sideways * c - spin * s)]
+    )
+
+
+tilting_disk = lj.System(
+    tilting_lagrangian, {"contact": lj.Holonomic(touches), "rolling": lj.Nonholonomic(contact_at_rest)}
+)
+COIN = {"m": 1.25, "R": 0.5, "I1": 1.25 * 0.5**2 / 4, "I3": 1.25 * 0.5**2 / 2, "g": 9.8125}
+
+
+def steady_spin(params, tilt, turn):
+    """ω₃ of steady rolling: (I₃ + m R²) ω₃ Ω sin θ - I₁ Ω² sin θ cos θ + m g R cos θ = 0."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    weight = params["I1"] * turn**2 * s * c - params["m"] * params["g"] * params["R"] * c
+    return weight / ((params["I3"] + params["m"] * params["R"] ** 2) * turn * s)
+
+
+def coin_by_hand(params, y0, ts):
+    """The rolling disk reduced to (α, θ, ω_h, ω_d, ω_n, x, y), and its contact forces m (r̈ + g ẑ), by SciPy.
+
+    Angular momentum about the centre in the frame (h, d, n), the force of the contact eliminated:
+
+        (I₁ + m R²) u̇ = I₁ p² cot θ - (I₃ + m R²) p w - m g R cos θ
+        I₁ ṗ = I₃ u w - I₁ u p cot θ,    (I₃ + m R²) ẇ = m R² u p,    u = θ̇, p = α̇ sin θ, w = ω₃
+
+    Source: Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.3 (a disk on a plane).
+    """
+    integrate = pytest.importorskip("scipy.integrate")
+    m, radius, first, third, g = (params[name] for name in ("m", "R", "I1", "I3", "g"))
+    inertia = m * radius**2
+
+    def rates(y):
+        heading, tilt, u, p, w = y[:5]
+        cot = np.cos(tilt) / np.sin(tilt)
+        du = (first * p**2 * cot - (third + inertia) * p * w - m * g * radius * np.cos(tilt)) / (first + inertia)
+        dp = third / first * u * w - u * p * cot
+        dw = inertia * u * p / (third + inertia)
+        sideways = -u * np.sin(tilt)
+        vx = radius * (-sideways * np.sin(heading) - w * np.cos(heading))
+        vy = radius * (sideways * np.cos(heading) - w * np.sin(heading))
+        return np.array([p / np.sin(tilt), u, du, dp, dw, vx, vy])
+
+    y = integrate.solve_ivp(lambda t, y: rates(y), (ts[0], ts[-1]), y0, "DOP853", ts, rtol=1e-13, atol=1e-13).y
+    heading, tilt, u, p, w = y[:5]
+    du, dw = rates(y)[[2, 4]]
+    # r̈ in the frame (h, d, n), then its components ahead, across and up.
+    ahead, along, axial = (
+        radius * part for part in (p * u - dw, -p * w * np.cos(tilt) / np.sin(tilt) - u**2, du + p * w)
+    )
+    across = along * np.cos(tilt) - axial * np.sin(tilt)
+    up = along * np.sin(tilt) + axial * np.cos(tilt)
+    c, s = np.cos(heading), np.sin(heading)
+    return y, m * np.stack([c * ahead - s * across, s * ahead + c * across, up + g])
+
+
+def coin_state(params, heading, tilt, u, p, w, x=0.0, y=0.0):
+    """(q, v) of the rolling disk with angular velocity u h + p d + w n."""
+    radius, turn, sideways = params["R"], p / np.sin(tilt), -u * np.sin(tilt)
+    c, s = np.cos(heading), np.sin(heading)
+    q = {"heading": heading, "spin": 0.0, "tilt": tilt, "x": x, "y": y, "z": radius * np.sin(tilt)}
+    v = {
+        "heading": turn,
+        "spin": w - turn * np.cos(tilt),
+        "tilt": u,
+        "x": radius * (-sideways * s - w * c),
+        "y": radius * (sideways * c - w * s),
+        "z": radius * np.cos(tilt) * u,
+    }
+    return q, v
+
+
+COIN_TS = np.linspace(0.0, 3.0, 16)
+
+
+@pytest.mark.exhaustive
+def test_tilted_disk_rolls_steadily():
+    """At the spin required by its tilt, a disk rolls on a circle; the contact carries m g, and m R ω₃ Ω inwards."""
+    tilt, turn = 1.125, 2.5
+    spin = steady_spin(COIN, tilt, turn)
+    q0, v0 = coin_state(COIN, 0.0, tilt, 0.0, turn * np.sin(tilt), spin)
+    traj = lj.integrate(tilting_disk, q0, v0, COIN, ts=COIN_TS, rtol=1e-11, atol=1e-11)
+    angle = turn * COIN_TS
+    c, s = np.cos(angle), np.sin(angle)
+    circle = -COIN["R"] * spin / turn
+    force = -COIN["m"] * COIN["R"] * spin * turn
+    expected = {
+        "heading": angle,
+        "tilt": np.full_like(angle, tilt),
+        "x": circle * s,
+        "y": circle * (1 - c),
+        "z": np.full_like(angle, COIN["R"] * np.sin(tilt)),
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(traj.q[name], values, atol=1e-11, err_msg=name)
+    np.testing.assert_allclose(traj.multipliers["contact"], COIN["m"] * COIN["g"], rtol=1e-11)
+    np.testing.assert_allclose(traj.multipliers["rolling"], np.stack([-s, c], axis=-1) * force, atol=1e-10)
+    # With ω₃ of the opposite sign the relation does not hold, and the disk falls over.
+    fallen = lj.integrate(
+        tilting_disk, *coin_state(COIN, 0.0, tilt, 0.0, turn * np.sin(tilt), -spin), COIN, ts=COIN_TS[:16] / 20
+    )
+    assert np.max(np.abs(fallen.q["tilt"] - tilt)) > 0.05
+
+
+@pytest.mark.slow
+def test_wobbling_disk():
+    """A disk that tilts while it rolls follows the reduced equations; λ and the rolling force balance its momentum."""
+    y0 = np.array([0.25, 1.25, 0.375, 1.5, -6.0, 0.0, 0.0])
+    y, force = coin_by_hand(COIN, y0, COIN_TS)
+    q0, v0 = coin_state(COIN, *y0)
+    run = lambda tol: lj.integrate(tilting_disk, q0, v0, COIN, ts=COIN_TS, rtol=tol, atol=tol)
+    tight, loose = run(TIGHT), run(LOOSE)
+    found = [tight.q["heading"], tight.q["tilt"], tight.v["tilt"], tight.q["x"], tight.q["y"]]
+    assert departure(found, y[[0, 1, 2, 5, 6]]) < 1e-10
+    assert departure(tight.multipliers["rolling"].T, force[:2]) < 1e-9
+    assert departure([tight.multipliers["contact"]], force[2:]) < 1e-9
+    # The disk really wobbles, and so does the contact force.
+    assert np.ptp(y[1]) > 0.05 and np.ptp(force[2]) > 1.0
+    assert float(tight.drift()) < 1e-10
+    assert float(loose.residual()) < ROUND_OFF
+
+
+# A ball on a turntable whose speed changes: explicit time in a rolling constraint.
+
+
+def ball_lagrangian(t, q, v, params):
+    """L = ½ m (ẋ² + ẏ²) + ½ I |ω|², Euler's angles: |ω|² = θ̇² + φ̇² + ψ̇² + 2 φ̇ ψ̇ cos θ."""
+    centre = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2)
+    angular = v["theta"] ** 2 + v["phi"] ** 2 + v["psi"] ** 2 + 2 * v["phi"] * v["psi"] * jnp.cos(q["theta"])
+    return centre + 0.5 * params["beta"] * params["m"] * params["a"] ** 2 * angular
+
+
+def table_speed(t, params):
+    """Ω(t) = Ω₀ + Ω₁ cos(ν t)."""
+    return params["mean"] + params["swing"] * jnp.cos(params["nu"] * t)
+
+
+def rolls_on_table(t, q, v, params):
+    """ṙ - a ω × ẑ = Ω(t) ẑ × r."""
+    c, s = jnp.cos(q["phi"]), jnp.sin(q["phi"])
+    omega_x = v["theta"] * c + v["psi"] * jnp.sin(q["theta"]) * s
+    omega_y = v["theta"] * s - v["psi"] * jnp.sin(q["theta"]) * c
+    turn, a = table_speed(t, params), params["a"]
+    return jnp.stack([v["x"] - a * omega_y + turn * q["y"], v["y"] + a * omega_x - turn * q["x"]])
+
+
+turntable = lj.System(ball_lagrangian, {"rolling": lj.Nonholonomic(rolls_on_table)})
+TABLE = {"m": 1.5, "a": 0.25, "beta": 0.4, "mean": 3.0, "swing": 1.25, "nu": 2.0}
+
+
+def ball_exact(params, ts, start, rate):
+    """z = x + i y, ż, z̈ of the ball's centre: ż - i k Ω(t) z is constant, k = β / (1 + β) (2/7 for a solid ball)."""
+    k, mean, swing, nu = params["beta"] / (1 + params["beta"]), params["mean"], params["swing"], params["nu"]
+    turned = lambda t: k * (mean * t + swing * np.sin(nu * t) / nu)
+    speed, change = k * (mean + swing * np.cos(nu * ts)), -k * swing * nu * np.sin(nu * ts)
+    constant = rate - 1j * speed[0] * start
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    history = np.array([t / 2 * np.sum(weights * np.exp(-1j * turned(t / 2 * (1 + nodes)))) for t in ts])
+    z = np.exp(1j * turned(ts)) * (start + constant * history)
+    dz = 1j * speed * z + constant
+    return z, dz, 1j * (change * z + speed * dz)
+
+
+@pytest.mark.slow
+def test_ball_on_a_turntable_of_varying_speed():
+    """The ball's centre turns at 2/7 of the table's speed, even while that changes; λ is the friction m r̈."""
+    ts = np.linspace(0.0, 4.0, 17)
+    start, rate = 0.5 + 0.25j, 0.375 - 0.5j
+    z, dz, ddz = ball_exact(TABLE, ts, start, rate)
+    # i a (ω_x + i ω_y) = i Ω z - ż, with φ = 0: ω = (θ̇, -ψ̇ sin θ, φ̇ + ψ̇ cos θ).
+    omega = (1j * (TABLE["mean"] + TABLE["swing"]) * start - rate) / (1j * TABLE["a"])
+    theta, upright = 1.5, 0.75
+    psi_rate = -omega.imag / np.sin(theta)
+    q0 = {"phi": 0.0, "psi": 0.0, "theta": theta, "x": start.real, "y": start.imag}
+    v0 = {
+        "phi": upright - psi_rate * np.cos(theta),
+        "psi": psi_rate,
+        "theta": omega.real,
+        "x": rate.real,
+        "y": rate.imag,
+    }
+    run = lambda tol: lj.integrate(turntable, q0, v0, TABLE, ts=ts, rtol=tol, atol=tol)
+    tight, loose = run(TIGHT), run(LOOSE)
+    np.testing.assert_allclose(tight.q["x"] + 1j * tight.q["y"], z, atol=1e-10)
+    np.testing.assert_allclose(tight.v["x"] + 1j * tight.v["y"], dz, atol=1e-10)
+    np.testing.assert_allclose(tight.multipliers["rolling"] @ np.array([1, 1j]), TABLE["m"] * ddz, atol=1e-10)
+    np.testing.assert_allclose(tight.v["phi"] + tight.v["psi"] * np.cos(tight.q["theta"]), upright, atol=1e-10)
+    assert float(loose.residual()) < ROUND_OFF
+    # Without ∂phi/∂t the centre would turn at the mean speed: the swing must matter here.
+    steady = ball_exact(TABLE | {"swing": 0.0, "mean": TABLE["mean"] + TABLE["swing"]}, ts, start, rate)[0]
+    assert np.max(np.abs(steady - z)) > 0.3
+
+
+# A disk rolling inside a circle: the centre on a circle of radius ρ by a holonomic constraint, rolling by its velocity.
+
+
+def inside_lagrangian(t, q, v, params):
+    """L = ½ m (ẋ² + ẏ²) + ½ I φ̇² - m g y."""
+    m = params["m"]
+    return 0.5 * m * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * params["I"] * v["angle"] ** 2 - m * params["g"] * q["y"]
+
+
+def on_circle(t, q, params):
+    """x² + y² - ρ²."""
+    return q["x"] ** 2 + q["y"] ** 2 - params["rho"] ** 2
+
+
+def rolls_inside(t, q, v, params):
+    """ρ θ̇ + R φ̇ = 0, written in x and y."""
+    return (q["x"] * v["y"] - q["y"] * v["x"]) / params["rho"] + params["R"] * v["angle"]
+
+
+rolling_inside = lj.System(
+    inside_lagrangian, {"circle": lj.Holonomic(on_circle), "rolling": lj.Nonholonomic(rolls_inside)}
+)
+INSIDE = {"m": 1.5, "rho": 1.25, "R": 0.25, "I": 0.0625, "g": 9.8125}
+
+
+@pytest.mark.slow
+def test_semi_holonomic_rolling_over_a_long_run():
+    """After 100 swings ρ θ + R φ is unchanged within the tolerance, though only its rate is constrained."""
+    special = pytest.importorskip("scipy.special")
+    m, rho, radius, g = (INSIDE[name] for name in ("m", "rho", "R", "g"))
+    inertia = INSIDE["I"] / radius**2
+    rate, highest = np.sqrt(m * g / ((m + inertia) * rho)), 2.0
+    k = np.sin(highest / 2)
+    ts = np.linspace(0.0, 400 * special.ellipk(k**2) / rate, 401) * (1 + 1e-3)
+    # A pendulum released from rest: sin(θ/2) = k cd(w t), θ̇ = -2 k k' w sd(w t).
+    sn, cn, dn, _ = special.ellipj(rate * ts, k**2)
+    angle = 2 * np.arcsin(k * cn / dn)
+    turn = -2 * rate * k * np.sqrt(1 - k**2) * sn / dn
+    q0 = {"angle": 0.0, "x": rho * np.sin(highest), "y": -rho * np.cos(highest)}
+    v0 = {"angle": 0.0, "x": 0.0, "y": 0.0}
+    run = lambda tol: lj.integrate(rolling_inside, q0, v0, INSIDE, ts=ts, rtol=tol, atol=tol)
+    tight, loose = run(TIGHT), run(LOOSE)
+    found = np.arctan2(tight.q["x"], -tight.q["y"])
+    np.testing.assert_allclose(found, angle, atol=3e-7)
+    friction = inertia * rho * rate**2 * np.sin(angle)
+    np.testing.assert_allclose(tight.multipliers["rolling"], friction, atol=1e-6)
+    normal = -m * (rho * turn**2 + g * np.cos(angle)) / (2 * rho)
+    np.testing.assert_allclose(tight.multipliers["circle"], normal, atol=4e-6)
+    for traj, allowed in ((tight, 1e-8), (loose, 1e-2)):
+        invariant = rho * np.arctan2(traj.q["x"], -traj.q["y"]) + radius * np.asarray(traj.q["angle"])
+        assert np.max(np.abs(invariant - rho * highest)) < allowed
+        assert float(traj.residual()) < ROUND_OFF
+
+
+def test_returning_to_a_velocity_constraint_leaves_positions():
+    """Without a position constraint q is unchanged bit for bit; v moves to the nearest rolling one by the metric M."""
+    rng = np.random.default_rng(3)
+    x, u = rng.normal(size=(2, 4))
+    names = ("angle", "heading", "x", "y")
+    q, v = dict(zip(names, x)), dict(zip(names, u))
+    state = 0.0, q, v
+    projected = to_manifold(equations_of(model_of(vertical_disk, *state, DISK)), *state, 1e-12, 1e-12)
+    assert [float(projected.q[name]).hex() for name in names] == [float(q[name]).hex() for name in names]
+    mass, _, rows, *_ = (np.asarray(part) for part in disk_by_hand(DISK)(0.0, x, u))
+    nearest = u - np.linalg.solve(mass, rows.T @ np.linalg.solve(rows @ np.linalg.solve(mass, rows.T), rows @ u))
+    np.testing.assert_allclose(np.stack(list(projected.v.values())), nearest, atol=1e-14)
+    assert np.max(np.abs(nearest - u)) > 0.1
+
+
+def test_returning_to_the_plane_rolls():
+    """With both kinds of constraint, positions move only as rolling allows: a lifted disk does not slide."""
+    q, v = coin_state(COIN, 0.25, 1.25, 0.375, 1.5, -6.0)
+    lifted = q | {"z": q["z"] + 1e-4}
+    state = 0.0, lifted, v
+    moved = to_manifold(equations_of(model_of(tilting_disk, *state, COIN)), *state, 1e-12, 1e-12).q
+    step = {name: float(moved[name]) - lifted[name] for name in q}
+    slid = np.asarray(contact_at_rest(0.0, lifted, step, COIN))
+    assert abs(float(touches(0.0, moved, COIN))) < ROUND_OFF
+    assert np.max(np.abs(slid)) < 1e-14
+    # The nearest point of the plane alone, by tilting and lowering in place, would have slid.
+    row = np.array([-COIN["R"] * np.cos(q["tilt"]), 1.0])
+    in_place = row / np.array([COIN["I1"], COIN["m"]])
+    in_place = in_place / (row @ in_place)
+    sliding = contact_at_rest(0.0, lifted, {name: 0.0 for name in q} | {"tilt": in_place[0] * -1e-4}, COIN)
+    assert np.max(np.abs(np.asarray(sliding))) > 1e-5
+
+
+@pytest.mark.exhaustive
+def test_gradient_of_rolling_in_reverse():
+    """d(place + friction)/d(m, R, I, g, start) of the disk on an incline, reverse mode, is the closed form's."""
+    weights = np.array([0.75, -1.25, 0.5, 1.5])
+
+    def exact(params, start):
+        q, _, force = disk_exact(params, start, jnp.asarray([2.5]))
+        return weights @ jnp.concatenate([q["x"], q["y"], force[0]])
+
+    def final(params, start):
+        q0, v0, _ = jax.tree.map(lambda curve: curve[0], disk_exact(params, start, jnp.zeros(1)))
+        ts = np.array([0.0, 2.5])
+        traj = lj.integrate(vertical_disk, q0, v0, params, ts=ts, rtol=TIGHT, atol=TIGHT)
+        return weights @ jnp.stack([traj.q["x"][-1], traj.q["y"][-1], *traj.multipliers["rolling"][-1]])
+
+    at = (DISK | {"g": 6.25}, DISK_START)
+    expected = jax.jacfwd(exact, argnums=(0, 1))(*at)
+    for found, wanted in zip(jax.jit(jax.grad(final, argnums=(0, 1)))(*at), expected):
+        for name, value in wanted.items():
+            np.testing.assert_allclose(found[name], value, atol=1e-10, err_msg=name)
+
+
+@pytest.mark.exhaustive
+def test_gradients_of_cruising_in_reverse():
+    """Reverse mode through a nonlinear velocity constraint: the closed form's derivatives of place, velocity and μ."""
+    ts = np.array([0.0, 1.25])
+    final = lambda params: jnp.concatenate([jnp.ravel(part[-1]) for part in cruise_run(params, ts, TIGHT)])
+    exact = lambda params: jnp.concatenate([jnp.ravel(part) for part in cruise_exact(params, jnp.asarray(1.25))])
+    found, expected = jax.jit(jax.jacrev(final))(CRUISE), jax.jacfwd(exact)(CRUISE)
+    for name in CRUISE:
+        np.testing.assert_allclose(found[name], expected[name], atol=2e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "flaw", exhaustive_but((None, "half Chetaev"), (None, "half Chetaev", "no d(phi)/dt", "no (d phi/dq) v"))
+)
+def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
+    """With one of the usual errors built into the library itself, the driven particle leaves its closed form."""
+
+    def rows(model, t, x, u):
+        level = lambda t, x, u: constraints.velocity_residual(model, t, x, u)
+        time = jnp.where(flaw == "no d(phi)/dt", 0.0, jnp.ones_like(t))
+        along = jnp.where(flaw == "no (d phi/dq) v", 0.0, u)
+        _, rate = jax.jvp(lambda t, x: level(t, x, u), (t, x), (time, along))
+        return constraints.ConstraintRows(jax.jacfwd(level, argnums=2)(t, x, u), -rate)
+
+    solved = saddle_point.saddle_point
+
+    def acting(*equations):
+        # One constraint's force does not depend on a factor in Aᵀ; its multiplier does.
+        a, multiplier = solved(*equations)
+        return a, multiplier / (0.5 if flaw == "half Chetaev" else 1.0)
+
+    monkeypatch.setattr(constraints, "acceleration_rows", rows)
+    monkeypatch.setattr(saddle_point, "saddle_point", acting)
+    # The parameters differ by `of`, so that the compiled programs of the true equations are not reused.
+    system = lj.System(thrown, {"drive": lj.Nonholonomic(driving)})
+    ts = np.linspace(0.0, 4.0, 9)
+    q, v, force = driven_exact(DRIVEN, ts)
+    # A method that is not ours: the written-out equations would use their own elimination, not this one.
+    method = diffrax.Dopri8(scan_kind="lax")
+    traj = lj.integrate(
+        system, q[:, 0], v[:, 0], DRIVEN | {"of": str(flaw)}, ts=ts, rtol=TIGHT, atol=TIGHT, method=method
+    )
+    off = departure([traj.q.T, traj.v.T, traj.multipliers["drive"]], [q, v, force])
+    assert off < 1e-9 if flaw is None else off > 1.0

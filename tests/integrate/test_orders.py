@@ -1,0 +1,220 @@
+"""The order of every method, measured; and gradients through a thousand constrained steps.
+
+One motion in two forms: a double pendulum by its angles (its mass matrix depends on them), and as two masses on rods
+(the constraints' multipliers are the tensions). The reference is the textbook equation by SciPy, good to 2e-13.
+Small angles, so that a step of order eight is already in its asymptotic range while its error is far above round-off;
+many outputs, all between steps, so that no single phase of a step decides.
+
+Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.3-II.5 (orders of the methods).
+"""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import lagjax as lj
+from lagjax.numerics.methods.radau import SimplifiedNewton
+from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
+from tests.tiers import exhaustive_but
+
+pytestmark = pytest.mark.optimised
+CLAIM = 0.35
+OUTPUTS = np.concatenate([[0.0], np.linspace(0.3, 8.0, 28) + 0.013 * np.sin(7 * np.arange(28.0))])
+ROD_SWING = jax.tree.map(np.asarray, rods_from_angles(*DOUBLE_SWING, DOUBLE_PARAMS))
+
+
+def tension_multipliers(q, v):
+    """The multipliers (T, 2) of states: each rod keeps its length, `r·a = -v²`, under gravity and both rods' pull."""
+    m1, m2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "g"))
+    r, d = q["first"], q["second"] - q["first"]
+    u, w = v["first"], v["second"] - v["first"]
+    dot = lambda a, b: np.sum(a * b, axis=-1)
+    coupling = -2 * dot(r, d) / m1
+    matrix = np.array([[2 * dot(r, r) / m1, coupling], [coupling, 2 * dot(d, d) * (1 / m1 + 1 / m2)]])
+    right = np.array([g * r[:, 1] - dot(u, u), -dot(w, w)])
+    return np.linalg.solve(np.moveaxis(matrix, -1, 0), right.T[:, :, None])[:, :, 0]
+
+
+def states(q, v):
+    """Positions and velocities as plain arrays, and the multipliers that belong to them."""
+    stacked = lambda tree: np.stack([tree["first"], tree["second"]], axis=1)
+    return {"q": stacked(q), "v": stacked(v), "multipliers": tension_multipliers(q, v)}
+
+
+def double_pendulum_equation(t, y):
+    """The textbook's two equations of the double pendulum, solved for the angular accelerations."""
+    m1, m2, l1, l2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "l1", "l2", "g"))
+    first, second, u, w = y
+    c, s = np.cos(first - second), np.sin(first - second)
+    mass = np.array([[(m1 + m2) * l1, m2 * l2 * c], [l1 * c, l2]])
+    force = [-m2 * l2 * w**2 * s - (m1 + m2) * g * np.sin(first), l1 * u**2 * s - g * np.sin(second)]
+    return [u, w, *np.linalg.solve(mass, force)]
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """Angles, and positions with multipliers, at OUTPUTS."""
+    integrate = pytest.importorskip("scipy.integrate")
+    solution = integrate.solve_ivp(
+        double_pendulum_equation, (0, OUTPUTS[-1]), np.concatenate(DOUBLE_SWING), "DOP853", OUTPUTS,
+        rtol=2.5e-14, atol=1e-15,
+    )  # fmt: skip
+    angles, rates = solution.y.T[:, :2], solution.y.T[:, 2:]
+    rods = jax.vmap(lambda angles, rates: rods_from_angles(angles, rates, DOUBLE_PARAMS))(angles, rates)
+    return {"free": {"q": angles, "v": rates}, "constrained": states(*jax.tree.map(np.asarray, rods))}
+
+
+def run(form, method, dt, ts=OUTPUTS):
+    """The motion in one of its forms at a constant step; one compile serves all steps."""
+    system, start = {"free": (double_pendulum, DOUBLE_SWING), "constrained": (double_rods, ROD_SWING)}[form]
+    return lj.integrate(
+        system, *start, DOUBLE_PARAMS, ts=ts, method=method, dt0=jnp.asarray(dt),
+        stepsize_controller=diffrax.ConstantStepSize(),
+    )  # fmt: skip
+
+
+def computed(form, traj):
+    """The values of a trajectory, in the layout of `exact`."""
+    if form == "free":
+        return {"q": traj.q, "v": traj.v}
+    multipliers = np.stack([traj.multipliers["inner"], traj.multipliers["outer"]], axis=-1)
+    return states(*jax.tree.map(np.asarray, (traj.q, traj.v))) | {"multipliers": multipliers}
+
+
+def orders(exact, steps, values):
+    """The order in q, v and the multipliers: slope of log error against log step, errors over all outputs."""
+    errors = [{name: np.linalg.norm(found[name] - exact[name]) for name in exact} for found in map(values, steps)]
+    fit = lambda name: np.polyfit(np.log(steps), [-np.log(e[name]) for e in errors], 1)[0]
+    return {name: float(fit(name)) for name in exact}
+
+
+def within(order, measured):
+    """Which of the measured orders are the claimed one."""
+    return [abs(found - order) < CLAIM for found in measured.values()]
+
+
+# A constant step leaves an implicit method no error estimate to take its root finder's tolerance from.
+NEWTON = optx.Newton(rtol=1e-10, atol=1e-12, norm=optx.max_norm)
+
+# Steps per unit of time: errors from 1e-1 (Euler) down to 7e-12 (Tsit5, free), 50 times the reference's.
+FAST = [(lj.Tsit5(), 5, (112, 160, 224)), (lj.Dopri8(), 8, (18, 22, 28))]
+
+
+class ShippedDopri8(diffrax.Dopri8):
+    """diffrax's own Dopri8: an instance of the original class would run in our form."""
+
+
+SLOW = [(lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-12, atol=1e-12)), 5, (28, 40, 56))]
+# One of each kind that diffrax has: the others differ only in their coefficients.
+OTHERS = [
+    (ShippedDopri8(), 8, (18, 22, 28)),
+    (diffrax.Kvaerno5(root_finder=NEWTON), 5, (28, 40, 56)),
+    (diffrax.Euler(), 1, (800, 1600, 3200)),
+    (diffrax.LeapfrogMidpoint(), 2, (200, 400, 800)),
+    (diffrax.ReversibleHeun(), 2, (200, 400, 800)),
+    (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
+]
+name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
+TIERS = {
+    ("Tsit5", "free"): (),
+    ("Dopri8", "free"): (),
+    ("Dopri8", "constrained"): pytest.mark.slow,
+    ("Radau5", "constrained"): pytest.mark.slow,
+}
+
+
+def cases():
+    """Every method, free and projected, in its tier."""
+    for method, order, steps in FAST + SLOW + OTHERS:
+        for form in ("free", "constrained"):
+            case = name_of(method), form
+            marks = TIERS.get(case, pytest.mark.exhaustive)
+            yield pytest.param(form, method, order, steps, marks=marks, id="-".join(case))
+
+
+@pytest.mark.parametrize(("form", "method", "order", "steps"), list(cases()))
+def test_order(exact, form, method, order, steps):
+    """Each method has its order in positions, velocities and multipliers, free and projected, between its steps."""
+    measured = orders(exact[form], steps, lambda n: computed(form, run(form, method, 1 / n)))
+    assert all(within(order, measured)), measured
+
+
+def with_lower_weights(method):
+    """The same stages, but stepping with the weights of the embedded method, one order lower."""
+    tableau = method.tableau
+    lower = dataclasses.replace(tableau, b_sol=tableau.b_sol - tableau.b_error)
+    return type("LowerWeights", (type(method),), {"tableau": lower})()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", exhaustive_but(("free",), ("free", "constrained")))
+@pytest.mark.parametrize(
+    ("method", "order", "steps"), [FAST[0], pytest.param(*FAST[1], marks=pytest.mark.exhaustive)], ids=name_of
+)
+def test_a_lower_order_would_be_seen(exact, form, method, order, steps):
+    """Failing twin: with the embedded weights no quantity passes."""
+    lower = with_lower_weights(method)
+    measured = orders(exact[form], steps, lambda n: computed(form, run(form, lower, 1 / n)))
+    assert not any(within(order, measured)), measured
+
+
+@pytest.mark.exhaustive
+def test_cubic_outputs_would_be_seen(exact):
+    """Failing twin: the same steps with cubic outputs between them (as diffrax's Kvaerno5 has) show order four."""
+    every_second = {name: value[1::2] for name, value in exact["constrained"].items()}
+
+    def interpolated(n):
+        before = np.floor(OUTPUTS[1::2] * n) / n
+        around = run("constrained", diffrax.Tsit5(), 1 / n, np.concatenate([[0.0], *zip(before, before + 1 / n)]))
+        a = jax.vmap(lambda t, q, v: lj.accelerations(double_rods, t, q, v, DOUBLE_PARAMS)[0])(
+            around.t, around.q, around.v
+        )
+        s = ((OUTPUTS[1::2] - before) * n)[:, None]
+        return states(cubic(around.q, around.v, s, 1 / n), cubic(around.v, a, s, 1 / n))
+
+    measured = orders(every_second, FAST[0][2], interpolated)
+    assert not any(within(5, measured)) and max(measured.values()) < 4 + CLAIM, measured
+
+
+def cubic(y, slope, s, h):
+    """Hermite's cubic at the fractions s of the steps whose ends follow the start in y."""
+
+    def one(y, slope):
+        y0, y1, d0, d1 = y[1::2], y[2::2], h * slope[1::2], h * slope[2::2]
+        return np.asarray(y0 + s * d0 + s**2 * (3 * (y1 - y0) - 2 * d0 - d1) + s**3 * (2 * (y0 - y1) + d0 + d1))
+
+    return jax.tree.map(one, y, slope)
+
+
+@pytest.mark.exhaustive
+def test_gradients_through_a_thousand_constrained_steps():
+    """d(final state, multipliers)/d(parameters, start): finite, forward is reverse to 1e-8, a difference to 1e-6."""
+
+    def outcome(x):
+        q0, v0 = rods_from_angles(x["angles"], x["rates"], x["params"])
+        traj = lj.integrate(
+            double_rods, q0, v0, x["params"], ts=np.array([0.0, 8.0]), method=diffrax.Tsit5(), dt0=jnp.asarray(0.008),
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=1024, throw=False,
+        )  # fmt: skip
+        final = ravel_pytree((traj.end.q, traj.end.v, traj.end.multipliers))[0]
+        return final, traj.stats["num_accepted_steps"]
+
+    angles, rates = DOUBLE_SWING
+    x, unflatten = ravel_pytree({"angles": angles, "rates": rates, "params": DOUBLE_PARAMS})
+    final = jax.jit(lambda x: outcome(unflatten(x)))
+    assert int(final(x)[1]) in (1000, 1001)
+    forward, reverse = (jax.jit(jac(lambda x: final(x)[0]))(x) for jac in (jax.jacfwd, jax.jacrev))
+    assert np.all(np.isfinite(forward)) and np.all(np.isfinite(reverse))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
+
+    # Fourth order on the same grid: its own error is near 1e-8 of the largest derivative.
+    step = 2.0**-10
+    at = jax.jit(lambda k: jax.lax.map(lambda e: final(x + k * step * e)[0], jnp.eye(x.size)))
+    difference = ((8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)).T
+    np.testing.assert_allclose(forward, difference, rtol=1e-6, atol=1e-6 * np.max(np.abs(forward)))

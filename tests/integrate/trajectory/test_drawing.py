@@ -1,0 +1,135 @@
+"""Interpolation between outputs for films: exact at outputs, of fourth order between, and refused if too coarse."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.trajectory.drawing import hermite
+from tests.systems import PARAMS, TS, pendulum
+
+DENSE = np.linspace(0.0, 2.0, 41)
+
+
+@pytest.fixture(scope="module")
+def traj():
+    """A pendulum for a period, densely."""
+    return lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE)
+
+
+def bob(t, q, params):
+    """The rod from its pivot to its bob, in NumPy."""
+    return {"rod": [(0.0, 0.0), (params["l"] * np.sin(q), -params["l"] * np.cos(q))]}
+
+
+def refused(*parts):
+    """Expect an error that contains all parts and a fix."""
+    return pytest.raises(ValueError, match="(?s)" + "".join(f"(?=.*{part})" for part in (*parts, "Fix:")))
+
+
+def test_exact_at_outputs_and_for_cubics():
+    """At outputs the values are those given, bit for bit; a cubic is reproduced everywhere, in any pytree."""
+    t = np.array([0.0, 0.3, 1.0, 1.1])
+    q, v = (
+        {"a": np.stack([t**3, 1 - t], axis=1), "b": t**2},
+        {"a": np.stack([3 * t**2, -np.ones(4)], axis=1), "b": 2 * t},
+    )
+    same = hermite(t, q, v, t)
+    assert np.array_equal(same["a"], q["a"]) and np.array_equal(same["b"], q["b"])
+    at = np.linspace(0.0, 1.1, 23)
+    np.testing.assert_allclose(hermite(t, q, v, at)["a"], np.stack([at**3, 1 - at], axis=1), atol=1e-15)
+    # Twin: with wrong slopes the cubic is not reproduced.
+    assert np.max(np.abs(hermite(t, q, {"a": v["a"], "b": 0 * t}, at)["b"] - at**2)) > 1e-2
+
+
+def test_fourth_order():
+    """The error between outputs falls with the fourth power of their distance."""
+    at, counts = np.linspace(0.0, 2.0, 501), np.array([11, 21, 41])
+    errors = [np.max(np.abs(hermite(t, np.sin(3 * t), 3 * np.cos(3 * t), at) - np.sin(3 * at)))
+              for t in (np.linspace(0.0, 2.0, n) for n in counts)]  # fmt: skip
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(np.abs(orders - 4) < 0.35), orders
+
+
+def test_frames_follow_the_motion(traj):
+    """Frames are equally far apart, the rod keeps its length, and frames at outputs show the outputs."""
+    film = traj.animate(bob, seconds=4.0, rate=20.0)
+    np.testing.assert_allclose(film.t, np.linspace(0.0, 2.0, 81), atol=1e-15)
+    ends = film.points["rod"]
+    assert ends.shape == (81, 2, 2) and not ends[:, 0].any()
+    np.testing.assert_allclose(np.hypot(*ends[:, 1].T), PARAMS["l"], atol=1e-14)
+    np.testing.assert_allclose(ends[::2, 1, 0], PARAMS["l"] * np.sin(traj.q), atol=1e-14)
+    finer = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 2.0, 81))
+    np.testing.assert_allclose(ends[:, 1, 0], PARAMS["l"] * np.sin(finer.q), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_ends_where_an_event_ended_the_motion():
+    """NaN after an event are cut off, and the last frame is the event."""
+    down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
+    traj = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE, event=down)
+    assert np.isnan(traj.q).any()
+    film = traj.animate(bob)
+    assert film.t[-1] == float(traj.end.t) < 1.0
+    np.testing.assert_allclose(film.points["rod"][-1, 1], [0.0, -PARAMS["l"]], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_motion_that_failed_plays_as_far_as_it_came():
+    """With throw=False the film ends at the last output that was reached; one that never began is refused."""
+    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
+    traj = lj.integrate(kepler, 1.0, 0.0, ts=np.linspace(0.0, 2.0, 201), throw=False)
+    film = traj.animate(lambda t, q, params: (q, 0.0))
+    np.testing.assert_allclose(film.t[-1], 1.11, atol=1e-12)
+    with refused("0 states", "failed at its start"):
+        lj.integrate(kepler, 0.0, 0.0, ts=DENSE, throw=False).animate(bob)
+
+
+@pytest.mark.exhaustive
+def test_a_batch_is_animated_lane_by_lane():
+    """The error for a batch says how to take one lane of it, and the lane can be animated."""
+    batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=DENSE))(np.array([0.5, 1.0]))
+    with refused("batch of shape", r"traj\).animate\(positions\)"):
+        batch.animate(bob)
+    assert len(jax.tree.map(lambda x: x[0], batch).animate(bob).t) == 51
+
+
+def test_positions_that_are_no_points(traj):
+    """Three coordinates, a number, words, a changing number of points and NaN are refused by name, with a fix."""
+    with refused(r"shape \(3,\) for 'bob'", "Usual cause"):
+        traj.animate(lambda t, q, params: {"bob": (q, q, q)})
+    with refused(r"shape \(\)"):
+        traj.animate(lambda t, q, params: q)
+    with refused("a str"):
+        traj.animate(lambda t, q, params: "here")
+    with refused("the same points"):
+        traj.animate(lambda t, q, params: [(q, q)] * (1 + (t > 1)))
+    with refused("the same points"):
+        traj.animate(lambda t, q, params: {})
+    with refused("NaN or infinity for 'bob' at t = ", "Usual cause"):
+        traj.animate(lambda t, q, params: {"bob": (jnp.sqrt(q), q)})
+
+
+def test_outputs_too_far_apart(traj):
+    """A motion with too few outputs for interpolation is refused."""
+    coarse = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 6.0, 7))
+    with refused("7 outputs are too few", "% of the picture", r"jnp.linspace\(0, 6, 57\)"):
+        coarse.animate(bob)
+    with refused("2 states"):
+        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS[:2]).animate(bob)
+
+
+def test_no_time_to_play(traj):
+    """A film of no length, or without an end, is refused."""
+    for seconds in (0.0, -1.0, np.inf, np.nan):
+        with refused("is not a film"):
+            traj.animate(bob, seconds=seconds)
+    with refused("is not a film"):
+        traj.animate(bob, trail=-1.0)
+
+
+def test_prints_what_it_is(traj):
+    """Frames, seconds and size."""
+    assert repr(traj.animate(bob)).startswith("Animation of 51 frames, 2 s, ")

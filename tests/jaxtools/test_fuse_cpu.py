@@ -1,0 +1,217 @@
+"""A program as one machine function: same results and derivatives, and compiled in this way only where XLA can."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import jaxpr_as_fun
+
+import lagjax.jaxtools.fuse_cpu as one_function_module
+from lagjax.jaxtools.fuse_cpu import calls_host, fits, one_function, without_checks, without_library
+from lagjax.jaxtools.plain import is_plain
+
+pytestmark = [
+    pytest.mark.optimised,
+    pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN: no program is compiled as one function"),
+]
+
+
+def grown(x, y):
+    """A loop over numbers whose length depends on them."""
+    return lax.while_loop(lambda s: s[0] < 100.0, lambda s: (1.5 * s[0] + s[1], jnp.sin(s[0]) + s[1]), (x, y))
+
+
+def entry(function, *args):
+    """The outermost part of a compiled program."""
+    text = jax.jit(function).lower(*args).compile().as_text()
+    return text[text.index("ENTRY") :]
+
+
+whole = lambda x, y: one_function(grown, x, y)
+TWO = (jnp.asarray(2.0), jnp.asarray(0.3))
+
+
+def test_same_results_and_derivatives():
+    """Value and forward derivative are those of the function; reverse mode raises."""
+    np.testing.assert_array_equal(whole(*TWO), grown(*TWO))
+    forward = jax.jit(jax.jacfwd(whole))(*TWO)
+    np.testing.assert_allclose(forward, jax.jacfwd(grown)(*TWO), rtol=1e-14)
+    with pytest.raises(ValueError, match="Linearization failed"):
+        jax.grad(lambda x: one_function(lambda x: x**3, x))(TWO[0])
+
+
+@pytest.mark.parametrize("block", [2, 4, 256])
+def test_lanes_in_blocks(monkeypatch, block):
+    """A batch, and a batch of batches, of lanes of different lengths, in blocks that they fill and do not fill."""
+    monkeypatch.setattr(one_function_module, "TOGETHER", block)
+    x, y = jnp.linspace(1.0, 50.0, 6), jnp.asarray(0.3)
+    in_blocks = lambda x, y: one_function(grown, x, y, in_blocks=True)
+    expected = jax.vmap(grown, (0, None))(x, y)
+    np.testing.assert_allclose(jax.jit(jax.vmap(in_blocks, (0, None)))(x, y), expected, rtol=1e-14)
+    nested = jax.vmap(jax.vmap(in_blocks, (0, None)), (None, 0))
+    found = jax.jit(nested)(x, jnp.array([0.3, 0.3]))
+    np.testing.assert_allclose(found[0][1], expected[0], rtol=1e-14)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="one function is for CPUs")
+def test_compiled_as_one_call():
+    """The loop is inside the marked call; a program without marks, or with a library call, has none."""
+    marked = entry(whole, *TWO)
+    assert 'inlineable="false"' in marked and "while(" not in marked
+    assert 'inlineable="false"' not in entry(grown, *TWO)
+    solve = lambda a: one_function(lambda a: jnp.linalg.solve(a, a[0]), a)
+    assert 'inlineable="false"' not in entry(solve, jnp.eye(9))
+
+
+def test_operands_that_are_not_needed():
+    """An unused operand, and one that XLA finds to be unused: either would end the process if it were dropped."""
+    never = jax.jit(lambda x, y: one_function(lambda x, y: 2 * x, x, y))
+    found_out = jax.jit(lambda x, y: one_function(lambda x, y: jnp.where(jnp.asarray(1.0) > 0, 2 * x, y), x, y))
+    assert never(*TWO) == found_out(*TWO) == 4.0
+
+
+def test_checks_are_left_out_where_they_are_known_to_pass():
+    """`error_if` calls the host; without it the program fits, and gives the same result."""
+
+    def checked(x):
+        return 3 * eqx.error_if(x, x < 0, "negative")
+
+    program = jax.make_jaxpr(checked)(TWO[0])
+    assert not fits(program.jaxpr) and fits(without_checks(program).jaxpr)
+    assert one_function(checked, TWO[0], checked=True) == 6.0
+    with pytest.raises(Exception, match="negative"):
+        jax.block_until_ready(jax.jit(lambda x: one_function(checked, x))(-TWO[0]))
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda x: jnp.sort(x), False),
+        (lambda x: jnp.sum(jnp.outer(x, x) @ x), True),
+        (lambda x: jnp.sum(jnp.tile(x, 1000)), False),
+        (lambda x: jnp.outer(x, x) @ x, True),
+        (lambda x: jnp.outer(x, x) @ jnp.outer(x, x), True),
+        (lambda x: jnp.outer(jnp.tile(x, 4), x) @ jnp.outer(x, jnp.tile(x, 50)), False),
+        (lambda x: x.at[2].set(1.0), True),
+        (lambda x: x.at[jnp.array([0, 2])].add(1.0), False),
+        (lambda x: jax.pure_callback(lambda x: x, x, x), False),
+        (lambda x: lax.scan(lambda c, x: (c + x, jnp.linalg.cholesky(jnp.eye(3) * c)), x[0], x)[1], False),
+    ],
+)
+def test_what_fits(function, expected):
+    """Library calls, large reductions and general scatters do not fit, nor inside a loop."""
+    assert fits(without_library(jax.make_jaxpr(function)(jnp.arange(5.0))).jaxpr) is expected
+
+
+def test_products_of_matrices():
+    """Sums of multiplications replace library products, whatever is contracted; several products share an operand."""
+    rng = np.random.default_rng(0)
+    a, b, c = (jnp.asarray(rng.normal(size=shape)) for shape in ((3, 4, 5), (5, 3, 4, 2), (3, 5, 6)))
+
+    def products(a, b, c):
+        return [
+            jnp.einsum("ijk,kilm->jlm", a, b),
+            jnp.einsum("ijk,kijm->im", a, b),
+            jnp.einsum("ijk,ikm->ijm", a, c),
+            jnp.einsum("ijk,ikm->mji", a, c),
+            *(x @ x.T for x in a),
+            *(x.T @ x for x in a),
+            a[0, :, :0] @ c[0, :0],
+        ]
+
+    assert fits(without_library(jax.make_jaxpr(products)(a, b, c)).jaxpr)
+    found = jax.jit(lambda *x: one_function(products, *x))(a, b, c)
+    for mine, plain in zip(found, products(*map(np.asarray, (a, b, c)))):
+        np.testing.assert_allclose(mine, plain, rtol=1e-13, atol=1e-13)
+
+
+def test_a_linear_solve_of_functions():
+    """Its programs are in a named tuple, which the rewriting keeps."""
+
+    def solve(x):
+        return lax.custom_linear_solve(lambda y: 3 * y, x, lambda _, b: b / 3, symmetric=True)
+
+    np.testing.assert_allclose(jax.jit(lambda x: one_function(solve, x))(TWO[0]), 2 / 3, rtol=1e-15)
+
+
+def test_what_is_no_check_stays():
+    """A host call that computes something stays; only one that does nothing but raise is left out."""
+    host = lambda x: jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), jnp.float64), x)
+    works = jax.make_jaxpr(lambda x: lax.cond(x > 0, host, lambda x: x, x))(TWO[0])
+    assert calls_host(without_checks(works).jaxpr) and jaxpr_as_fun(without_checks(works))(TWO[0])[0] == 4.0
+    check = jax.make_jaxpr(lambda x: eqx.error_if(x, x < 0, "negative"))(TWO[0])
+    assert calls_host(check.jaxpr) and not calls_host(without_checks(check).jaxpr)
+
+
+@pytest.mark.parametrize("size", [1, 1000, 1251, 5000])
+def test_large_arrays_that_are_known(size):
+    """Arrays closed over, captured or made inside: above 10 kB XLA ended the process."""
+    table = np.linspace(0.0, 1.0, size)
+    known, given = jnp.asarray(table), jnp.asarray(2.0)
+
+    def looked_up(x, table):
+        return lax.while_loop(lambda s: s < 100.0, lambda s: 3 * s + (table - s)[s.astype(int) % size], x)
+
+    expected = looked_up(given, known)
+    closed = jax.jit(lambda x: one_function(looked_up, x, known))
+    captured = jax.jit(lambda x: one_function(lambda x: looked_up(x, known), x))
+    made = jax.jit(lambda x: one_function(lambda x: looked_up(x, jnp.linspace(0.0, 1.0, size)), x))
+    for program in (closed, captured, made):
+        assert 'inlineable="false"' in entry(program, given)
+        np.testing.assert_allclose(program(given), expected, rtol=1e-14)
+
+
+def layer(x, w):
+    """Two products with a matrix, done twice in a loop."""
+    return lax.while_loop(lambda s: s[0] < 2, lambda s: (s[0] + 1, jnp.tanh(w.T @ (w @ s[1]))), (0, x))[1]
+
+
+def check_products(sizes):
+    """Products of these sizes, each in one function, are those of NumPy; twenty sizes share a program."""
+    rng = np.random.default_rng(0)
+    square = lambda a: a @ a @ a.T
+    for some in (sizes[i : i + 20] for i in range(0, len(sizes), 20)):
+        layers = [(rng.normal(size=size), rng.normal(size=(size, size)) / size) for size in some]
+        squares = [rng.normal(size=2 * (int(size**0.5) + 1,)) for size in some]
+        of_all = lambda layers, squares: (
+            [one_function(layer, x, w) for x, w in layers], [one_function(square, a) for a in squares]
+        )  # fmt: skip
+        found = jax.jit(of_all)(*jax.tree.map(jnp.asarray, (layers, squares)))
+        for one, (x, w) in zip(found[0], layers):
+            once = np.tanh(w.T @ (w @ x))
+            np.testing.assert_allclose(one, np.tanh(w.T @ (w @ once)), rtol=1e-12, atol=1e-14)
+        for one, a in zip(found[1], squares):
+            np.testing.assert_allclose(one, square(a), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [16, 63, 64, 65])
+def test_products_of_many_multiplications(size):
+    """Around 4,096 multiplications, where XLA may take a sum for a library product, which must not occur."""
+    check_products([size])
+
+
+@pytest.mark.exhaustive
+def test_products_of_every_size():
+    """Sizes 2 to 300 as matrix times vector, and their square roots as matrix times matrix."""
+    check_products(range(2, 301))
+
+
+def test_a_checkpoint_is_looked_into():
+    """A checkpoint holds its program in another way; products in it are replaced too."""
+    w = jnp.asarray(np.random.default_rng(0).normal(size=(70, 70)))
+    inside = lambda x: jax.checkpoint(lambda x: w[:9, :9] @ x)(x)
+    program = without_library(jax.make_jaxpr(inside)(w[0, :9]))
+    assert fits(program.jaxpr) and "dot_general" not in str(program)
+    one = jax.jit(lambda x: one_function(inside, x))(w[0, :9])
+    np.testing.assert_allclose(one, w[:9, :9] @ w[0, :9], rtol=1e-14)
+
+
+def test_products_of_mixed_kinds():
+    """Integers, booleans and lower precision times float64, as `@` passes them."""
+    x = jnp.arange(1.0, 4.0)
+    for matrix in (2 * jnp.eye(3, dtype=int), jnp.eye(3, dtype=bool), jnp.eye(3, dtype=jnp.float32) / 3):
+        one = jax.jit(lambda x: one_function(lambda x: matrix @ x, x))(x)
+        assert one.dtype == x.dtype
+        np.testing.assert_allclose(one, np.asarray(matrix, float) @ x, rtol=1e-15)

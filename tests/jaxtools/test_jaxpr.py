@@ -1,0 +1,130 @@
+"""The tables of primitives by name: each name is that of a primitive of the installed JAX."""
+
+import sys
+
+import diffrax  # noqa: F401  (with the primitives of equinox that it uses)
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import Primitive
+
+from lagjax.jaxtools import fuse_cpu, jaxpr, scalarize, sparsity
+from lagjax.jaxtools.xla_marks import STAYS_A_CALL, marked
+
+# From jax 0.11.1 on there are none of these.
+UP_TO_0_11_0 = {"closed_call"}
+TABLES = {
+    f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
+    for module in (jaxpr, fuse_cpu, scalarize, sparsity)
+    for name, table in vars(module).items()
+    if name.isupper() and name not in ("ONE_KERNEL", "STAYS_A_CALL") and isinstance(table, (set, dict))
+}
+
+
+def primitives():
+    """The names of all primitives that JAX, equinox, lineax and lagjax have defined, in the modules that are loaded."""
+    # The primitive of the marks is not a variable of any module.
+    program = jax.make_jaxpr(lambda x: marked(jnp.sin(x), STAYS_A_CALL))(1.0)
+    found = {equation.primitive.name for equation in program.eqns}
+    for name, module in list(sys.modules.items()):
+        if name.split(".")[0] in ("jax", "equinox", "lagjax", "lineax"):
+            found |= {x.name for x in list(vars(module).values()) if isinstance(x, Primitive)}
+    return found
+
+
+def unknown(table):
+    """The names of a table that belong to no primitive."""
+    gone = UP_TO_0_11_0 if jax.__version_info__ >= (0, 11, 1) else set()
+    return sorted(table - primitives() - gone)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_each_name_is_one(table):
+    """Every name is known: a primitive that JAX has renamed would silently be treated as unknown, and be slower."""
+    assert unknown(TABLES[table]) == []
+
+
+def test_the_tables_are_found():
+    """Twin: all of the modules have tables, and a misspelt name is noticed."""
+    assert {name.rsplit(".", 1)[0].split(".")[-1] for name in TABLES} == {
+        "jaxpr", "fuse_cpu", "scalarize", "sparsity",
+    }  # fmt: skip
+    assert unknown({"sin", "sine"}) == ["sine"]
+
+
+OTHERWISE_CALLED = {"and": lax.bitwise_and, "or": lax.bitwise_or, "not": lax.bitwise_not}
+OF_WHOLE_NUMBERS = {"and", "or", "not"}
+
+
+def the_same_in_numpy(name, by_jax):
+    """Whether a primitive and the table's NumPy function agree on some numbers; check that it is the one meant."""
+    numbers = np.array([-3, 0, 2, 5]), np.array([4, -1, 2, -2])
+    operands = numbers if name in OF_WHOLE_NUMBERS else tuple(0.7 * x for x in numbers)
+    if name == "select_n":
+        operands = np.array([True, False, True, False]), *operands
+    if name in ("abs", "neg", "not", "square"):
+        operands = operands[:1]
+    assert [e.primitive.name for e in jax.make_jaxpr(by_jax)(*operands).eqns] == [name]
+    return np.array_equal(by_jax(*operands), jaxpr.IN_NUMPY[name](*operands))
+
+
+@pytest.mark.parametrize("name", jaxpr.IN_NUMPY)
+def test_numpy_does_the_same(name):
+    """NumPy's functions agree with the primitives on numbers of both signs, equal ones among them."""
+    assert the_same_in_numpy(name, OTHERWISE_CALLED[name] if name in OTHERWISE_CALLED else getattr(lax, name))
+
+
+def test_another_function_would_be_seen(monkeypatch):
+    """Twin: "less" in place of "less or equal" is noticed."""
+    monkeypatch.setitem(jaxpr.IN_NUMPY, "le", np.less)
+    assert not the_same_in_numpy("le", lax.le)
+
+
+FACTOR = np.array([[1.0, 2.0], [3.0, 4.0]])
+LINEAR = {
+    "add": lambda x: lax.add(x, x),
+    "add_any": lambda x: jax.linear_transpose(lambda y: (y, y), x)((x, x))[0],
+    "broadcast_in_dim": lambda x: lax.broadcast_in_dim(x, (2, 2, 2), (1, 2)),
+    "concatenate": lambda x: lax.concatenate([x, x], 0),
+    "convert_element_type": lambda x: lax.convert_element_type(x, np.float32),
+    "copy": lambda x: lax.copy_p.bind(x),
+    "cumsum": lambda x: lax.cumsum(x, 0),
+    "neg": lax.neg,
+    "pad": lambda x: lax.pad(x, 0.0, [(1, 0, 0), (0, 1, 0)]),
+    "reduce_sum": lambda x: lax.reduce_sum_p.bind(x, axes=(0,), out_sharding=None),
+    "reshape": lambda x: lax.reshape(x, (4,)),
+    "rev": lambda x: lax.rev(x, (0,)),
+    "slice": lambda x: lax.slice(x, (0, 1), (2, 2)),
+    "split": lambda x: lax.split(x, (1, 1))[1],
+    "squeeze": lambda x: lax.squeeze(lax.slice(x, (0, 0), (1, 2)), (0,)),
+    "sub": lambda x: lax.sub(x, lax.mul(x, FACTOR)),
+    "transpose": lambda x: lax.transpose(x, (1, 0)),
+    "div": lambda x: lax.div(x, FACTOR),
+    "dynamic_slice": lambda x: lax.dynamic_slice(x, (1, 0), (1, 2)),
+    "gather": lambda x: x[np.array([1, 0]), np.array([1, 1])],
+    "dot_general": lambda x: x @ FACTOR,
+    "mul": lambda x: lax.mul(x, FACTOR),
+}
+
+
+def is_linear(function):
+    """Whether a function of a matrix doubles with it, and leaves sums alone."""
+    x, y = np.array([[0.3, -1.2], [2.5, 0.7]]), np.array([[1.1, 0.4], [-0.6, 3.0]])
+    of = lambda x: np.asarray(function(jnp.asarray(x)), float)
+    return np.allclose(of(x + y), of(x) + of(y), atol=1e-6) and np.allclose(of(2 * x), 2 * of(x), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_linear_primitives(name):
+    """They are linear in their first operand, as the analysis of dependence assumes."""
+    found = [equation.primitive.name for equation in jaxpr.equations(jax.make_jaxpr(LINEAR[name])(FACTOR).jaxpr)]
+    assert name in found and is_linear(LINEAR[name])
+
+
+def test_all_linear_primitives_are_tried():
+    """Twin: a function that is not linear is noticed; and only the named primitives of the tables are not tried."""
+    assert not is_linear(lambda x: lax.mul(x, x)) and not is_linear(jnp.sin)
+    untried = jaxpr.ADDITIVE | jaxpr.LINEAR_IN_FIRST | jaxpr.BILINEAR - set(LINEAR)
+    assert untried - set(LINEAR) == {"stack", "stop_gradient"}

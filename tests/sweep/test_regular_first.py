@@ -1,0 +1,238 @@
+"""Sweeps first assume regular motions: lanes that are not settled are computed entirely with the robust program."""
+
+import contextlib
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import lagjax as lj
+from lagjax.fit.search.search import in_turn
+from lagjax.integrate.solve import harvest
+from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
+from lagjax.sweep import batch_program, program_cache
+from lagjax.sweep.axes import axes_of
+from tests.plain import not_plain
+from tests.tiers import exhaustive_but
+
+# The mass matrix [[k, 1], [1, k]] is definite for k > 1; for k < 1 it needs pivots.
+saddle = lj.System(
+    lambda t, q, v, p: v[0] * v[1] + 0.5 * p["k"] * (v[0] ** 2 + v[1] ** 2) - 0.5 * (q[0] ** 2 + q[1] ** 2)
+)
+BOTH = {"k": np.array([0.0, 0.5, 2.0, 3.0, 4.0, 5.0])}
+DEFINITE = {"k": np.array([2.0, 3.0, 4.0, 5.0])}
+
+
+def saddle_motion(k):
+    """From (1, 1/2) at rest to t = 1."""
+    return lj.integrate(saddle, jnp.array([1.0, 0.5]), jnp.zeros(2), {"k": k}, ts=jnp.array([0.0, 1.0]))
+
+
+def first_coordinate(point):
+    """The first coordinate at t = 1."""
+    return saddle_motion(point["k"]).q[-1, 0]
+
+
+def exact(k):
+    """(1 + k) s'' = -s for the sum of the coordinates, (k - 1) d'' = -d for their difference."""
+    rate = 1 / np.sqrt(np.abs(k - 1))
+    difference = np.where(k < 1, np.cosh(rate), np.cos(rate))
+    return 0.5 * (1.5 * np.cos(1 / np.sqrt(1 + k)) + 0.5 * difference)
+
+
+def quiet(run, axes=BOTH, **settings):
+    """A sweep without a progress bar."""
+    return lj.sweep(run, axes, progress=False, **settings)
+
+
+def regular_alone(run, axes=BOTH):
+    """(values, status, settled) of only the program that assumes regular motions."""
+    grid = axes_of(axes, False)
+    program, _ = program_cache.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
+    return program.call(grid.at(np.arange(grid.size)), grid.size)
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch):
+    """Count the compiled programs of each kind, starting with an empty cache."""
+    count, compiled = Counter(), program_cache.compiled
+
+    def counted(*args):
+        count["robust" if args[-1] else "regular"] += 1
+        return compiled(*args)
+
+    monkeypatch.setattr(program_cache, "compiled", counted)
+    program_cache.PROGRAMS.clear()
+    return count
+
+
+@contextlib.contextmanager
+def all_robust(monkeypatch):
+    """Run sweeps with the robust program from the start."""
+    with monkeypatch.context() as changed:
+        changed.setattr(batch_program, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
+        program_cache.PROGRAMS.clear()
+        yield
+    program_cache.PROGRAMS.clear()
+
+
+@pytest.mark.exhaustive
+@not_plain
+def test_lanes_that_are_not_regular(compiled):
+    """All lanes have their exact values. Twin: without the robust program the irregular ones fail."""
+    swept = quiet(first_coordinate)
+    assert swept.ok.all() and compiled == {"regular": 1, "robust": 1}
+    np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
+    values, status, settled = regular_alone(first_coordinate)
+    np.testing.assert_array_equal(settled, BOTH["k"] > 1)
+    np.testing.assert_array_equal(np.isnan(values), ~settled)
+    assert not np.isin(status.result[~settled], batch_program.TRUSTED).any()
+
+
+def test_where_all_are_regular(compiled):
+    """No robust program is compiled if all motions are regular."""
+    swept = quiet(first_coordinate, DEFINITE)
+    np.testing.assert_allclose(swept.values, exact(DEFINITE["k"]), rtol=1e-7)
+    assert swept.ok.all() and compiled == {"regular": 1}
+
+
+@pytest.mark.exhaustive
+@not_plain
+def test_what_run_makes_of_a_failure():
+    """A run that replaces NaN and reads `result`: the whole lane is computed again. Twin: the first program alone."""
+
+    def run(point):
+        traj = saddle_motion(point["k"])
+        went_well = traj.result == lj.RESULTS.successful
+        return {"q": jnp.where(jnp.isfinite(traj.q[-1, 0]), traj.q[-1, 0], 7.0), "went well": went_well}
+
+    swept, (values, *_) = quiet(run), regular_alone(run)
+    np.testing.assert_allclose(swept.values["q"], exact(BOTH["k"]), rtol=1e-7)
+    assert swept.values["went well"].all()
+    # The values are not even NaN: only the report says that the lane failed.
+    assert not values["went well"][:2].any() and not np.allclose(values["q"][:2], swept.values["q"][:2])
+
+
+# Functions that hide an integration at k.
+HIDDEN = {
+    "a map": lambda k: lax.map(lambda k: saddle_motion(k).q[-1, 0], jnp.stack([k]))[0],
+    "a branch": lambda k: lax.cond(k < 9.0, lambda k: saddle_motion(k).q[-1, 0], lambda k: k, k),
+    "a loop": lambda k: lax.while_loop(lambda x: x[1] < 1, lambda x: (saddle_motion(k).q[-1, 0], 1), (k, 0))[0],
+    "a branch, jitted": lambda k: jax.jit(lambda k: HIDDEN["a branch"](k))(k),
+}
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("what", exhaustive_but(("a map",), HIDDEN))
+def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
+    """In a loop or a branch no motion is assumed regular. Twin: failures there would go unnoticed."""
+    run = lambda point: HIDDEN[what](point["k"])
+    np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
+    assert regular_alone(run)[2] is None and compiled["robust"] == 0
+    monkeypatch.setattr(harvest, "_hides", lambda jaxpr: False)
+    program_cache.PROGRAMS.clear()
+    np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    "derivative", exhaustive_but((jax.grad,), (jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))))
+)
+def test_derivatives(derivative, compiled):
+    """Both modes, and `vmap` inside, give the exact derivatives. Twin: the first program alone gives NaN."""
+    motion = lambda k: saddle_motion(k).q[-1, 0]
+
+    def run(point):
+        many = jnp.stack([point["k"], 2.5 + 0.0 * point["k"]])
+        return derivative(motion)(many)[0] if derivative not in (jax.grad, jax.jacfwd) else derivative(motion)(many[0])
+
+    step = 1e-5
+    slopes = (exact(BOTH["k"] + step) - exact(BOTH["k"] - step)) / (2 * step)
+    np.testing.assert_allclose(quiet(run).values, slopes, rtol=1e-5)
+    assert compiled == {"regular": 1, "robust": 1}
+    np.testing.assert_array_equal(np.isnan(regular_alone(run)[0]), BOTH["k"] < 1)
+
+
+@pytest.mark.exhaustive
+def test_many_chunks_and_workers(compiled):
+    """All chunks share one robust program; after a mostly irregular chunk the first program is not called again."""
+    many = {"k": np.tile(BOTH["k"][:2], 40)}
+    swept = quiet(first_coordinate, many, chunk=4, workers=4)
+    np.testing.assert_allclose(swept.values, exact(many["k"]), rtol=1e-7)
+    assert compiled == {"regular": 1, "robust": 1} and swept.compiling > 0
+    (program,) = [program for program in program_cache.PROGRAMS.values() if program.irregular.is_set()]
+    calls = Counter()
+    remembered_program = program._replace(call=lambda *args: calls.update(["regular"]) or program.call(*args))
+    for key, kept in list(program_cache.PROGRAMS.items()):
+        if kept is program:
+            program_cache.PROGRAMS[key] = remembered_program
+    again = quiet(first_coordinate, many, chunk=4, workers=4)
+    np.testing.assert_array_equal(again.values, swept.values)
+    assert again.compiling == 0 and not calls
+    # Twin: with the flag cleared it is called.
+    program.irregular.clear()
+    quiet(first_coordinate, many, chunk=4, workers=1)
+    assert calls["regular"] == 1
+
+
+@pytest.mark.exhaustive
+def test_in_turn_and_resweep(compiled):
+    """Lanes one after the other, and points run again."""
+    swept = quiet(first_coordinate, layout="map")
+    np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
+    again = swept.resweep(lambda point: 2 * first_coordinate(point), where=BOTH["k"] < 3)
+    np.testing.assert_allclose(again.values, exact(BOTH["k"]) * np.where(BOTH["k"] < 3, 2, 1), rtol=1e-7)
+
+
+@pytest.mark.exhaustive
+def test_in_a_store(tmp_path, compiled):
+    """Same values; the store is recognised even when the first program is no longer called."""
+    pytest.importorskip("zarr")
+    path, whole = tmp_path / "sweep", quiet(first_coordinate, chunk=3)
+    half = quiet(first_coordinate, chunk=3, store=path, part=(0, 2))
+    assert half.ran == 3 and half.ok.sum() == 3
+    assert any(program.irregular.is_set() for program in program_cache.PROGRAMS.values())
+    done = quiet(first_coordinate, chunk=3, store=path, part=(1, 2))
+    assert done.ran == 3 and done.ok.all()
+    np.testing.assert_allclose(done.values, whole.values, rtol=1e-13)
+    program_cache.PROGRAMS.clear()
+    assert quiet(first_coordinate, chunk=3, store=path).ran == 0
+
+
+rod = lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1.0
+doubled = lj.System(
+    lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2) - p["g"] * q["y"],
+    {"rod": lj.Holonomic(rod), "other": lj.Holonomic(lambda t, q, p: jnp.where(p["twice"], rod(t, q, p), q["z"]))},
+)
+
+
+@pytest.mark.exhaustive
+def test_a_constraint_written_twice(monkeypatch):
+    """Dependent constraints and invalid starts: values and statuses match those of the robust program alone."""
+
+    def values(point):
+        still = {"x": 0.0, "y": 0.0, "z": 0.0}
+        params = {"g": 9.81, "twice": point["twice"]}
+        traj = lj.integrate(doubled, still | {"x": point["x"]}, still, params, ts=jnp.linspace(0, 1, 3))
+        return traj.q["y"], traj.multipliers["rod"]
+
+    axes = {"twice": np.array([True, False]), "x": np.array([1.0, 1.2, np.nan])}
+    swept = quiet(values, axes)
+    with all_robust(monkeypatch):
+        expected = quiet(values, axes)
+    np.testing.assert_array_equal(swept.status.result, expected.status.result)
+    assert swept.ok[:, 0].all()
+    for found, other in zip(swept.values, expected.values):
+        np.testing.assert_allclose(found, other, rtol=1e-9, atol=1e-12)
+
+
+def test_a_fit_takes_nothing_for_regular():
+    """Motions that a search tries are not assumed regular and not reported to a sweep of fits."""
+    with WATCHED(True), REGULAR_FIRST(True):
+        assert takes_for_regular()
+        inside = []
+        in_turn(lambda x: inside.append(takes_for_regular()) or x, jnp.asarray(1.0))
+    assert inside == [False]

@@ -1,0 +1,176 @@
+"""Sweeps on disk: resumed, refused, killed, shared."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import zarr
+
+import lagjax as lj
+from lagjax.sweep.store import Store
+from tests.sweep import worker
+
+POINTS = 2000
+
+
+def swept(run, store=None, **settings):
+    """The worker's sweep, or a quicker one, in this process."""
+    return lj.sweep(run, worker.axes(POINTS), store=store, chunk=32, workers=1, progress=False, **settings)
+
+
+def same(found, whole):
+    """Check equality bit for bit: a resumed sweep runs the same program."""
+    np.testing.assert_array_equal(found.values, whole.values)
+    np.testing.assert_array_equal(found.status.result, whole.status.result)
+
+
+def started(store, k=0, n=1, *port):
+    """Start a worker process."""
+    root = Path(lj.__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(POINTS), *map(str, port)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def test_written_resumed_and_read(tmp_path):
+    """A second call computes nothing; the store opens without the function that ran it."""
+    path, whole = tmp_path / "sweep", swept(worker.quick)
+    first = swept(worker.quick, path)
+    assert first.ran == POINTS
+    same(first, whole)
+    second = swept(worker.quick, path)
+    assert second.ran == 0
+    same(second, whole)
+    alone = lj.open_sweep(path)
+    assert alone.dims == whole.dims and alone.counts() == whole.counts()
+    np.testing.assert_array_equal(alone.values, whole.values)
+    assert alone.to_xarray()["value"].dims == ("g", "angle")
+    with pytest.raises(ValueError, match="does not know the function that ran it"):
+        alone.resweep(where=True)
+
+
+def test_only_what_is_missing(tmp_path):
+    """Unmarked blocks are computed again, whatever values they contain."""
+    path, whole = tmp_path / "sweep", swept(worker.quick)
+    swept(worker.quick, path)
+    store = Store(path)
+    store.unmark([1])
+    zarr.open_group(str(path))["value"][store.blocks.region(1)] = -1.0
+    again = swept(worker.quick, path)
+    assert again.ran == len(np.r_[store.blocks.points(1)])
+    same(again, whole)
+
+
+def test_another_sweep_is_refused(tmp_path):
+    """Other values, another function, other settings: each is named, and the store stays unchanged."""
+    path, axes = tmp_path / "sweep", {"x": jnp.arange(6.0)}
+    run = lambda scale: lambda point: scale * point["x"]
+    lj.sweep(run(2.0), axes, store=path, chunk=2, progress=False)
+    cases = [
+        (run(3.0), axes, {}, "run is another function"),
+        (run(2.0), {"x": jnp.arange(6.0) + 1}, {}, "axis 'x' has other values"),
+        (run(2.0), {"x": jnp.arange(7.0)}, {}, "points: x: 6 there, x: 7 here"),
+        (run(2.0), axes, {"chunk": 3}, "chunk: 2 there, 3 here"),
+        (lambda point: (2.0 * point["x"], 1.0), axes, {}, "values 0: None there"),
+    ]
+    for other, over, settings, words in cases:
+        with pytest.raises(ValueError, match="belongs to another sweep") as refusal:
+            lj.sweep(other, over, store=path, progress=False, **settings)
+        assert words in str(refusal.value)
+    assert lj.sweep(run(2.0), axes, store=path, progress=False).ran == 0
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match="is not the store of a sweep"):
+        lj.sweep(run(2.0), axes, store=tmp_path / "other", progress=False)
+
+
+def blocks_there(path):
+    """The number of marked blocks, 0 before the store exists."""
+    return 0 if not path.exists() else len(Store(path).blocks) - len(Store(path).missing())
+
+
+def points_there(path):
+    """The number of points in the marked blocks."""
+    store = Store(path)
+    there = set(range(len(store.blocks))) - set(store.missing().tolist())
+    return sum(len(np.r_[store.blocks.points(number)]) for number in there)
+
+
+def wait_for(process, path, count):
+    """Wait until `count` blocks are marked."""
+    deadline = time.monotonic() + 120
+    while blocks_there(path) < count:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def kill_when(process, path, count):
+    """`kill -9` once `count` blocks are marked."""
+    wait_for(process, path, count)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+@pytest.mark.optimised
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path):
+    """At any moment only the block in progress is lost, and nothing is corrupted."""
+    path = tmp_path / "sweep"
+    kill_when(started(path), path, 1)
+    kill_when(started(path), path, 2)
+    there = points_there(path)
+    rest = started(path)
+    computed = int(rest.communicate()[0])
+    assert 0 < computed <= POINTS - there
+    same(swept(worker.run, path), swept(worker.run))
+
+
+@pytest.mark.exhaustive
+def test_interrupted_from_the_keyboard(tmp_path):
+    """The process exits normally and keeps the finished points."""
+    path, computed = tmp_path / "sweep", POINTS
+    while computed == POINTS:
+        # On a busy machine a sweep may finish before it is interrupted; then it is tried again.
+        shutil.rmtree(path, ignore_errors=True)
+        process = started(path)
+        wait_for(process, path, 1)
+        process.send_signal(signal.SIGINT)
+        computed = int(process.communicate()[0])
+        assert process.returncode == 0 and computed > 0
+    assert points_there(path) == computed
+    same(swept(worker.run, path), swept(worker.run))
+
+
+@pytest.mark.exhaustive
+def test_two_processes_by_jax_distributed(tmp_path):
+    """On loopback: each process finds its part, and together they compute all points."""
+    path = tmp_path / "sweep"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes = [started(path, k, 2, port) for k in range(2)]
+    computed = [int(process.communicate(timeout=300)[0]) for process in processes]
+    assert sum(computed) == POINTS and min(computed) > 0
+    same(swept(worker.run, path), swept(worker.run))
+
+
+@pytest.mark.exhaustive
+def test_two_processes_one_killed(tmp_path):
+    """Two processes share a store; the killed one is restarted and computes only its missing blocks."""
+    path = tmp_path / "sweep"
+    first, second = started(path, 0, 2), started(path, 1, 2)
+    kill_when(second, path, 1)
+    computed = int(first.communicate()[0])
+    missing = POINTS - points_there(path)
+    again = int(started(path, 1, 2).communicate()[0])
+    assert 0 < computed < POINTS and missing > 0 and again <= missing
+    assert len(Store(path).missing()) == 0
+    same(swept(worker.run, path), swept(worker.run))

@@ -1,0 +1,573 @@
+"""What a function computes is its jaxpr: whatever its values come from, an answer is that of a fresh process."""
+
+import collections
+import contextvars
+import copy
+import dataclasses
+import functools
+import gc
+import importlib
+import os
+import sys
+import threading
+import types
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.jaxtools import cache as memory
+from lagjax.jaxtools import program_cache
+from lagjax.system import coordinates, traced_functions
+from lagjax.system.check_functions import traced_system
+from tests.counting import compiles
+
+VALUES = (9.81, 1.62, 3.7)
+G = 9.81
+BOX = types.SimpleNamespace(inner=None)
+CONTEXT: contextvars.ContextVar = contextvars.ContextVar("gravity", default=0.0)
+
+
+def strength():
+    """A function that L calls."""
+    return G
+
+
+def weight():
+    """A function that is defined anew."""
+    return G
+
+
+def helper(q):
+    """Another one."""
+    return q
+
+
+class Planet:
+    """A number below attributes, properties and tables."""
+
+    factor = 1.0
+
+    def __init__(self):
+        self.table, self.inner = {"g": 0.0}, types.SimpleNamespace(g=0.0)
+
+    @property
+    def gravity(self):
+        return self.inner.g
+
+    def by_table(self, t, q, v, p):
+        return 0.5 * v**2 - self.table["g"] * q
+
+    def by_property(self, t, q, v, p):
+        return 0.5 * v**2 - self.gravity * q
+
+    def __call__(self, t, q, v, p):
+        return 0.5 * v**2 - self.inner.g * q
+
+
+@dataclasses.dataclass
+class Inner:
+    """An inner part."""
+
+    g: float
+
+
+@dataclasses.dataclass
+class Outer:
+    """An outer part."""
+
+    inner: Inner
+
+
+class Module(eqx.Module):
+    """A module with a static number."""
+
+    g: float = eqx.field(static=True)
+
+    def __call__(self, t, q, v, p):
+        return 0.5 * v**2 - self.g * q
+
+
+def falling(read):
+    """L with the number that `read()` returns."""
+    return lambda t, q, v, p: 0.5 * v**2 - read() * q
+
+
+# Each returns L and the function that sets the number which it reads.
+def in_a_global():
+    """In a global."""
+    return lambda t, q, v, p: 0.5 * v**2 - G * q, lambda g: globals().__setitem__("G", g)
+
+
+def in_a_global_of_a_function():
+    """In a global of a function."""
+    return lambda t, q, v, p: 0.5 * v**2 - strength() * q, lambda g: globals().__setitem__("G", g)
+
+
+def in_a_function_defined_anew():
+    """In a function defined anew."""
+    return (
+        lambda t, q, v, p: 0.5 * v**2 - weight() * q,
+        lambda g: globals().__setitem__("weight", lambda: g),
+    )
+
+
+def in_a_cell():
+    """In a cell."""
+    number = 0.0
+
+    def put(g):
+        nonlocal number
+        number = g
+
+    return falling(lambda: number), put
+
+
+def in_a_list_of_a_dictionary():
+    """In a list of a dictionary."""
+    held = {"nested": [0.0]}
+    return falling(lambda: held["nested"][0]), lambda g: held["nested"].__setitem__(0, g)
+
+
+def in_a_new_dictionary():
+    """In a new dictionary."""
+    held = types.SimpleNamespace(table={})
+    return falling(lambda: held.table["g"]), lambda g: setattr(held, "table", {"g": g})
+
+
+def in_a_new_object():
+    """In a new object."""
+    held = types.SimpleNamespace()
+    return falling(lambda: held.inner.g), lambda g: setattr(held, "inner", types.SimpleNamespace(g=g))
+
+
+def in_a_table_of_a_method():
+    """In a table of a method."""
+    planet = Planet()
+    return planet.by_table, lambda g: planet.table.__setitem__("g", g)
+
+
+def in_a_property():
+    """In a property."""
+    planet = Planet()
+    return planet.by_property, lambda g: setattr(planet.inner, "g", g)
+
+
+def in_an_object_that_is_called():
+    """In an object that is called."""
+    planet = Planet()
+    return planet, lambda g: setattr(planet, "inner", types.SimpleNamespace(g=g))
+
+
+def in_a_class():
+    """In a class."""
+    cls = type("OfOne", (Planet,), {})
+    return falling(lambda: cls.factor), lambda g: setattr(cls, "factor", g)
+
+
+def in_dataclasses():
+    """In dataclasses."""
+    outer = Outer(Inner(0.0))
+    return falling(lambda: outer.inner.g), lambda g: setattr(outer.inner, "g", g)
+
+
+def in_one_entry_of_a_large_array():
+    """In one entry of a large array."""
+    table = np.zeros(20_000)
+    return falling(lambda: table[12_345]), lambda g: table.__setitem__(12_345, g)
+
+
+def in_a_large_array_that_is_summed():
+    """In a large array that is summed."""
+    table = np.zeros(5_000)
+    return falling(lambda: jnp.sum(table)), lambda g: table.__setitem__(77, g)
+
+
+def in_a_long_list():
+    """In a long list."""
+    table = [0.0] * 100
+    return falling(lambda: table[99]), lambda g: table.__setitem__(99, g)
+
+
+def in_a_large_dictionary():
+    """In a large dictionary."""
+    table = dict.fromkeys(range(100), 0.0)
+    return falling(lambda: table[99]), lambda g: table.__setitem__(99, g)
+
+
+def in_a_module():
+    """In a module."""
+    module = types.ModuleType("constants_of_the_user")
+    return falling(lambda: module.g), lambda g: setattr(module, "g", g)
+
+
+def in_an_import():
+    """In an import."""
+    sys.modules["lagjax_test_constants"] = module = types.ModuleType("lagjax_test_constants")
+
+    def lagrangian(t, q, v, p):
+        import lagjax_test_constants  # pyright: ignore
+
+        return 0.5 * v**2 - lagjax_test_constants.g * q
+
+    return lagrangian, lambda g: setattr(module, "g", g)
+
+
+def in_a_deque():
+    """In a deque."""
+    held = collections.deque([0.0], maxlen=1)
+    return falling(lambda: held[0]), held.append
+
+
+def in_a_context_variable():
+    """In a context variable."""
+    # Threads have contexts of their own, and see the default.
+    name = CONTEXT
+    return falling(lambda: name.get()), name.set
+
+
+def in_the_environment():
+    """In the environment."""
+    return falling(lambda: float(os.environ["LAGJAX_TEST_G"])), lambda g: os.environ.update(LAGJAX_TEST_G=str(g))
+
+
+def in_a_default():
+    """In a default."""
+    held = np.zeros(1)
+    return lambda t, q, v, p, k=held: 0.5 * v**2 - k[0] * q, lambda g: held.__setitem__(0, g)
+
+
+def in_defaults_that_are_replaced():
+    """In defaults that are replaced."""
+
+    def lagrangian(t, q, v, p, k=0.0, *, more=0.0):
+        return 0.5 * v**2 - (k + more) * q
+
+    def put(g):
+        lagrangian.__defaults__, lagrangian.__kwdefaults__ = (g - 1.0,), {"more": 1.0}
+
+    return lagrangian, put
+
+
+def in_a_partial():
+    """In a partial."""
+    held = {"g": 0.0}
+    return functools.partial(lambda k, t, q, v, p: 0.5 * v**2 - k["g"] * q, held), lambda g: held.update(g=g)
+
+
+def in_an_attribute_of_the_function():
+    """In an attribute of the function."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * v**2 - getattr(lagrangian, "g") * q
+
+    return lagrangian, lambda g: setattr(lagrangian, "g", g)
+
+
+def in_code_that_is_replaced():
+    """In code that is replaced."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * v**2
+
+    def put(g):
+        lagrangian.__code__ = eval(f"lambda t, q, v, p: 0.5 * v**2 - {g!r} * q").__code__
+
+    return lagrangian, put
+
+
+def in_a_static_field():
+    """In a static field."""
+    return falling(lambda: BOX.inner.g), lambda g: setattr(BOX, "inner", Module(g))
+
+
+def in_a_rule_of_differentiation():
+    """In a rule of differentiation."""
+    held = [0.0]
+
+    @jax.custom_jvp
+    def potential(q):
+        return held[0] * q
+
+    potential.defjvp(lambda primals, tangents: (held[0] * primals[0], held[0] * tangents[0]))
+    return lambda t, q, v, p: 0.5 * v**2 - potential(q), lambda g: held.__setitem__(0, g)
+
+
+def in_an_array_of_jax():
+    """In an array of jax."""
+    held = [jnp.zeros(300)]
+    return falling(lambda: held[0][250]), lambda g: held.__setitem__(0, held[0].at[250].set(g))
+
+
+def inside_a_jitted_helper():
+    """Inside a jitted helper."""
+    held = np.zeros(300)
+    return (
+        lambda t, q, v, p: 0.5 * v**2 - jax.jit(lambda q: jnp.sum(held * q))(q),
+        lambda g: held.__setitem__(3, g),
+    )
+
+
+HOLDERS = [f for name, f in list(globals().items()) if name.startswith(("in_", "inside_"))]
+# A thread has a context of its own.
+NO_THREADS = {in_a_context_variable}
+
+
+def weight_at(system):
+    """The weight of a unit mass, V(1)."""
+    return float(lj.jacobi_integral(system, 0.0, 1.0, 0.0, None))
+
+
+def in_a_thread(function, *args):
+    """The result of a function called in another thread."""
+    found = []
+    thread = threading.Thread(target=lambda: found.append(function(*args)))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def wrong_answers(rng, histories):
+    """How many of the answers in so many random histories differ from the number that L then reads."""
+    wrong, asked = 0, 0
+    for number in range(histories):
+        holder = HOLDERS[number % len(HOLDERS)]
+        lagrangian, put = holder()
+        system, g = lj.System(lagrangian), VALUES[rng.integers(3)]
+        put(g)
+        for _ in range(5):
+            action = rng.integers(6)
+            if action == 0:
+                lagrangian, put = holder()
+                g = VALUES[rng.integers(3)]
+                put(g)
+                system = lj.System(lagrangian)
+            elif action == 1:
+                system = copy.copy(system)
+            elif action == 2:
+                system = lj.System(lagrangian)
+                gc.collect(0)
+            else:
+                g = VALUES[rng.integers(3)]
+                put(g)
+            apart = action == 3 and holder not in NO_THREADS
+            found = in_a_thread(weight_at, system) if apart else weight_at(system)
+            wrong, asked = wrong + (abs(found - g) > 1e-12), asked + 1
+    return wrong, asked
+
+
+def forget():
+    """Drop all programs and facts."""
+    for cache in (program_cache._programs, memory._facts, traced_functions._known):
+        cache.clear()
+
+
+def test_answers_of_random_histories():
+    """In 320 histories of changes every answer is that of a fresh process."""
+    wrong, asked = wrong_answers(np.random.default_rng(0), 320)
+    assert asked == 1600 and wrong == 0
+
+
+def test_histories_would_show_it(monkeypatch):
+    """Twin: if programs were kept by the shapes of arguments alone, answers would be wrong."""
+    forget()
+    with monkeypatch.context() as patched:
+        patched.setattr(traced_functions, "meaning_of", lambda jaxpr: len(jaxpr.eqns))
+        wrong, _ = wrong_answers(np.random.default_rng(0), 30)
+    forget()
+    assert wrong > 30
+
+
+def test_equal_functions_share_a_program():
+    """What computes the same compiles once, however it is written; twins: another number, type, sign or array."""
+    holders = [in_a_list_of_a_dictionary, in_a_new_object, in_a_cell]
+    ones = [lj.System(lagrangian) for lagrangian, put in (holder() for holder in holders) for _ in [put(8.87)]]
+    weight_at(ones[0])
+    with compiles() as found:
+        assert [weight_at(system) for system in ones] == [8.87] * 3
+    assert found == []
+    s = coordinates.state(0.0, 1.0, 0.0, None)
+    arrays = np.ones(2), np.ones((2, 1)), np.ones(2, np.float32), np.ones(2, int), np.zeros(2), -np.zeros(2)
+    systems = [lj.System(lambda t, q, v, p, k=k: 0.5 * v**2 + jnp.sum(k) * q) for k in (1.0, 2.0, 0.0, -0.0, *arrays)]
+    programs = {getattr(traced_system(system, s).lagrangian, "program") for system in systems}
+    assert len(programs) == 10
+
+
+def test_large_arrays_are_arguments():
+    """Other values of a large array compile nothing; twin: those of a small one do."""
+    for size, most in ((5_000, 0), (3, 99)):
+        held = np.zeros(size)
+        system = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.sum(held) * q)
+        weight_at(system)
+        held[1] = 2.5
+        with compiles() as found:
+            assert weight_at(system) == 2.5
+        assert (found == []) == (most == 0)
+
+
+def test_what_names_nothing_outside_is_traced_once():
+    """Library modules, builtins and functions like itself may be named; twins: values, imports, random numbers."""
+    names = {"jnp": jnp, "np": np}
+    source = """
+def helper(q): return sum([jnp.cos(q), np.pi])
+def plain(t, q, v, params): return 0.5 * v**2 + helper(q) + params["k"] * q
+def with_value(t, q, v, params): return 0.5 * v**2 + constant * q
+def with_import(t, q, v, params):
+    import time
+    return 0.5 * v**2 + time.time() * q
+def with_random(t, q, v, params): return 0.5 * v**2 + np.random.normal() * q
+def with_default(t, q, v, params, k=1.0): return 0.5 * v**2 + k * q
+def with_eval(t, q, v, params): return eval("constant") * q
+"""
+    exec(source, names)
+    assert traced_functions.names_outside(names["plain"]) is not None
+    names["constant"] = 1.0
+    for name in ("with_value", "with_import", "with_random", "with_default", "with_eval"):
+        assert traced_functions.names_outside(names[name]) is None, name
+    plain = lj.System(names["plain"])
+    at = lambda: float(lj.jacobi_integral(plain, 0.0, 0.0, 0.0, {"k": 1.0}))
+    np.testing.assert_allclose(at(), -1 - np.pi)
+    # A function that is called may be another one the next time.
+    exec("def helper(q): return 2.0 * jnp.cos(q)", names)
+    np.testing.assert_allclose(at(), -2.0)
+    del names["helper"]
+    with pytest.raises(NameError):
+        at()
+
+
+def test_code_in_params_is_run():
+    """A function among the parameters may read another number each time."""
+    held = [1.0]
+    params = {"potential": lambda q: held[0] * q}
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["potential"](q))
+    for g in VALUES:
+        held[0] = g
+        assert float(lj.jacobi_integral(system, 0.0, 1.0, 0.0, params)) == g
+
+
+def test_a_function_called_at_run_time():
+    """What a program calls on the host reads its values then; equal callbacks share a program."""
+    held = [1.0]
+    shape = jax.ShapeDtypeStruct((), np.float64)
+    read = lambda x: np.asarray(held[0] * x)
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * v**2 - jax.lax.stop_gradient(jax.pure_callback(lambda x: read(x), shape, 1.0)) * q
+
+    system = lj.System(lagrangian)
+    for number, g in enumerate(VALUES):
+        held[0] = g
+        with compiles() as found:
+            assert weight_at(system) == g
+        assert number == 0 or found == []
+
+
+def test_a_module_that_is_loaded_again(tmp_path, monkeypatch):
+    """A reloaded module's L counts, whatever was compiled before."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    path = tmp_path / "lagjax_test_model.py"
+    path.write_text("def lagrangian(t, q, v, p):\n    return 0.5 * v**2 - 2.0 * q\n")
+    model = importlib.import_module("lagjax_test_model")
+    assert weight_at(lj.System(model.lagrangian)) == 2.0
+    path.write_text("def lagrangian(t, q, v, p):\n    return 0.5 * v**2 - 33.0 * q\n")
+    importlib.reload(model)
+    assert weight_at(lj.System(model.lagrangian)) == 33.0
+
+
+def test_a_system_with_the_data_of_its_own():
+    """A new object of the same class, whose predecessor has changed since, computes with its own data."""
+    first, second = Planet(), Planet()
+    first.table["g"] = second.table["g"] = 9.81
+    assert weight_at(lj.System(first.by_table)) == 9.81
+    first.table["g"] = 4.0
+    assert weight_at(lj.System(second.by_table)) == 9.81
+    assert weight_at(lj.System(first.by_table)) == 4.0
+
+
+def test_a_trajectory_keeps_what_was_read():
+    """Its Jacobi integral, its copies and its ledger are those of the numbers that it was integrated with."""
+    held = [10.0]
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - held[0] * q)
+    motion = lj.integrate(system, 1.0, 0.0, ts=np.array([0.0, 1.0]))
+    held[0] = 2.0
+    np.testing.assert_allclose(motion.jacobi_integral(), 10.0, rtol=1e-12)
+    np.testing.assert_allclose(lj.integrate(system, 1.0, 0.0, ts=np.array([0.0, 1.0])).q[-1], 0.0, atol=1e-12)
+
+
+def test_constraints_and_guards_are_read_again():
+    """A constraint's residual, and the time of an event at q = level, after a number that they read has changed."""
+    held = {"length": 1.0}
+    rod = lj.Holonomic(lambda t, q, p: q - held["length"])
+    free = lambda **constraints: lj.System(lambda t, q, v, p: 0.5 * v**2, constraints)
+    at_level = {"level": lj.Crossing(lambda t, q, v, p: q - held["length"])}
+    for length in (1.0, 2.0):
+        held["length"] = length
+        residual = lj.constraint_residual(free(rod=rod), 0.0, 3.0, 0.0, None)["rod"]
+        motion = lj.integrate(free(), 0.0, 2.0, ts=np.array([0.0, 9.0]), events=at_level)
+        np.testing.assert_allclose([residual, motion.end.t], [3.0 - length, length / 2], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_fit_reads_again():
+    """The stiffness of x'' = -k s x with k s = 3 is fitted as 3/s, also after s, which L reads, has changed."""
+    held, t = [1.0], np.linspace(0.0, 2.0, 21)
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * held[0] * q**2)
+    record = lj.Record(t, q=np.cos(np.sqrt(3.0) * t), q0=1.0, v0=0.0, hold_q=True, hold_v=True)
+    for s in (1.0, 1.25):
+        held[0] = s
+        np.testing.assert_allclose(lj.fit(system, record, {"k": 2.5}).params["k"], 3.0 / s, rtol=1e-7)
+
+
+SPRING = types.SimpleNamespace(k=1.0)
+
+
+def by_default(k):
+    """A spring's L with its stiffness by default."""
+    return lambda t, q, v, p, k=k: 0.5 * v**2 - 0.5 * k * q**2
+
+
+def by_keyword(k):
+    """A spring's L with its stiffness by keyword."""
+
+    def lagrangian(t, q, v, p, *, k=k):
+        return 0.5 * v**2 - 0.5 * k * q**2
+
+    return lagrangian
+
+
+def by_attribute(k):
+    """A spring's L with its stiffness by attribute."""
+    SPRING.k = k
+    return lambda t, q, v, p: 0.5 * v**2 - 0.5 * SPRING.k * q**2
+
+
+def by_helper(k):
+    """A spring's L with its stiffness by helper."""
+    globals()["helper"] = lambda q: 0.5 * k * q**2
+    return lambda t, q, v, p: 0.5 * v**2 - helper(q)
+
+
+@pytest.mark.parametrize("lagrangian", [by_default, by_keyword, by_attribute, by_helper])
+def test_traced_numbers_from_outside(lagrangian):
+    """Derivatives by a number that L reads from outside, in both modes and in lanes: a = -k q."""
+    acceleration = lambda k: lj.accelerations(lj.System(lagrangian(k)), 0.0, 2.0, 0.0, None)[0]
+    for slope in (jax.grad(acceleration), jax.jit(jax.grad(acceleration)), jax.jacfwd(acceleration)):
+        np.testing.assert_allclose(slope(3.0), -2.0, rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.vmap(acceleration))(jnp.array([2.0, 3.0])), [-4.0, -6.0], rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_motions_with_traced_numbers_from_outside():
+    """d/dk cos(sqrt k) at k = 3, and the time 0.5 c of an event at q = c, for defaults of L and of a guard."""
+    ts = jnp.array([0.0, 1.0])
+    end = lambda k: lj.integrate(lj.System(by_default(k)), 1.0, 0.0, ts=ts).q[-1]
+    exact = -np.sin(np.sqrt(3.0)) / (2 * np.sqrt(3.0))
+    np.testing.assert_allclose([jax.grad(end)(3.0), jax.jit(jax.grad(end))(3.0)], exact, rtol=1e-9)
+    free = lj.System(lambda t, q, v, p: 0.5 * v**2)
+    level = lambda c: {"level": lj.Crossing(lambda t, q, v, p, c=c: q - c)}
+    when = lambda c: lj.integrate(free, 0.0, 2.0, ts=10 * ts, events=level(c)).end.t
+    np.testing.assert_allclose([jax.grad(when)(3.0), jax.jit(jax.grad(when))(3.0)], 0.5, rtol=1e-12)
