@@ -3,6 +3,7 @@
 import ast
 import doctest
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import re
@@ -237,6 +238,29 @@ def test_the_example_check_can_fail():
 def test_types_are_shipped():
     """The marker file for type checkers is in the package."""
     assert (ROOT / "py.typed").exists()
+
+
+def absent(source: str) -> list[str]:
+    """What a file reads from modules of lagjax that these do not have, such as `balance.holonomic` after a renaming."""
+    nodes = list(ast.walk(ast.parse(source)))
+    modules = {}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lagjax"):
+            for alias in node.names:
+                if importlib.util.find_spec(node.module).submodule_search_locations is None:
+                    continue
+                name = f"{node.module}.{alias.name}"
+                if importlib.util.find_spec(name) is not None:
+                    modules[alias.asname or alias.name] = importlib.import_module(name)
+    reads = {(x.value.id, x.attr) for x in nodes if isinstance(x, ast.Attribute) and isinstance(x.value, ast.Name)}
+    return sorted(f"{name}.{attr}" for name, attr in reads if name in modules and not hasattr(modules[name], attr))
+
+
+def test_what_is_read_from_a_module_is_there():
+    """No function, however rarely it is called, reads a name that another module no longer has; twin: one that does."""
+    files = [*FILES, *(ROOT.parent / "benchmarks").rglob("*.py")]
+    assert {str(path): found for path in files if (found := absent(path.read_text()))} == {}
+    assert absent("from lagjax.mechanics import projection as p\ndef f(x): return p.projectd(x)") == ["p.projectd"]
 
 
 def test_import_computes_nothing():

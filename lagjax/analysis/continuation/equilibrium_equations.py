@@ -156,7 +156,7 @@ def dynamic(frame: Frame, z):
     m = d.rows.shape[0]
     kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
     keep = lambda rows: jnp.where(kept[:, None], rows, 0.0)
-    holonomic = equations.holonomic(s)[:, None]
+    holonomic = s.model.holonomic[:, None]
     rows, slopes, none = keep(d.rows), keep(d.slopes), jnp.zeros((s.n, m), d.rows.dtype)
     corner = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(d.rows.dtype)
     stiffness = jnp.block([[d.stiffness, -keep(d.pushes).T], [jnp.where(holonomic, rows, slopes), corner]])
