@@ -94,6 +94,19 @@ def test_messages_are_found():
     ]
 
 
+def missing_files(text: str) -> list[str]:
+    """The files of the project that a page names and that are not there."""
+    named = re.findall(r"(?:lagjax|tests|benchmarks)/[\w/]+\.py\b", text)
+    return sorted({path for path in named if not (ROOT / path).exists()})
+
+
+def test_files_that_pages_name_are_there():
+    """Twin: one that was moved is noticed."""
+    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
+    assert {str(page): missing for page in pages if (missing := missing_files(page.read_text()))} == {}
+    assert missing_files("lagjax/files/table.py, lagjax/mechanics/file_table.py") == ["lagjax/mechanics/file_table.py"]
+
+
 def test_every_message_has_its_place():
     """A message that occurs is on the page, and each has its own anchor."""
     page = error_pages.page()
