@@ -29,7 +29,7 @@ import matplotlib
 import numpy as np
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 from lagjax.scenes import rolling_hoop as exact
 
 jax.config.update("jax_enable_x64", True)

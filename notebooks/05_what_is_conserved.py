@@ -31,7 +31,7 @@ import matplotlib
 import numpy as np
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 from lagjax.scenes import cross_rails as rails
 from lagjax.scenes import mass_distributions as masses
 from lagjax.scenes import potentials

@@ -30,7 +30,7 @@ import matplotlib
 import numpy as np
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 from lagjax.scenes import sphere_geodesic as exact
 
 jax.config.update("jax_enable_x64", True)

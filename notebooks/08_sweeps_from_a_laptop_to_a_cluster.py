@@ -30,7 +30,7 @@ import numpy as np
 import xarray
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.rcParams["savefig.dpi"] = 80  # small pictures

@@ -31,7 +31,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 from lagjax.scenes import cross_rails as exact
 
 jax.config.update("jax_enable_x64", True)

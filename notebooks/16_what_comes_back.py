@@ -26,7 +26,7 @@ import numpy as np
 from scipy import special
 
 import lagjax as lj
-from lagjax import plot
+from lagjax.display import plots as plot
 
 jax.config.update("jax_enable_x64", True)
 matplotlib.rcParams["savefig.dpi"] = 90  # small pictures

@@ -13,7 +13,17 @@ from tests.tiers import exhaustive_but
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-WITHOUT_CODE = {"CHANGELOG", "CONTRIBUTING", "derivatives", "gallery", "how-to", "index", "known-gaps", "look-up"}
+WITHOUT_CODE = {
+    "CHANGELOG",
+    "CONTRIBUTING",
+    "architecture",
+    "derivatives",
+    "gallery",
+    "how-to",
+    "index",
+    "known-gaps",
+    "look-up",
+}
 # Their code trains, fits or compiles for half a minute.
 LONG = ("fitting", "learned", "switch-phases", "what-a-system-is-like")
 SHORT = [page for page in PAGES if page.stem not in LONG]

@@ -114,7 +114,8 @@ def test_a_block_slides_and_sticks_in_phases():
 
     def end(mu):
         motion = lj.integrate(hybrid, start, rest, mu, ts=2 * ONE, start="left", estimate_error=False)
-        return motion.q["x"][-1], jnp.nanmax(jnp.where(motion.switches.t < jnp.inf, motion.switches.t, jnp.nan))
+        at = motion.switches.t  # type: ignore[attr-defined]
+        return motion.q["x"][-1], jnp.nanmax(jnp.where(at < jnp.inf, at, jnp.nan))
 
     for mu in (0.3, 0.15):
         lost = mu * g / k

@@ -7,6 +7,7 @@ With a port the processes are connected by `jax.distributed`, which assigns thei
 import signal
 import sys
 import time
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,6 @@ import numpy as np
 
 import lagjax as lj
 from lagjax.display.progress import Silent
-from lagjax.sweep import sweep
 
 jax.config.update("jax_enable_x64", True)
 
@@ -49,7 +49,7 @@ class Resting(Silent):
 if __name__ == "__main__":
     # A shell makes background processes ignore Ctrl-C, and Python inherits that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sweep._meter = lambda total, progress: Resting()
+    setattr(import_module("lagjax.sweep.sweep"), "_meter", lambda total, progress: Resting())
     store, k, n, points, *port = sys.argv[1], *map(int, sys.argv[2:])
     if port:
         jax.distributed.initialize(f"127.0.0.1:{port[0]}", num_processes=n, process_id=k)
