@@ -4,9 +4,9 @@ Along any motion of `d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v + Aᵀ λ` the J
 
     dh/dt = Q·v - (∂R/∂v)·v + λ·(A v) - ∂L/∂t
 
-one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated separately
-(`energy.py`), without using h, so that the remainder of the balance, the closure, tests the motion, the multipliers and
-the forces together.
+one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated separately,
+without using h, so that the remainder of the balance, the closure, tests the motion, the multipliers and the forces
+together.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7.
 

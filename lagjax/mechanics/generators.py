@@ -1,8 +1,7 @@
 """Infinitesimal motions of a system: of its coordinates, of its clock, and of L by a total derivative.
 
-Translations, rotations and boosts move all points that `generators.py` finds among the coordinates.
-
-Find which coordinates are Cartesian coordinates of points, by their names and shapes.
+Translations, rotations and boosts move all points among the coordinates: those that are Cartesian coordinates of points
+by their names and shapes.
 
 A point is a group of scalars whose names differ only by x, y, z (`x, y`; `x1, z1`; `bead_x, bead_y, bead_z`), or an
 array of shape (2,) or (3,), or one row of an array (n, 2) or (n, 3). The guess only decides which motions of space are

@@ -5,7 +5,7 @@
 M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
 equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and Aᵀ are
 functions, derivatives of the user's, and S is found from its products with a few coloured vectors. Which entries can
-be nonzero is read off the jaxpr (`sparse_saddle_point.py`) and holds at every state.
+be nonzero is read off the jaxpr (see below) and holds at every state.
 
 One step of iterative refinement on the whole system follows. It restores the digits that S, being a square, loses, and
 corrects the error from a vanishing mass, which counts as a small one in M⁻¹. Where the refinement does not converge the

@@ -1,7 +1,7 @@
 """A system prepared for states of one form: what is known of it before any value is, and its functions of vectors.
 
-A front door makes a `Model` once (`first_call.prepare`). Everything below takes the model and a state in vector form,
-(t, x, u), and does not ask again for the user's structure, the shapes of constraints or their number.
+A front door makes a `Model` once (`check_functions.prepare`). Everything below takes the model and a state in vector
+form, (t, x, u), and does not ask again for the user's structure, the shapes of constraints or their number.
 """
 
 from collections.abc import Callable

@@ -22,12 +22,10 @@ frequencies without damping has two more equations than unknowns; they are consi
 Source: Moore & Spence, SIAM J. Numer. Anal. 17 (1980) 567 (folds); Moore, *Numer. Funct. Anal. Optim.* 2 (1980) 441
 (branch points); Govaerts, *Numerical Methods for Bifurcations of Dynamical Equilibria*, ch. 3-5.
 
-Branches of steady motions, from the equations of `equilibrium_equations.py`.
-
-Monitored from point to point are the sign of `det (J; τ)`, which changes where another branch crosses (also where this
-one only touches the critical parameter, as the side branch of a pitchfork does); the sign of τ_μ, which changes at a
-fold; the number of growing roots; and the number of negative eigenvalues of E_y, which changes by two where two vanish
-together.
+Along a branch of steady motions, monitored from point to point are the sign of `det (J; τ)`, which changes where
+another branch crosses (also where this one only touches the critical parameter, as the side branch of a pitchfork
+does); the sign of τ_μ, which changes at a fold; the number of growing roots; and the number of negative eigenvalues of
+E_y, which changes by two where two vanish together.
 
 Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.1 (the determinant).
 """

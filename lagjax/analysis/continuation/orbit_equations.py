@@ -20,9 +20,8 @@ with respect to μ and `log T` together with those with respect to the state.
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Doedel, Keller & Kernévez, Int. J. Bifurcation
 Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of conservative systems).
 
-Branches of cycles, from the equations of `orbit_equations.py`: their points, with multipliers and stability.
-
-Two functions of the monodromy matrix N are monitored. With the rows Q of its trivial directions and P = 1 - QᵀQ,
+Along a branch of cycles two functions of the monodromy matrix N are monitored. With the rows Q of its trivial
+directions and P = 1 - QᵀQ,
 
     χ₊ = det (P (N - 1) P + QᵀQ),      χ₋ = det (P (N + 1) P + QᵀQ)
 

@@ -250,8 +250,8 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     """All roots s of departures e^(st), (2n,), with NaN in place of the roots that constraints remove.
 
     Departures along the symmetry are left out: they lead to the same motion. All roots are NaN where the equations of
-    motion are singular. Derivatives follow `roots.py`, as for `lj.normal_modes`, which reports more about one state;
-    this function serves many states inside compiled programs, and any symmetry.
+    motion are singular. Derivatives follow `eigenmodes.py`, as for `lj.normal_modes`, which reports more about one
+    state; this function serves many states inside compiled programs, and any symmetry.
     """
     d, n = departures(s, y, jacobian), s.n
     project, count = directions(s, d, y)

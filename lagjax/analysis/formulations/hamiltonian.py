@@ -3,7 +3,7 @@
     H(t, q, p) = p·v - L(t, q, v)        with v from p = ∂L/∂v
     q̇ = ∂H/∂p,    ṗ = -∂H/∂q + Q - ∂R/∂v
 
-`hamiltonian.py` solves for v. H is the Jacobi integral as a function of momenta.
+H is the Jacobi integral as a function of momenta.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (8.15), (8.18).
 

@@ -1,7 +1,7 @@
 """The monodromy matrix of a motion, and its eigenvalues, with the trivial ones (1 for a known reason) deflated.
 
 With an orthonormal basis B of the tangent space of the constraints, and orthonormal rows Q of the trivial directions
-(`monodromy.py`), the motion takes B w to B N w. The eigenvalues of
+(see below), the motion takes B w to B N w. The eigenvalues of
 
     (1 - QᵀQ) N (1 - QᵀQ) + QᵀQ
 
@@ -143,8 +143,8 @@ TURN = 2 * np.pi
 class Period(NamedTuple):
     """The numerical results of following a motion for a period.
 
-    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,): which reasons of `monodromy.py`
-    apply. `reduced`: N. `apart`: how far the end is from the start, in units of the state.
+    `multipliers` are sorted, the `trivial` ones first; `reasons` (r,): which of the
+    reasons apply. `reduced`: N. `apart`: how far the end is from the start, in units of the state.
     """
 
     multipliers: Complex[Array, " k"]

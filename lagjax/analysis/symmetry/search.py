@@ -6,7 +6,7 @@ which only the span matters; it is projected out. A combination that vanishes in
 Symmetries without t are found first, so that a momentum across a uniform force is not hidden in two that grow with
 time.
 
-Scalings that multiply L by a factor are found separately (`search.py`).
+Scalings that multiply L by a factor are found separately.
 
 Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Olver, *Applications of Lie Groups to Differential
 Equations*, §4.4.

@@ -1,10 +1,6 @@
 """What is known of the guards: at one time, between two times at which the motion is known, and since the start.
 
 See `detect.py` for how they are used, and for the source.
-
-The values of guards at one time, and between two times at which the motion is known.
-
-See `detect.py` for how they are used, and `brackets.py` for how they are judged.
 """
 
 from typing import NamedTuple

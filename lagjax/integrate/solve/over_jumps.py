@@ -154,7 +154,7 @@ class ModeWay(NamedTuple):
 
 
 def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, settings, adjoint):
-    """Return the fields of the trajectory, like `one_solve.solved`."""
+    """Return the fields of the trajectory, like `one_motion.solved`."""
     model = model_of(system, ts[0], q0, v0, params)
     small = model.n + model.m <= 24
     piecewise = piecewise_of(jumps, system, small)

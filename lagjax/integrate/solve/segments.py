@@ -128,7 +128,7 @@ class PhaseWay(NamedTuple):
 
 
 def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
-    """Return the fields of the trajectory, like `one_solve.solved`, with the phase of each output and the switches."""
+    """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
     def next_legs(way: PhaseWay) -> PhaseWay:

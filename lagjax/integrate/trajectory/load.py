@@ -148,7 +148,7 @@ def check_shapes(found: dict[str, Any]) -> None:
 
 
 def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
-    """The trajectory with these parts (see `saving.parts`) and the system `kept`."""
+    """The trajectory with these parts (see `save.parts`) and the system `kept`."""
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
     fields["events"] = {name: made(Crossings, x) for name, x in found["events"].items()}
