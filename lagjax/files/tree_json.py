@@ -17,6 +17,7 @@ import numpy as np
 
 from lagjax.display.printable import is_plain, printable
 from lagjax.files.table import Table, check_field, fields_of, listed, name_of_function
+from lagjax.jaxtools.trees import without_init
 from lagjax.numerics.methods.radau import tolerance_of_the_controller
 
 # Structures are nested no deeper than this.
@@ -255,10 +256,7 @@ class Reader:
         # Neither `__new__` nor `__init__` of a class is called: these may change what was written.
         if is_tuple:
             return tuple.__new__(cls, [values[name] for name in cls._fields])
-        found = object.__new__(cls)
-        for name, x in values.items():
-            object.__setattr__(found, name, x)
-        return found
+        return without_init(cls, values)
 
 
 def _defaults(cls) -> dict[str, Any]:

@@ -1,5 +1,8 @@
 """Operations on all arrays of a tree at once; everything else in it stays as it is."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,6 +16,18 @@ def stop_gradient(tree):
     3.0
     """
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
+def without_init(cls: type, fields: Mapping[str, Any]):
+    """An instance with these fields, whose own `__init__` is not called: it would check, or take long.
+
+    >>> print(without_init(type("Pair", (), {}), {"re": 1.0}).re)
+    1.0
+    """
+    made = object.__new__(cls)
+    for name, x in fields.items():
+        object.__setattr__(made, name, x)
+    return made
 
 
 def where(condition, a, b):

@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Int
 
 from lagjax.display.printable import by_line
 from lagjax.jaxtools.cache import kinds, same
+from lagjax.jaxtools.trees import without_init
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System, check_functions
 
@@ -103,12 +104,7 @@ class Switch(eqx.Module):
 
     def with_functions(self, when: Callable, reset: Callable | None) -> "Switch":
         """The same switch with other functions, unchecked."""
-        same = object.__new__(Switch)
-        for name in ("phase", "to", "rest", "slower_than"):
-            object.__setattr__(same, name, getattr(self, name))
-        object.__setattr__(same, "when", when)
-        object.__setattr__(same, "reset", reset)
-        return same
+        return without_init(Switch, vars(self) | {"when": when, "reset": reset})
 
     def value(self, t, q, v, multipliers, params):
         """The value of the guard at one state."""
@@ -275,7 +271,4 @@ def _count(n, word, plural):
 
 def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     """Replace some fields of a hybrid without checking them again."""
-    same = object.__new__(Hybrid)
-    for name in ("systems", "switches", "first", "names", "most_switches"):
-        object.__setattr__(same, name, fields.get(name, getattr(hybrid, name)))
-    return same
+    return without_init(Hybrid, vars(hybrid) | fields)

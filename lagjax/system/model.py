@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools.cache import shape_of
+from lagjax.jaxtools.trees import without_init
 from lagjax.system import coordinates
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
 from lagjax.system.traced_functions import Traced
@@ -190,7 +191,4 @@ def _shape_of(constraint, *state):
 
 def unchecked(system, params, form) -> Model:
     """A model of these parts: to make a module the usual way takes long."""
-    model = object.__new__(Model)
-    for name, x in (("system", system), ("params", params), ("form", form)):
-        object.__setattr__(model, name, x)
-    return model
+    return without_init(Model, {"system": system, "params": params, "form": form})

@@ -18,6 +18,7 @@ import jax
 
 from lagjax.display.printable import by_line
 from lagjax.jaxtools.cache import kinds, same
+from lagjax.jaxtools.trees import without_init
 from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.traced_functions import Traced
 
@@ -222,10 +223,7 @@ def untraced(tree):
 
 def unchecked(lagrangian, constraints: dict, force, dissipation) -> System:
     """A system of these functions, which have been checked: to make a module the usual way takes long."""
-    system = object.__new__(System)
-    for name, x in zip(FIELDS, (lagrangian, constraints, force, dissipation)):
-        object.__setattr__(system, name, x)
-    return system
+    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation))))
 
 
 def _name(function):

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jaxtools.jaxpr import length
+from lagjax.jaxtools.trees import without_init
 from lagjax.system.check_functions import traced_call
 from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
@@ -83,10 +84,7 @@ class Crossing(eqx.Module):
 
     def with_guard(self, guard: Callable) -> "Crossing":
         """Return the same crossing with another guard, unchecked."""
-        same = object.__new__(Crossing)
-        for name, x in (vars(self) | {"guard": guard}).items():
-            object.__setattr__(same, name, x)
-        return same
+        return without_init(Crossing, vars(self) | {"guard": guard})
 
     def __reduce_ex__(self, protocol):
         check_functions({"the guard of a crossing": self.guard})

@@ -19,6 +19,7 @@ from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Swit
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN
 from lagjax.integrate.trajectory.trajectory import Snapshot, SolveInfo, SolveOptions, Trajectory, pack
+from lagjax.jaxtools.trees import without_init
 from lagjax.system.coordinates import State
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.signature import UnknownSystem, differences, signature
@@ -204,10 +205,7 @@ def made(cls: type, fields: dict[str, Any]) -> Any:
         check_field(cls, name, x)
     if issubclass(cls, tuple):
         return cls(**fields)
-    found = object.__new__(cls)
-    for name in fields_of(cls) or ():
-        object.__setattr__(found, name, fields[name])
-    return found
+    return without_init(cls, {name: fields[name] for name in fields_of(cls) or ()})
 
 
 def result_of_names(said) -> RESULTS:
