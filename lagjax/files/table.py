@@ -175,8 +175,10 @@ _BY_PACKAGE = {f"{name.split('.')[0]}.{name.rsplit('.', 1)[1]}": x for name, x i
 # Classes by the names that they had when files of 0.2 were first written.
 RENAMED = {"Found": "FreeNumbers", "Problem": "FitProblem", "Kind": "LinearisationKind", "Parts": "LinearParts"}
 
+# Says that a solver takes its tolerances, and the norm that they are measured in, from the controller.
+FROM_CONTROLLER = type(tolerance_of_the_controller())
 # What stands for a number, while a motion is computed in lanes as well.
-NUMBERS = (bool, int, float, complex, np.number, np.bool_, np.ndarray, jax.Array, type(tolerance_of_the_controller()))
+NUMBERS = (bool, int, float, complex, np.number, np.bool_, np.ndarray, jax.Array, FROM_CONTROLLER)
 
 
 class UnknownClass(ValueError):
@@ -293,6 +295,6 @@ def fits(value: Any, annotation: Any) -> bool:
     if kind in (int, float, bool, complex) or hasattr(kind, "dtypes") or kind in (jax.Array, np.ndarray):
         return isinstance(value, NUMBERS)
     if kind is Callable or kind is typing.Callable:
-        return callable(value)
+        return callable(value) or isinstance(value, FROM_CONTROLLER)
     is_class = isinstance(kind, type) and kind.__module__ != "jaxtyping"
     return isinstance(value, kind) if is_class else True
