@@ -98,10 +98,11 @@ def test_a_scene_pays_for_what_it_has():
         assert not LIBRARY & set(operations) and "dot_general" not in operations and "while" not in operations
 
 
-def compiled(system, q0, v0, params):
-    """The text of a compiled integration."""
+def library_solves(system, q0, v0, params):
+    """How many operations of a compiled integration call LAPACK (its text names files too, one of them by LAPACK)."""
     run = lambda params: lj.integrate(system, q0, v0, params, ts=np.array([0.0, 1.0]), throw=False).q
-    return jax.jit(run).lower(params).compile().as_text()
+    lines = jax.jit(run).lower(params).compile().as_text().splitlines()
+    return sum('custom_call_target="lapack' in line for line in lines)
 
 
 @pytest.mark.optimised
@@ -110,11 +111,9 @@ def test_the_compiled_program():
     """No LAPACK call with one coordinate or a rod; seven coupled coordinates need one."""
     seven = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + jnp.sum(v) ** 2 * jnp.cos(q[0]) ** 2)
     for system, start in ((pendulum, (0.3, 0.0)), (rod_pendulum, HORIZONTAL)):
-        text = compiled(system, *start, PARAMS)
-        assert "lapack" not in text.lower()
+        assert not library_solves(system, *start, PARAMS)
     many = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + 0.1 * jnp.sum(v) ** 2 * jnp.cos(q[0]) ** 2)
-    text = compiled(many, np.ones(9), np.ones(9), PARAMS)
-    assert "lapack" in text.lower()
+    assert library_solves(many, np.ones(9), np.ones(9), PARAMS)
     assert not is_small(model_of(many, *coordinates.state(0.0, np.ones(9), np.ones(9), PARAMS)))
     assert is_small(model_of(seven, *coordinates.state(0.0, np.ones(7), np.ones(7), PARAMS)))
     # A network in L is left to arrays; twin: the same count of numbers in a vector is not.
