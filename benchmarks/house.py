@@ -15,7 +15,7 @@ A walk counts the functions that are called with the system, or its model, at th
 distinct functions, `files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from
 a file to one of a package above it.
 
-    python benchmarks/house.py [--json FILE]
+    python -m benchmarks.house [--json FILE]
 """
 
 import ast
@@ -30,9 +30,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from measure import main, row
 
 import lagjax as lj
+from benchmarks.measure import main, row
 from lagjax.system.model import Model
 
 jax.config.update("jax_enable_x64", True)

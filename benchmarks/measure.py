@@ -22,6 +22,7 @@ import numpy as np
 
 PACKAGES = ("lagjax", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "casadi", "scikit-sundae", "mujoco")
 
+ROOT = Path(__file__).parent.parent
 # The clock of `in_turn`; `main` changes it for `--processor-time`.
 CLOCK = {"seconds": time.perf_counter}
 
@@ -60,8 +61,8 @@ def _seconds(function, calls):
 
 
 def in_new_process(source):
-    """Run the source in a new Python process and parse the last line that it prints as JSON."""
-    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True)
+    """Run the source in a new Python process, in the repository, and parse the last line that it prints as JSON."""
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=ROOT)
     if done.returncode:
         raise RuntimeError(done.stderr)
     return json.loads(done.stdout.splitlines()[-1])

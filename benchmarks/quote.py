@@ -1,6 +1,6 @@
 """Write the README's tables of errors over run times and of speeds from `benchmarks/results/`.
 
-python benchmarks/quote.py
+python -m benchmarks.quote
 """
 
 import json

@@ -255,7 +255,7 @@ def test_the_site_builds(tmp_path):
 
 def test_the_advice_for_notebooks_is_what_was_measured():
     """The lines for Jupyter's configuration in the known gaps are those of the benchmark."""
-    source = (DOCS.parent / "benchmarks" / "slider_response.py").read_text()
+    source = (DOCS.parent / "benchmarks" / "speed" / "slider_response.py").read_text()
     measured = re.search(r'WITHOUT_DELAY = """\n(.*?)"""', source, re.DOTALL)
     advised = re.search(r"  ```py\n(.*?)  ```", (DOCS / "known-gaps.md").read_text(), re.DOTALL)
     assert measured and advised and textwrap.dedent(advised[1]) == measured[1]

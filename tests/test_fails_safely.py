@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks import fails_safely
+from benchmarks.campaigns import fails_safely
 
 
 def family(name):

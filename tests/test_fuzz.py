@@ -1,4 +1,4 @@
-"""Random systems of `benchmarks/fuzz.py` that once crashed, raised or gave wrong results; and a failing twin."""
+"""Random systems of `benchmarks/campaigns/fuzz.py` that once crashed, raised or were wrong; and a failing twin."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from tests.tiers import exhaustive_but
 
 def fuzzed(*options):
     """The fuzzer's output and status."""
-    run = [sys.executable, "benchmarks/fuzz.py", "--seconds", 800, "--cases", 1, *options]
+    run = [sys.executable, "-m", "benchmarks.campaigns.fuzz", "--seconds", 800, "--cases", 1, *options]
     return subprocess.run(list(map(str, run)), capture_output=True, text=True, timeout=900)
 
 
@@ -34,8 +34,8 @@ def test_what_once_came_out_wrong_on_the_way():
 def test_the_fuzzer_can_fail():
     """Accelerations that are wrong by a millionth are found."""
     script = (
-        "import sys; sys.path[:0] = ['benchmarks', '.']\n"
-        "import fuzz, jax\n"
+        "import jax\n"
+        "from benchmarks.campaigns import fuzz\n"
         "kept = fuzz.lj.accelerations\n"
         "fuzz.lj.accelerations = lambda *x: jax.tree.map(lambda a: 1.000001 * a, kept(*x))\n"
         "print(fuzz.in_a_process(fuzz.run_quickly, 97, False))\n"

@@ -1,4 +1,4 @@
-"""`benchmarks/learned.py` really learns: more time gives smaller errors, and its reference values are correct."""
+"""`benchmarks/learned` really learns: more time gives smaller errors, and its references are right."""
 
 import json
 import subprocess
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+ROOT = Path(__file__).parent.parent
 
 
 def run(*words):
     """The output of a process."""
-    found = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=900, cwd=BENCHMARKS)
+    found = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=900, cwd=ROOT)
     assert found.returncode == 0, found.stderr
     return found.stdout
 
@@ -27,10 +27,10 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import json
 import numpy as np
-from learned import HIDDEN, PEAK
-from learned_models import ours
-from learned_systems import PUBLISHED, published_states
-from learned_training import Trainer, by_states
+from benchmarks.learned.learned import HIDDEN, PEAK
+from benchmarks.learned.models import ours
+from benchmarks.learned.systems import PUBLISHED, published_states
+from benchmarks.learned.training import Trainer, by_states
 
 model = ours(PUBLISHED.setting, HIDDEN)
 loss = by_states(model)
@@ -53,7 +53,7 @@ def test_what_is_learned_from_is_true():
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-import learned_systems as ls
+from benchmarks.learned import systems as ls
 import lagjax as lj
 
 q, v, a = map(np.asarray, ls.published_states(jax.random.key(0), 50, np.float64))

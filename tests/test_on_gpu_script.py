@@ -1,4 +1,4 @@
-"""Assumptions of `benchmarks/on_gpu.py`: a batch and its gradient never need the host, and the check detects it."""
+"""Assumptions of `benchmarks/gpu/on_gpu.py`: a batch and its gradient never need the host, and the check detects it."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ import pytest
 from jax.experimental import io_callback
 
 import lagjax as lj
-from benchmarks.host_operations import host_operations, with_a_look
+from benchmarks.gpu.host_operations import host_operations, with_a_look
 
 TS, WEIGHTS = np.array([0.0, 1.0]), np.random.default_rng(0).normal(size=(3, 10))
 
@@ -81,7 +81,7 @@ def test_a_callback_in_the_lagrangian_is_found():
 def test_the_script_runs_small(tmp_path):
     """On any machine: motions of rods, and float32 results. A shared machine may only miss the speed target."""
     file = tmp_path / "rows.json"
-    run = [sys.executable, "benchmarks/on_gpu.py", "--small", "--processor-time", "--json", str(file), "--only"]
+    run = [sys.executable, "-m", "benchmarks.gpu.on_gpu", "--small", "--processor-time", "--json", str(file), "--only"]
     for what in ("rods, float64, motions", "single precision, rods"):
         subprocess.run([*run, what], check=True, capture_output=True, text=True, timeout=900)
         rows = json.loads(file.read_text())["rows"]

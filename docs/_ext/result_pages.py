@@ -64,12 +64,13 @@ def table(rows: list[dict]) -> str:
 
 def one_file(name: str, found: dict) -> str:
     """The page of one file of results, with the question of the script that wrote it as its title."""
-    script = ROOT / "benchmarks" / f"{name}.py"
-    question = (ast.get_docstring(ast.parse(script.read_text())) or "") if script.exists() else ""
+    script = next((ROOT / "benchmarks").rglob(f"{name}.py"), None)
+    question = ast.get_docstring(ast.parse(script.read_text())) or "" if script else ""
     versions = ", ".join(f"{package} {version}" for package, version in found.get("versions", {}).items())
     measured = f"Measured on {found['machine']}" + (f", {found['clock']}" if "clock" in found else "")
     title = question.split("\n")[0].rstrip(".") or name
-    said = f"{measured}{'; ' + versions if versions else ''}. Written by `benchmarks/{name}.py`.\n"
+    author = f" Written by `{script.relative_to(ROOT).as_posix()}`." if script else ""
+    said = f"{measured}{'; ' + versions if versions else ''}.{author}\n"
     return f"# {plain(title)}\n\n{said}\n{table(found['rows'])}"
 
 

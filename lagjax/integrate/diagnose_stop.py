@@ -10,7 +10,7 @@ is said only where one of these numbers shows it, and with the number; otherwise
 - Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
   stability of an explicit method (a stiff system), imaginary ones as frequencies to be resolved.
 
-This takes a compilation and some seconds, and is done only after a failure. `benchmarks/advice.py` applies each fix.
+This takes a compilation and some seconds, and is done only after a failure. `benchmarks/campaigns/advice.py` applies each fix.
 
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
 """

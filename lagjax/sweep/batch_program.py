@@ -1,7 +1,7 @@
 """The compiled program of a sweep: maps the axis values at some points to values and statuses.
 
 Lanes run together under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"` runs
-one after the other, which is slower in nearly all measurements (`benchmarks/sweep.py`) and needs the least memory.
+one after the other, which is slower in nearly all measurements (`benchmarks/speed/sweep.py`) and needs the least memory.
 """
 
 import hashlib

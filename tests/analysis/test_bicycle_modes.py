@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from benchmarks import bicycle
+from benchmarks.speed import bicycle
 
 WEAVE = {
     1: 3.52696170990070 + 0.80774027519930j,

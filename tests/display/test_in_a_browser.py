@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from benchmarks.browser import Browser, installed
+from benchmarks.speed.browser import Browser, installed
 from lagjax.display.animation import Animation, film
 from lagjax.display.web_page import fragment, whole
 

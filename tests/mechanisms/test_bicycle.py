@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from benchmarks import bicycle
+from benchmarks.speed import bicycle
 
 SPEED, SMALL = 5.0, 1e-6
 

@@ -1,4 +1,4 @@
-"""The woodpecker toy: its cycle against an independent computation (`benchmarks/woodpecker.py`: its derivatives)."""
+"""The woodpecker toy: its cycle against another computation (`benchmarks/speed/woodpecker.py`: its derivatives)."""
 
 import jax
 import numpy as np

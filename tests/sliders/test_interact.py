@@ -1,6 +1,6 @@
 """Sliders without a browser: values arrive, nothing is recompiled, and failures are shown without breaking the widget.
 
-`benchmarks/slider_response.py` measures the same in JupyterLab, in a browser.
+`benchmarks/speed/slider_response.py` measures the same in JupyterLab, in a browser.
 """
 
 import builtins

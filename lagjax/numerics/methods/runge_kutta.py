@@ -4,7 +4,7 @@
 
 diffrax runs the stages in a loop over a buffer of k. Here they are unrolled on the leaves of y, without terms for zero
 coefficients: for a state of single numbers XLA keeps all of them in registers. The cost of a step on one coordinate is
-measured in `benchmarks/work_precision.py` and `benchmarks/against_peers.py`.
+measured in `benchmarks/accuracy/work_precision.py` and `benchmarks/speed/against_peers.py`.
 
 The tableaus and the dense output are diffrax's.
 
