@@ -1,15 +1,16 @@
-"""Lagrange's equations of a small system as formulas, read back from the program that computes them.
+"""Lagrange's equations of a small system as formulas: the program of L becomes an expression, and the rest is SymPy's.
 
-The program of M, F and A is expanded into scalar operations (`scalar_form.py`) and run on SymPy expressions in place of
-numbers. The resulting formulas are then evaluated at random states and compared with the program.
+Each primitive in the programs of L, the forces and the constraints has a function of SymPy's. SymPy derives
+
+    Σ_j M_ij a_j = F_i + Σ_k λ_k A_ki,    M = ∂p/∂v,  p = ∂L/∂v,  F = ∂L/∂q - ∂p/∂t - (∂p/∂q) v + Q - ∂R/∂v
+
+simplifies and typesets. The formulas are then evaluated at random states and compared with what JAX computes.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26), whose equations these are.
 """
 
-import functools
 import math
 import re
-from collections import defaultdict
 from collections.abc import Callable
 from fractions import Fraction
 from importlib import import_module
@@ -21,20 +22,20 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import eval_jaxpr
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from lagjax.exchange.from_sympy import sympy_itself
-from lagjax.jaxtools.jaxpr import MOVING, interpreted
-from lagjax.jaxtools.scalarize import MOVES, TooLong
+from lagjax.jaxtools.jaxpr import MOVING, ClosedJaxpr, equations, interpreted
+from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.mechanics.scalar_form import Numbers, in_numbers
 from lagjax.system import constraints, coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 
-# Beyond these numbers of operations, coordinates and terms the equations are too long to read.
-OPERATIONS, COORDINATES, TERMS = 2000, 8, 400
+# Beyond these numbers of coordinates, of operations and of terms the equations are too long to read.
+COORDINATES, OPERATIONS, TERMS = 8, 2000, 400
 # Fractions are written as such up to this denominator.
 SMALL = 64
 # Formulas that differ from the program by more than this are not shown.
@@ -87,14 +88,14 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     the symbols; numbers inside the functions are written as numbers.
 
     **Returns:** an `EquationsOfMotion`: one equation per coordinate, `Σ M a = F + Aᵀ λ`, with multipliers λ named after
-    their constraints, and each constraint `g = 0` or `phi = 0`. Products are expanded, sines and cosines combined where
-    that is shorter.
+    their constraints, and each constraint `g = 0` or `phi = 0`. Products are expanded, and sines and cosines combined,
+    where that is shorter.
 
     **Raises:**
 
     - `ImportError` without SymPy (extra `sympy`).
-    - `ValueError` for a system that is not small, whose program has loops, branches or functions without a formula, or
-      if the formulas do not agree with the program.
+    - `ValueError` for a system that is not small, whose functions have loops, branches or functions without a formula,
+      or if the formulas do not agree with the program.
     - As `accelerations` for a state of the wrong kind.
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26).
@@ -109,51 +110,38 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
         s = coordinates.state(t, q, v, params)
         system = traced_system(system, s)
     model = model_of(system, *s)
-    names = model.names
-    if len(names) > COORDINATES:
+    if model.n > COORDINATES:
         raise ValueError(
-            f"the system has {len(names)} coordinates, but equations are written only for up to {COORDINATES}."
+            f"the system has {model.n} coordinates, but equations are written only for up to {COORDINATES}."
         )
-    scalarised = in_numbers(model)
+    inputs = s.t, *model.vectors(s.q, s.v), eqx.filter(s.params, eqx.is_array), jnp.zeros(model.m), jnp.zeros(model.n)
+    # Whole numbers among the parameters stay whole at random states.
+    whole = ravel_pytree(jax.tree.map(lambda x: jnp.full(x.shape, not jnp.issubdtype(x.dtype, jnp.inexact)), inputs))[0]
+    numbers, restore = ravel_pytree(inputs)
+
+    def state(numbers):
+        t, x, u, arrays, multipliers, a = restore(numbers)
+        return model.of(eqx.combine(arrays, s.params)), t, x, u, multipliers, a
+
+    symbols = _symbols(model, s)
     try:
-        program = Numbers(_parts, scalarised, most=OPERATIONS).program
-        symbols = _symbols(s)
-        formulas = jaxpr_to_formula(program, _arrays(scalarised.system), _as_inputs(list(symbols), model.n))
+        sides = _equations(state, numbers, list(symbols), model)
     except TooLong:
         raise ValueError(
             "the equations are too long to be read.\n"
             "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print a system with fewer parts."
         ) from None
-    error = _verified(program, formulas, _as_inputs(list(symbols), model.n), scalarised, s)
-    return EquationsOfMotion(tuple(_lines(names, model.equation_names, symbols, formulas)), error, STATES)
+    error = _verified(state, np.asarray(numbers), np.asarray(whole), list(symbols), sides)
+    lines = (" = ".join(typeset(side, symbols) for side in pair) for pair in sides)
+    return EquationsOfMotion(tuple(lines), error, STATES)
 
 
-def _as_inputs(symbols: list, n: int) -> list:
-    """The symbols of t, q, v and parameters in the order in which the program takes them: parameters first."""
-    return symbols[1 + 2 * n :] + symbols[: 1 + 2 * n]
-
-
-def _parts(model, t, q, v) -> list[jax.Array]:
-    """The entries of M, F, A and the constraints; A includes the derivative of a force by the multipliers."""
-    x, u = model.vectors(q, v)
-    linear, rows = mass_and_forcing(model, t, x, u), constraints.jacobian(model, t, x, u)
-    if linear.response is not None:
-        rows = rows + linear.response.T
-    held = [jnp.ravel(c.residual(t, q, v, model.params)) for c in model.system.constraints.values()]
-    return [y for x in (linear.mass, linear.forcing, rows, *held) for y in jnp.ravel(x)]
-
-
-def _arrays(tree) -> list[np.ndarray]:
-    return [np.asarray(x) for x in jtu.tree_leaves(eqx.filter(tree, eqx.is_array))]
-
-
-def _symbols(s: coordinates.State) -> dict[Any, str]:
-    """The symbols of t, coordinates, velocities and parameters, in the order of the program's inputs, and their LaTeX.
+def _symbols(model, s: coordinates.State) -> dict[Any, str]:
+    """The symbols of t, q, v, the parameters, multipliers and accelerations, with their LaTeX.
 
     The first character of a symbol's own name is its place among the factors of a product, and keeps names apart.
     """
-    sympy = sympy_itself()
-    names, leaves = coordinates.names(s.q), eqx.filter(s.params, eqx.is_array)
+    names, leaves = model.names, eqx.filter(s.params, eqx.is_array)
     known = coordinates.names(leaves) if jtu.tree_leaves(leaves) else []
     if jtu.treedef_is_leaf(jtu.tree_structure(s.params)):
         known = [name.replace("q", "params", 1) for name in known]
@@ -163,7 +151,9 @@ def _symbols(s: coordinates.State) -> dict[Any, str]:
     entries = [("1", "t"), *((f"2{name}", written(name)) for name in names)]
     entries += [(f"3{name}", written(name, r"\dot")) for name in names]
     entries += [(f"0{name}", written(letter)) for name, letter in zip(known, letters)]
-    return {sympy.Symbol(key, real=True): text for key, text in entries}
+    entries += [(f"5{name}", rf"\lambda_{{{written(name)}}}") for name in model.equation_names]
+    entries += [(f"4{name}", written(name, r"\ddot")) for name in names]
+    return {sympy_itself().Symbol(key, real=True): text for key, text in entries}
 
 
 def written(name: str, accent: str = "") -> str:
@@ -184,143 +174,140 @@ def written(name: str, accent: str = "") -> str:
     return (f"{accent}{{{first}}}" if accent else first) + (f"_{{{','.join(indices)}}}" if indices else "")
 
 
-def jaxpr_to_formula(program, arrays: list[np.ndarray], symbols: list) -> list:
-    """The results of a program as SymPy expressions: of numbers for its first inputs, and symbols for the rest."""
-    entries = iter(symbols)
-    inputs = [_constant(x, None) for x in arrays]
-    for variable in program.jaxpr.invars[len(arrays) :]:
-        inputs.append(_filled([next(entries) for _ in range(variable.aval.size)], variable.aval.shape))
-    # Many entries contain the same sines and cosines.
-    combined = functools.cache(_combined)
-    return [_simplified(x[()], combined) for x in interpreted(program, inputs, _applied, _constant)]
+def _equations(state: Callable, numbers: Array, symbols: list, model: Model) -> list[tuple]:
+    """The left and the right side of each equation."""
+    n = model.n
+
+    def functions(*numbers):
+        model, t, x, u, multipliers, _ = state(jnp.stack(numbers))
+        dissipation = 0.0 if model.system.dissipation is None else model.dissipation(t, x, u)
+        force = jnp.zeros(n) if model.system.force is None else model.force(t, x, u, multipliers)
+        values = model.lagrangian(t, x, u), dissipation, force, *_residuals(model, t, x, u)
+        return [y for value in values for y in jnp.ravel(value)]
+
+    energy, dissipation, *rest = jaxpr_to_formula(jax.make_jaxpr(functions)(*numbers), symbols)
+    force, residuals = rest[:n], rest[n:]
+    (t, *x), u, a = symbols[: n + 1], symbols[n + 1 : 2 * n + 1], symbols[-n:]
+    multipliers = symbols[-n - model.m : -n]
+    found = []
+    for i, p in enumerate(energy.diff(v) for v in u):
+        left = sum(p.diff(v) * y for v, y in zip(u, a))
+        # A constraint pushes along the gradient of its residual, by positions or by velocities.
+        pushes = (g.diff(x[i] if of_q else u[i]) for g, of_q in zip(residuals, model.holonomic))
+        right = energy.diff(x[i]) - p.diff(t) - sum(p.diff(y) * v for y, v in zip(x, u))
+        right += force[i] - dissipation.diff(u[i]) + sum(map(mul, multipliers, pushes))
+        found.append((_linear(left, a), _linear(right, multipliers)))
+    return found + [(simplified(g), sympy_itself().Integer(0)) for g in residuals]
 
 
-def _constant(x, aval) -> np.ndarray:
-    x = np.asarray(x)
-    return _filled([_number(y) for y in x.reshape(-1)], x.shape)
+def _residuals(model: Model, t, x, u) -> list[Array]:
+    q, v = model.tree(x), model.tree(u)
+    return [c.residual(t, q, v, model.params) for c in model.system.constraints.values()]
 
 
-def _filled(entries: list, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.empty(len(entries), object)
-    array[:] = entries
-    return array.reshape(shape)
-
-
-def _number(x: np.generic) -> Any:
-    """A number as the first of these that equals it to round-off: a small fraction, a short decimal, all its digits."""
+def _linear(side, unknowns: list) -> Any:
+    """An expression linear in some unknowns, simplified, and so each of their factors."""
     sympy = sympy_itself()
+    # JAX's derivative of a sign is zero.
+    side = sympy.sympify(side).replace(sympy.DiracDelta, lambda *_: sympy.Integer(0))
+    factors = (simplified(side.diff(y)) for y in unknowns)
+    short = (min(x, sympy.factor_terms(x), key=sympy.count_ops) for x in factors)
+    return simplified(side.xreplace(dict.fromkeys(unknowns, sympy.Integer(0)))) + sum(map(mul, short, unknowns))
+
+
+def jaxpr_to_formula(program: ClosedJaxpr, symbols: list) -> list:
+    """The results of a program of single numbers as SymPy expressions of one symbol for each of them."""
+    if any(x.aval.size > LARGE for equation in equations(program.jaxpr) for x in equation.outvars):
+        raise TooLong
+    in_numbers = jax.make_jaxpr(lambda *x: written_out(program, *x, most=OPERATIONS))(*program.in_avals)
+    return interpreted(in_numbers, symbols, _applied, _number)
+
+
+def _applied(equation, operands: list) -> list:
+    """The results of a primitive for expressions."""
+    sympy, name = sympy_itself(), equation.primitive.name
+    if name == "convert_element_type" or name in MOVING and equation.outvars[0].aval.size == len(operands) == 1:
+        return operands
+    if name in MOVING:
+        # The arrays that an operation without a formula takes.
+        return [None for _ in equation.outvars]
+    if name == "integer_pow":
+        name, operands = "pow", [*operands, equation.params["y"]]
+    found = []
+    for one in ("sin", "cos") if name == "sincos" else (name,):
+        if one not in FORMULAS:
+            raise ValueError(
+                f"the equations contain '{one}', which has no formula here.\n"
+                "Usual cause: jnp.where, a table, a loop, or a special function in L.\nFix: print a system without it."
+            )
+        result = (getattr(sympy, FORMULAS[one]) if isinstance(FORMULAS[one], str) else FORMULAS[one])(*operands)
+        if result.is_number and not result.is_Rational:
+            # The sine or the root of a number is a number.
+            result = _number(np.float64(result)) if result.is_real else sympy.nan
+        found.append(result)
+    return found
+
+
+def _number(x, aval=None) -> Any:
+    """A number as the first of these that equals it to round-off: a small fraction, a short decimal, all its digits."""
+    sympy, x = sympy_itself(), np.asarray(x, None if aval is None else aval.dtype)
     if not np.isfinite(x):
         return sympy.nan
     exact = Fraction(x.item())
     if not jnp.issubdtype(x.dtype, jnp.floating):
         return sympy.Rational(exact)
     kind = jnp.finfo(x.dtype)
-    simple = exact.limit_denominator(SMALL), Fraction(f"{x:.{kind.precision - 2}g}")
+    simple = exact.limit_denominator(SMALL), Fraction(f"{x.item():.{kind.precision - 2}g}")
     close = (y for y in simple if abs(y - exact) <= 4 * float(kind.eps) * abs(exact))
     return sympy.Rational(next(close, Fraction(str(x))))
 
 
-def _applied(equation, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """The results of a primitive for expressions."""
-    name, params, shape = equation.primitive.name, equation.params, equation.outvars[0].aval.shape
-    if name in ("convert_element_type", "stop_gradient"):
-        return operands
-    if name == "cumsum":
-        order = slice(None, None, -1 if params["reverse"] else 1)
-        columns = np.moveaxis(operands[0], params["axis"], 0)[order]
-        return [np.moveaxis(np.cumsum(columns, axis=0)[order], 0, params["axis"])]
-    if name in MOVING and name in MOVES:
-        found = MOVES[name](params, equation.outvars, *operands)
-        if found is not None:
-            return found
-    rows = list(zip(*(np.broadcast_to(x, shape).reshape(-1) for x in operands)))
-    names = ("sin", "cos") if name == "sincos" else (name,)
-    return [_filled([_result(one, params, *row) for row in rows], shape) for one in names]
-
-
-def _result(name: str, params: dict, *x) -> Any:
-    """The result of a primitive, as a sum of terms."""
+def simplified(formula) -> Any:
+    """The shortest of some equal formulas: products expanded, sines and cosines combined, one denominator."""
     sympy = sympy_itself()
-    # `integer_pow` has its exponent as a parameter.
-    name, x = ("pow", (*x, params["y"])) if name == "integer_pow" else (name, x)
-    if name not in FORMULAS:
-        raise ValueError(
-            f"the equations contain '{name}', which has no formula here.\n"
-            "Usual cause: jnp.where, a table, a loop, or a special function in L.\nFix: print a system without it."
-        )
-    formula = FORMULAS[name]
-    result = (getattr(sympy, formula) if isinstance(formula, str) else formula)(*x)
-    if result.is_number and not result.is_Rational:
-        # The sine or the root of a number is a number.
-        return _number(np.float64(result)) if result.is_real else sympy.nan
-    return _expanded(result)
-
-
-def _expanded(x) -> Any:
-    """A product or a power as a sum of terms, with the denominator as it is."""
-    sympy = sympy_itself()
-    # SymPy is not asked to expand what is too long.
-    if _length(x) > TERMS:
+    if formula.count_ops() > OPERATIONS or _terms(formula) > TERMS:
         raise TooLong
-    if x.is_Add:
-        return x
-    above, below = sympy.fraction(x)
-    above = sympy.expand_multinomial(sympy.expand_mul(above, deep=False), deep=False)
-    return sympy.Add(*(y / below for y in sympy.Add.make_args(above)))
+    forms = [sympy.expand_mul(formula)]
+    if formula.has(sympy.sin, sympy.cos):
+        forms.append(sympy.expand_mul(sympy.trigsimp(forms[0])))
+    above, below = sympy.fraction(sympy.together(forms[0]))
+    if _terms(above) <= TERMS:
+        forms.append(sympy.expand_mul(above) / below)
+    return min(*forms, formula, key=sympy.count_ops)
 
 
-def _length(x) -> int:
-    """The most terms that an expression can have once it is expanded."""
-    if x.is_Add or x.is_Mul:
-        return (sum if x.is_Add else math.prod)(map(_length, x.args))
-    if x.is_Pow and x.exp.is_Integer and x.exp > 0:
-        return math.comb(_length(x.base) + int(x.exp) - 1, int(x.exp))
-    return 1
+def _terms(formula) -> int:
+    """How many terms a formula has once its products are expanded."""
+    if formula.is_Add:
+        return sum(map(_terms, formula.args))
+    return math.prod(map(_terms, formula.args)) if formula.is_Mul else 1
 
 
-def _simplified(formula, combined) -> Any:
-    """The formula, with sums of sines and cosines that have the same factor combined, if that is shorter."""
-    sympy = sympy_itself()
-    sums = defaultdict(list)
-    for term in sympy.Add.make_args(formula):
-        factor, waves = term.as_independent(sympy.sin, sympy.cos)
-        number, factor = factor.as_coeff_Mul()
-        sums[factor].append(number * waves)
-    formula = sympy.Add(*(_expanded(factor * combined(sympy.Add(*waves))) for factor, waves in sums.items()))
-    above, below = sympy.fraction(sympy.together(formula))
-    if _length(above) > TERMS:
-        return formula
-    return min(formula, sympy.expand(above) / below, key=sympy.count_ops)
-
-
-def _combined(waves) -> Any:
-    sympy = sympy_itself()
-    if not (waves.is_Add and waves.has(sympy.sin, sympy.cos)):
-        return waves
-    return min(waves, sympy.expand_mul(sympy.trigsimp(waves)), key=sympy.count_ops)
-
-
-def _verified(program, formulas, symbols, scalarised, s) -> float:
+def _verified(state: Callable, numbers: np.ndarray, whole: np.ndarray, symbols: list, sides: list[tuple]) -> float:
     """The largest relative difference of formulas and program at random states; raises if they do not agree."""
-    given, flat = _arrays(scalarised.system), np.concatenate([np.ravel(x) for x in _arrays((s.params, *s[:3]))])
-    run = jax.jit(lambda *inputs: eval_jaxpr(program.jaxpr, program.consts, *inputs))
+
+    def exactly(numbers):
+        model, t, x, u, multipliers, a = state(numbers)
+        linear, push = mass_and_forcing(model, t, x, u), constraints.jacobian(model, t, x, u).T @ multipliers
+        right = linear.forcing + (push if linear.response is None else push + linear.response @ multipliers)
+        held = [jnp.ravel(g) for g in _residuals(model, t, x, u)]
+        return jnp.concatenate([linear.mass @ a, *held, right])
+
+    random = np.random.default_rng(4).standard_normal((4 * STATES, numbers.size))
+    spread = 0.25 * np.where(numbers == 0, 1.0, np.abs(numbers)) * ~whole
+    states = (numbers + spread * random).astype(numbers.dtype)
+    exact = np.asarray(jax.jit(jax.vmap(exactly))(states), float)
+    known = np.all(np.isfinite(exact), axis=1)
+    states, exact = states[known][:STATES], exact[known][:STATES]
+    left, right = zip(*sides)
+    formulas = [*left, *right][: exact.shape[1]]
     evaluate = sympy_itself().lambdify(symbols, formulas, "numpy", dummify=True, cse=True)
-    variables = program.jaxpr.invars[len(given) :]
-    ends = np.cumsum([x.aval.size for x in variables])[:-1]
-    errors, random = [], np.random.default_rng(4)
-    for _ in range(4 * STATES):
-        at = flat + 0.25 * np.where(flat == 0, 1.0, np.abs(flat)) * random.standard_normal(flat.size)
-        inputs = [y.reshape(x.aval.shape).astype(x.aval.dtype) for x, y in zip(variables, np.split(at, ends))]
-        exact = np.asarray(run(*given, *inputs), float)
-        with np.errstate(all="ignore"):
-            values = np.asarray(evaluate(*(y for x in inputs for y in np.ravel(x).astype(float))), float)
-        if np.all(np.isfinite(exact)):
-            errors.append(np.max(np.abs(values - exact) / (1e-3 * np.max(np.abs(exact)) + np.abs(exact))))
-        if len(errors) == STATES:
-            break
+    with np.errstate(all="ignore"):
+        values = np.array([evaluate(*row) for row in states.astype(float)], float).reshape(exact.shape)
+    scale = np.abs(exact) + 1e-3 * np.max(np.abs(exact), axis=1, keepdims=True)
     # NaN if a formula has no value where the program has one.
-    worst = float(np.max(errors, initial=0.0))
-    if len(errors) < STATES or not worst <= (AGREE if flat.dtype == np.float64 else 1e-3):
+    worst = float(np.max(np.abs(values - exact) / scale, initial=0.0))
+    if len(states) < STATES or not worst <= (AGREE if numbers.dtype == np.float64 else 1e-3):
         raise ValueError(
             f"the formulas differ from the program by {worst:.0e} and are not shown.\n"
             "Usual cause: a root or power of an expression that changes sign.\nFix: write it so that it does not."
@@ -328,34 +315,9 @@ def _verified(program, formulas, symbols, scalarised, s) -> float:
     return worst
 
 
-def _lines(names: list[str], held: list[str], symbols: dict[Any, str], formulas: list) -> list[str]:
-    """Each equation in LaTeX."""
-    sympy = sympy_itself()
-    accelerations = {sympy.Symbol(f"4{name}"): written(name, r"\ddot") for name in names}
-    multipliers = {sympy.Symbol(f"5{name}"): rf"\lambda_{{{written(name)}}}" for name in held}
-    texts, n, m = symbols | accelerations | multipliers, len(names), len(held)
-    mass, forcing, rows, residuals = np.split(_filled(formulas, (-1,)), np.cumsum([n * n, n, m * n]))
-
-    def total(factors, coefficients):
-        short = (min(x, sympy.factor_terms(x), key=sympy.count_ops) for x in coefficients)
-        return sympy.Add(*(x * y for x, y in zip(factors, short)))
-
-    left = [total(accelerations, mass[i * n : (i + 1) * n]) for i in range(n)]
-    right = [forcing[i] + total(multipliers, rows[i::n]) for i in range(n)]
-    pairs = [*zip(left, right), *((x, sympy.Integer(0)) for x in residuals)]
-    return [f"{typeset(x, texts)} = {typeset(y, texts)}" for x, y in pairs]
-
-
 def typeset(formula, texts: dict[Any, str]) -> str:
     """A formula in LaTeX, its numbers as small fractions, or in the shortest digits that give the same float."""
     sympy = sympy_itself()
-    shown = {}
-    for x in formula.atoms(sympy.Rational):
-        shown[x] = simple = _number(np.float64(x))
-        if simple.q > SMALL or abs(simple) >= 10**6:
-            # SymPy writes the digits like a symbol that comes before all others.
-            digits, _, exponent = str(float(abs(simple))).removesuffix(".0").partition("e")
-            text = digits + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")
-            symbol = sympy.Symbol(f" {text}", positive=True)
-            shown[x], texts = symbol if x > 0 else -symbol, texts | {symbol: text}
-    return sympy.latex(formula.xreplace(shown), symbol_names=texts, ln_notation=True, inv_trig_style="full")
+    shown = {x: _number(np.float64(x)) for x in formula.atoms(sympy.Rational)}
+    long = {x: sympy.Float(repr(float(x))) for x, y in shown.items() if y.q > SMALL or abs(y) >= 10**15}
+    return sympy.latex(formula.xreplace(shown | long), symbol_names=texts, ln_notation=True, inv_trig_style="full")
