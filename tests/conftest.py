@@ -1,18 +1,19 @@
 """Strict numerics for all tests: float64, no silent rank promotion, warnings are errors.
 
-Tiers of tests; `.ci/run` runs the first three:
+Two tiers of tests, and an option; `.ci/run` runs the scenes and both tiers:
 
     python -m lagjax    the scenes: error against exact motions by method and tolerance, stiff and extreme cases,
                         pictures; the reduced stability report. The exit status is 1 if anything is missed, which
                         `test_main.py` and `test_stability.py` check.
     pytest              every module on programs that compile in seconds; messages; docstring examples; architecture.
-    pytest -m "slow and not exhaustive"
+    pytest -m slow
                         tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,
                         orders, events, degenerate and large systems, mechanisms to their end, fits and their
                         uncertainties, random systems; code of README and docs, short notebooks, the types.
-    pytest -m exhaustive
-                        before a release and after a change of what they test (`.ci/release`), for two hours: tests
-                        that compile or train for longer; further sizes, seeds, methods and modes of those above.
+    pytest -m slow --all-sizes
+                        also the tests marked `exhaustive`, before a release and after a change of what they test
+                        (`.ci/release`), for two hours: those that compile or train for longer; further sizes, seeds,
+                        methods and modes of those above.
 """
 
 import gc
@@ -45,17 +46,29 @@ def as_users_get_it(item):
     return any(item.get_closest_marker(name) for name in ("exhaustive", "optimised"))
 
 
-def pytest_collection_modifyitems(items):
-    """Run the optimised tests last, so that few programs are compiled in both ways."""
+def pytest_addoption(parser):
+    """The option for all sizes."""
+    parser.addoption("--all-sizes", action="store_true", help="also the slow tests that are marked `exhaustive`")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Exhaustive tests are slow ones, run on request; the optimised tests come last: few programs compile twice."""
+    exhaustive = [item for item in items if item.get_closest_marker("exhaustive")]
+    for item in exhaustive:
+        item.add_marker("slow")
+    if not config.getoption("--all-sizes"):
+        config.hook.pytest_deselected(items=exhaustive)
+        items[:] = [item for item in items if not item.get_closest_marker("exhaustive")]
     items.sort(key=as_users_get_it)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """In the first two tiers XLA optimises little, which compiles in two thirds of the time.
+    """XLA optimises little in most tests, which compiles in two thirds of the time.
 
-    Order, stability, speed and compiled programs are measured as users get them: in tests marked `optimised`, in all
-    processes that tests start, in `python -m lagjax`, and in the last tier.
+    Order, stability, speed and compiled programs are measured as users get them: in tests marked `optimised` or
+    `exhaustive`, in all processes that tests start, and in `python -m lagjax`.
     """
     optimised = as_users_get_it(item)
     if optimised and jax.config.read("jax_disable_most_optimizations"):
