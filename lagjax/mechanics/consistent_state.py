@@ -16,6 +16,7 @@ Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,7 @@ from lagjax.mechanics.projection import departures, within
 from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.numerics.linalg import dense
 from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
+from lagjax.numerics.newton import largest, last_step, newton
 from lagjax.system import constraints, coordinates
 from lagjax.system.check_functions import prepare
 
@@ -168,16 +170,15 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         rows = rows_at(fixed, y)
         return displacement_map(fixed_metric, rows, usable_rows(rows, dependent_below))
 
-    def shortest_step(y, dependent_below):
-        slope = jnp.sum(jnp.abs(rows_at(fixed, y)), axis=1)
-        step = to_displacement(y, dependent_below) @ residual(fixed, y)
-        trials = y[None] - FRACTIONS.astype(y.dtype)[:, None] * step[None]
-        left = jax.vmap(lambda y: jnp.max(jnp.abs(residual(fixed, y)) / jnp.where(slope > 0, slope, 1.0)))(trials)
-        return trials[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))], None
+    def shortest_step(y, r, i):
+        # Off the manifold dependent rows disagree by about the distance to it, which is unknown at first.
+        dependent_below = jnp.maximum(0.1 * 0.25**i, DEPENDENT_BELOW[np.dtype(y0.dtype)]).astype(y0.dtype)
+        return to_displacement(y, dependent_below) @ r
 
-    # Off the manifold dependent rows disagree by about the distance to it, which is unknown at first.
-    thresholds = jnp.maximum(0.1 * 0.25 ** jnp.arange(TO_REACH), DEPENDENT_BELOW[np.dtype(y0.dtype)])
-    reached, _ = lax.scan(shortest_step, start, thresholds.astype(y0.dtype))
+    slope = jnp.sum(jnp.abs(rows_at(fixed, start)), axis=1)
+    distance = lambda r: largest(r / jnp.where(slope > 0, slope, 1.0))
+    of_y = partial(residual, fixed)
+    reached = newton(of_y, shortest_step, start, TO_REACH, size=distance, fractions=FRACTIONS)
 
     def newton_matrix(y, multipliers):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
@@ -194,18 +195,21 @@ def _nearest(residual: Callable, problem, y0, metric, free):
 
     def follow(state, share):
         target = reached + share * (start - reached)
-        for _ in range(PER_STAGE):
-            y, multipliers = state
+
+        def step(state, left, i):
+            y, multipliers = state[:n], state[n:]
             independent = usable_rows(rows_at(fixed, y))
-            left = equations(fixed, fixed_metric, target, y, multipliers)
             left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
             step = dense.solve(newton_matrix(y, multipliers), left)
-            state = y - step[:n], jnp.where(independent, multipliers - step[n:], 0.0)
-        return state, None
+            return step.at[n:].set(jnp.where(independent, step[n:], multipliers))
+
+        at_target = lambda state: equations(fixed, fixed_metric, target, state[:n], state[n:])
+        return newton(at_target, step, state, PER_STAGE), None
 
     zero = jnp.zeros_like(residual(fixed, start))
     shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
-    (y, multipliers), _ = lax.scan(follow, (reached, zero), shares)
+    followed, _ = lax.scan(follow, jnp.concatenate([reached, zero]), shares)
+    y, multipliers = followed[:n], followed[n:]
     finite = jnp.all(jnp.isfinite(y))
     y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)
     # One more Newton step gives the nearest point all its derivatives, by the implicit function theorem.
@@ -213,8 +217,8 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     y, multipliers, reached = stop_gradient((y, multipliers, reached))
     nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
     # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
-    near = reached + (y0 - start)
-    near = near - lax.stop_gradient(to_displacement(reached)) @ residual(problem, near)
+    back = lax.stop_gradient(to_displacement(reached))
+    near = last_step(reached, y0, lambda y: back @ residual(problem, y))
     length = lambda y: (y - start) @ fixed_metric @ (y - start)
     off = jnp.max(jnp.abs(residual(fixed, nearest)))
     kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, PyTree
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.numerics.newton import largest, last_step, newton
 from lagjax.system import constraints, coordinates
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
@@ -78,23 +79,13 @@ def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     fixed, start = stop_gradient((problem, y))
 
     def size(r):
-        return jnp.max(jnp.abs(r) / jnp.where(slope > 0, slope, 1.0))
+        return largest(r / jnp.where(slope > 0, slope, 1.0))
 
-    def unfinished(state):
-        i, y, r = state
-        return (i < ITERATIONS) & (size(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(jnp.max(jnp.abs(y)), first))
-
-    def iterate(state):
-        i, y, r = state
-        y = y - displacement(r)
-        return i + 1, y, residual(fixed, y)
-
-    r = residual(fixed, start)
-    first = size(r)
-    _, near, _ = lax.while_loop(unfinished, iterate, (0, start, r))
-    # This has the value of `near` and the derivative of y.
-    y = near + (y - start)
-    return y - displacement(residual(problem, y))
+    near = newton(
+        partial(residual, fixed), lambda y, r, i: displacement(r), start, ITERATIONS, size=size,
+        relative=ONE_IS_ENOUGH_BELOW,
+    )  # fmt: skip
+    return last_step(near, y, lambda y: displacement(residual(problem, y)))
 
 
 def velocity_change(model, t, q, v, change):

@@ -1,6 +1,11 @@
-"""Roots of small systems of equations, of any rank and from any start: Levenberg-Marquardt by singular values.
+"""Newton's method for `r(y) = 0`: one loop for each of the three ways in which it is kept from going astray.
 
-A step for `r(y) = 0` is, with the singular value decomposition of the scaled Jacobian `J = U Σ Vᵀ`,
+`newton` takes steps that its caller solves for, and shortens them where they overshoot; `damped_newton` repeats a step
+that did not reduce the residual with more damping; `newton_in_python` starts near the solution and gives up where steps
+do not shrink. Derivatives of the solution are those of one more step with a constant matrix (`last_step`), or of the
+implicit function, to any order (`differentiable`).
+
+A step of Levenberg and Marquardt is, with the singular value decomposition of the scaled Jacobian `J = U Σ Vᵀ`,
 
     d = -V Σ (Σ² + δ)⁻¹ Uᵀ r
 
@@ -11,13 +16,14 @@ Source: Nocedal & Wright, *Numerical Optimization*, §10.3; Nielsen, IMM-REP-199
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.numerics.linalg import lapack
 
@@ -25,6 +31,138 @@ from lagjax.numerics.linalg import lapack
 ZERO_BELOW = 1e3
 # The largest number of steps. A stiff system is followed along a narrow valley; a hopeless start ends much earlier.
 MOST = 600
+# Steps with less damping than this are Newton's.
+NEWTON_BELOW = 1e-9
+
+
+def largest(r: Array) -> Array:
+    """The largest entry."""
+    return jnp.max(jnp.abs(r))
+
+
+def newton(
+    residual: Callable[[Array], Array],
+    step: Callable[[Array, Array, Array], Array],
+    y0: Float[Array, " n"],
+    most: int,
+    *,
+    size: Callable[[Array], Array] = largest,
+    relative: float = 0.0,
+    falls: float | None = None,
+    fractions: np.ndarray | None = None,
+) -> Float[Array, " n"]:
+    """Repeat `y - f step(y, r, i)` with `r = residual(y)`, at most `most` times. Not differentiable in reverse mode.
+
+    >>> print(newton(lambda y: y**2 - 2.0, lambda y, r, i: r / (2 * y), jnp.array([1.0]), 6).round(6))
+    [1.414214]
+
+    **Arguments:** f is the first of the `fractions` for which `size(r)` is least, or 1. The iteration ends when
+    `size(r)` is at most `relative` times the larger of `|y|` and its first value or, with `falls`, when it is no longer
+    below `falls` times the one before.
+    """
+
+    def unfinished(state):
+        i, y, r, before = state
+        going = (i < most) & (size(r) > (relative * jnp.maximum(largest(y), first) if relative else 0.0))
+        return going if falls is None else going & (size(r) < falls * before)
+
+    def iterate(state):
+        i, y, r, _ = state
+        whole, before = step(y, r, i), size(r)
+        if fractions is None:
+            return i + 1, y - whole, residual(y - whole), before
+        trials = y[None] - fractions.astype(y.dtype)[:, None] * whole[None]
+        residuals = jax.vmap(residual)(trials)
+        sizes = jax.vmap(size)(residuals)
+        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+        return i + 1, trials[best], residuals[best], before
+
+    r = residual(y0)
+    first = size(r)
+    return lax.while_loop(unfinished, iterate, (0, y0, r, jnp.full_like(first, jnp.inf)))[1]
+
+
+def last_step(near: Array, y0: Array, step: Callable[[Array], Array]) -> Array:
+    """One more step from `near`, with the first derivatives of the solution that was found from y0.
+
+    The matrix in `step(y)` is constant: where the residual vanishes, its derivative does not contribute.
+    """
+    y = near + (y0 - lax.stop_gradient(y0))
+    return y - step(y)
+
+
+class Search(NamedTuple):
+    """A damped search: the best `y`, its evaluation `at`, what the next step depends on, and the evaluations so far."""
+
+    y: PyTree
+    at: PyTree
+    memory: Any
+    steps: Int[Array, ""]
+
+
+def damped_newton(
+    evaluate: Callable[[PyTree], PyTree],
+    propose: Callable[[Search], PyTree],
+    judge: Callable[[Search, PyTree, PyTree], tuple[Bool[Array, ""], Any]],
+    unfinished: Callable[[Search], Bool[Array, ""]],
+    y0: PyTree,
+    at: PyTree,
+    memory: Any,
+) -> Search:
+    """Repeat `trial = propose(search)`, and keep it where it is better.
+
+    `judge(search, trial, evaluate(trial))` says whether it is, and gives the next memory. The first trial is to be y0,
+    whose evaluation `at` is unknown: so the program contains one evaluation.
+    """
+
+    def iterate(search):
+        trial = propose(search)
+        there = evaluate(trial)
+        better, memory = judge(search, trial, there)
+        y, at = jax.tree.map(lambda new, old: jnp.where(better, new, old), (trial, there), (search.y, search.at))
+        return Search(y, at, memory, search.steps + 1)
+
+    return lax.while_loop(unfinished, iterate, Search(y0, at, memory, jnp.zeros((), int)))
+
+
+class Ended(NamedTuple):
+    """Where `newton_in_python` ended, its last step, the relative lengths of all, and whether they ended small."""
+
+    y: np.ndarray
+    step: np.ndarray
+    lengths: list[float]
+    converged: bool
+
+
+def newton_in_python(
+    step: Callable[[np.ndarray], np.ndarray | None],
+    y: np.ndarray,
+    most: int,
+    *,
+    enough: float = 0.0,
+    free: int | None = None,
+    shrinks: float = 1.0,
+    noise: float = np.inf,
+) -> Ended | None:
+    """Repeat `y - step(y)` until a step is at most `enough`, or, after `free` steps, not shorter than the one before.
+
+    None where `step(y)` is None, or where a step after `free` ones is above `noise` and above `shrinks` times the one
+    before. A length is the largest entry of a step, relative to that of y if this is above 1.
+    """
+    lengths = [np.inf]
+    for i in range(most):
+        change = step(y)
+        if change is None:
+            return None
+        length = float(np.max(np.abs(change))) / max(1.0, float(np.max(np.abs(y))))
+        settled = free is not None and i >= free
+        if settled and length > shrinks * lengths[-1] and length > noise:
+            return None
+        y = y - change
+        if length <= enough or settled and length >= lengths[-1]:
+            return Ended(y, change, [*lengths[1:], length], True)
+        lengths.append(length)
+    return Ended(y, change, lengths[1:], False)
 
 
 class Root(NamedTuple):
@@ -35,6 +173,16 @@ class Root(NamedTuple):
     jacobian: Float[Array, "m n"]
     rows: Float[Array, " m"]
     steps: Int[Array, ""]
+
+
+class Damping(NamedTuple):
+    """What a step of Levenberg and Marquardt depends on; the search ends when no tries are left."""
+
+    rows: Float[Array, " m"]
+    columns: Float[Array, " n"]
+    damping: Float[Array, ""]
+    grow: Float[Array, ""]
+    tries_left: Int[Array, ""]
 
 
 def zero_below(dtype) -> float:
@@ -54,69 +202,60 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
     """
     eps, tiny = jnp.finfo(y0.dtype).eps, jnp.finfo(y0.dtype).tiny
     linear = np.zeros(y0.size, bool) if linear is None else linear
-    positive = lambda x: jnp.where(x > 0, x, 1.0)
 
-    def step_of(r, jacobian, rows, columns, damping):
-        u, s, vt = lapack.decomposed(jacobian / rows[:, None] / columns[None, :])
+    def positive(x):
+        return jnp.where(x > 0, x, 1.0)
+
+    def size(r, rows):
+        squared = jnp.sum((r / rows) ** 2)
+        return jnp.where(jnp.isfinite(squared), squared, jnp.inf)
+
+    def propose(search):
+        (r, jacobian), memory = search.at, search.memory
+        only_linear = (search.steps == 1) & linear.any()
+        columns = positive(memory.columns)
+        reduced = jnp.where(only_linear & ~linear[None, :], 0.0, jacobian)
+        damping = jnp.where((memory.damping < NEWTON_BELOW) | only_linear, 0.0, memory.damping)
+        u, s, vt = lapack.decomposed(reduced / memory.rows[:, None] / columns[None, :])
         kept = s > zero_below(y0.dtype) * jnp.maximum(s[0], tiny)
         gain = jnp.where(kept, s / jnp.where(kept, s**2 + damping, 1.0), 0.0)
-        return -(vt.T @ (gain * (u.T @ (r / rows)))) / columns
+        step = (vt.T @ (gain * (u.T @ (r / memory.rows)))) / columns
+        return search.y - jnp.where(search.steps == 0, 0.0, step)
 
-    def unfinished(state):
-        i, *_, tries_left = state
-        return (i < MOST) & (tries_left > 0)
-
-    # Residuals and Jacobian appear only once in the program, at the trial point, which the start is as well.
-    def iterate(state):
-        i, y, r, jacobian, trial, rows, columns, damping, grow, expected, tries_left = state
-        new_r, new_jacobian = with_value(residual, trial)
-        first = i == 0
-        sizes = positive(jnp.max(jnp.abs(new_jacobian), axis=1))
+    def judge(search, trial, there):
+        (new_r, new_jacobian), (r, jacobian), (rows, columns, damping, grow, _) = there, search.at, search.memory
+        # The start, and the step of the linear unknowns.
+        always_accepted = (search.steps == 0) | (linear.any() & (search.steps == 1))
         # Rows are scaled at the start, and again after the step of the linear unknowns.
-        rows = jnp.where(i <= 1, sizes, rows)
-        size = lambda r: jnp.where(jnp.isfinite(squared := jnp.sum((r / rows) ** 2)), squared, jnp.inf)
-        old, new = size(r), size(new_r)
-        always_accepted = first | (linear.any() & (i == 1))
+        rows = jnp.where(search.steps <= 1, positive(jnp.max(jnp.abs(new_jacobian), axis=1)), rows)
+        old, new = size(r, rows), size(new_r, rows)
         better = jnp.all(jnp.isfinite(new_jacobian)) & (always_accepted | (new < old))
+        expected = old - size(r + jacobian @ (trial - search.y), rows)
         gain_ratio = jnp.where(expected > 0, (old - new) / positive(expected), 0.0)
         less = damping * jnp.maximum(1e-3, 1 - (2 * gain_ratio - 1) ** 3)
         more = jnp.maximum(damping, 1e-12) * grow
-        damping = jnp.where(always_accepted, damping, jnp.where(better, less, more)).astype(y.dtype)
-        grow = jnp.where(better, 2.0, 2 * grow).astype(y.dtype)
-        moved = jnp.max(jnp.abs(trial - y)) > 4 * eps * jnp.max(jnp.abs(trial))
-        y = jnp.where(better, trial, y)
-        r, jacobian = jnp.where(better, new_r, r), jnp.where(better, new_jacobian, jacobian)
+        damping = jnp.where(always_accepted, damping, jnp.where(better, less, more)).astype(trial.dtype)
+        grow = jnp.where(better, 2.0, 2 * grow).astype(trial.dtype)
+        moved = largest(trial - search.y) > 4 * eps * largest(trial)
         columns = jnp.where(always_accepted, 0.0, columns)
+        jacobian = jnp.where(better, new_jacobian, jacobian)
         columns = jnp.maximum(columns, jnp.max(jnp.abs(jacobian / rows[:, None]), axis=0))
         # The last steps are Newton's, as long as they reduce the residual.
-        is_newton = damping < 1e-9
-        only_linear = first & linear.any()
-        reduced_jacobian = jnp.where(only_linear & ~linear[None, :], 0.0, jacobian)
-        step = step_of(r, reduced_jacobian, rows, positive(columns), jnp.where(is_newton | only_linear, 0.0, damping))
-        expected = size(r) - size(r + jacobian @ step)
-        tries_left = jnp.where(is_newton & ~better & ~always_accepted, tries_left - 1, tries_left)
-        tries_left = jnp.where((moved | always_accepted) & (size(r) > 0) & (damping < 1e12), tries_left, 0)
-        tries_left = jnp.where(always_accepted & ~better, 0, tries_left)
-        return i + 1, y, r, jacobian, y + step, rows, columns, damping, grow, expected, tries_left
+        tries_left = search.memory.tries_left - ((damping < NEWTON_BELOW) & ~better & ~always_accepted)
+        left = jnp.where(better, new, old)
+        going = jnp.where(always_accepted, better, moved) & (left > 0) & (damping < 1e12)
+        return better, Damping(rows, columns, damping, grow, jnp.where(going, tries_left, 0))
 
-    count = jax.eval_shape(residual, y0).shape[0]
-    zeros = lambda *shape: jnp.zeros(shape, y0.dtype)
-    one = jnp.ones((), y0.dtype)
-    start = (
-        0,
-        y0,
-        zeros(count) * jnp.nan,
-        zeros(count, y0.size),
-        y0,
-        zeros(count) + 1,
-        zeros(y0.size),
-        1e-3 * one,
-        2 * one,
-        zeros(),
-        2,
+    def unfinished(search):
+        return (search.steps < MOST) & (search.memory.tries_left > 0)
+
+    m = jax.eval_shape(residual, y0).shape[0]
+    none, one = jnp.zeros((m, y0.size), y0.dtype), jnp.ones((), y0.dtype)
+    memory = Damping(none[:, 0] + 1, jnp.zeros_like(y0), 1e-3 * one, 2 * one, jnp.asarray(2))
+    found = damped_newton(
+        partial(with_value, residual), propose, judge, unfinished, y0, (none[:, 0] * jnp.nan, none), memory
     )
-    steps, y, r, jacobian, _, rows, *_ = lax.while_loop(unfinished, iterate, start)
-    return Root(y, r, jacobian, rows, steps)
+    return Root(found.y, *found.at, found.memory.rows, found.steps)
 
 
 def with_value(residual: Callable, y):

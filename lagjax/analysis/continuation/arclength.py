@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from lagjax.numerics.newton import newton_in_python
+
 ITERATIONS = 10
 # Step lengths: the first, the longest (relative to the distance from the origin) and the smallest.
 FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
@@ -111,8 +113,8 @@ class Tracer(abc.ABC):
     def corrected(self, z, row, known=None):
         """Newton's method from z with `row @ z` held at `known` (by default its value at z); None if it fails."""
         known = row @ z if known is None else known
-        z, last, self.contraction = z.copy(), np.inf, 0.0
-        for i in range(ITERATIONS):
+
+        def step(z):
             value, jacobian, _ = self.at(z)
             if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
                 return None
@@ -120,19 +122,18 @@ class Tracer(abc.ABC):
             left = np.append(value, row @ z - known)
             try:
                 square = matrix.shape[0] == matrix.shape[1]
-                step = np.linalg.solve(matrix, left) if square else np.linalg.lstsq(matrix, left, rcond=None)[0]
+                change = np.linalg.solve(matrix, left) if square else np.linalg.lstsq(matrix, left, rcond=None)[0]
             except np.linalg.LinAlgError:
                 return None
-            length = float(np.max(np.abs(step)))
-            if not np.isfinite(length) or i > 1 and length > 0.7 * last and length > 1e3 * self.noise * self.size(z):
-                return None
-            z = z - step
-            if i == 1 and last > 1e-6 * self.size(z):
-                self.contraction = length / last
-            if length <= 50 * self.noise * self.size(z) or i > 2 and length >= last:
-                return z
-            last = length
-        return None
+            return change if np.all(np.isfinite(change)) else None
+
+        limits = {"enough": 50 * self.noise, "noise": 1e3 * self.noise}
+        found = newton_in_python(step, z, ITERATIONS, free=2, shrinks=0.7, **limits)
+        if found is None or not found.converged:
+            return None
+        first, second = (*found.lengths, 0.0)[:2]
+        self.contraction = second / first if first > 1e-6 else 0.0
+        return found.y
 
     def size(self, z):
         return max(1.0, float(np.max(np.abs(z))))

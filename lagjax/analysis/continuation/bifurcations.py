@@ -33,6 +33,7 @@ from lagjax.analysis.continuation.equilibrium_equations import (  # fmt: skip
     extended_at,
     extended_by_params,
 )
+from lagjax.numerics.newton import newton_in_python
 
 NEWTON = 12
 # A direction whose component along the parameter is smaller leaves the parameter constant.
@@ -315,21 +316,16 @@ def _flutter(tracer, few, many, root):
 def _newton(tracer, kind, big, guide):
     """Solve the extended system by Newton's method with steps of least norm; also returns the parameter's last step."""
     cast = lambda x: np.asarray(x, tracer.dtype)
-    last, n, step, length = np.inf, tracer.frame.columns.size, big, np.inf
-    for i in range(NEWTON):
+
+    def step(big):
         value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, cast(big), cast(guide)))
-        if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
-            return None
-        step = _least_squares(jacobian, value)
-        length = float(np.max(np.abs(step)))
-        if i > 3 and length > last and length > tracer.eps**0.5 * tracer.size(big):
-            return None
-        big = big - step
-        if length <= 4 * tracer.eps * tracer.size(big) or i > 3 and length >= last:
-            break
-        last = length
-    accuracy = abs(float(step[n]))
-    return (big, accuracy) if length < tracer.eps**0.6 * tracer.size(big) else None
+        finite = np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))
+        return _least_squares(jacobian, value) if finite else None
+
+    found = newton_in_python(step, big, NEWTON, enough=4 * tracer.eps, free=4, noise=tracer.eps**0.5)
+    if found is None or not found.lengths[-1] < tracer.eps**0.6:
+        return None
+    return found.y, abs(float(found.step[tracer.frame.columns.size]))
 
 
 def _least_squares(matrix, known):

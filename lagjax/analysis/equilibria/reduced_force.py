@@ -23,7 +23,7 @@ from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria.balance import Steady
 from lagjax.jaxtools.compiled import compiled
 from lagjax.numerics.linalg.rank import null_space
-from lagjax.numerics.newton import with_value
+from lagjax.numerics.newton import newton_in_python, with_value
 
 # Amplitudes that are evaluated together, half of them on each side.
 SAMPLES = 64
@@ -129,22 +129,27 @@ def reduced(bordered: Bordered, amplitudes: np.ndarray):
     """The reduced force b (B, z) at amplitudes s (B, z), and the unknowns there; NaN where there is no solution."""
     steady, y0, rows, columns, right, left = bordered
     dtype, z, count = np.dtype(steady.t.dtype), right.shape[1], len(amplitudes)
-    y, beta = y0 + columns * (amplitudes @ right.T), np.zeros((count, z))
-    step = np.zeros((count, y0.size + z))
+    y = y0 + columns * (amplitudes @ right.T)
+    units = np.append(columns, np.ones(z))
+
+    def step(both):
+        y, beta = both[:, : y0.size], both[:, y0.size :]
+        r, jacobian = (np.asarray(x, float)[:count] for x in values_at(steady, padded(y, dtype)))
+        matrix = np.zeros((count, len(rows) + z, y0.size + z))
+        matrix[:, : len(rows), : y0.size] = jacobian / rows[:, None] * columns
+        matrix[:, : len(rows), y0.size :] = left
+        matrix[:, len(rows) :, : y0.size] = right.T
+        off = np.concatenate([r / rows + beta @ left.T, ((y - y0) / columns) @ right - amplitudes], axis=1)
+        usable = np.all(np.isfinite(matrix), axis=(1, 2)) & np.all(np.isfinite(off), axis=1)
+        inverse = np.linalg.pinv(np.where(usable[:, None, None], matrix, 0.0), rcond=1e-11)
+        return units * np.einsum("bij,bj->bi", inverse, np.where(usable[:, None], off, np.nan))
+
     with np.errstate(all="ignore"):
-        for _ in range(NEWTON_STEPS):
-            r, jacobian = (np.asarray(x, float)[:count] for x in values_at(steady, padded(y, dtype)))
-            matrix = np.zeros((count, len(rows) + z, y0.size + z))
-            matrix[:, : len(rows), : y0.size] = jacobian / rows[:, None] * columns
-            matrix[:, : len(rows), y0.size :] = left
-            matrix[:, len(rows) :, : y0.size] = right.T
-            off = np.concatenate([r / rows + beta @ left.T, ((y - y0) / columns) @ right - amplitudes], axis=1)
-            usable = np.all(np.isfinite(matrix), axis=(1, 2)) & np.all(np.isfinite(off), axis=1)
-            inverse = np.linalg.pinv(np.where(usable[:, None, None], matrix, 0.0), rcond=1e-11)
-            step = -np.einsum("bij,bj->bi", inverse, np.where(usable[:, None], off, np.nan))
-            y, beta = y + columns * step[:, : y0.size], beta + step[:, y0.size :]
-    small = np.max(np.abs(step[:, : y0.size]), axis=1) <= 1e-6 * np.max(np.abs(amplitudes), axis=1)
-    return np.where(small[:, None], -beta, np.nan), np.where(small[:, None], y, np.nan)
+        found = newton_in_python(step, np.concatenate([y, np.zeros((count, z))], axis=1), NEWTON_STEPS)
+    assert found is not None
+    last = np.max(np.abs(found.step[:, : y0.size] / columns), axis=1)
+    reached = (last <= 1e-6 * np.max(np.abs(amplitudes), axis=1))[:, None]
+    return np.where(reached, -found.y[:, y0.size :], np.nan), np.where(reached, found.y[:, : y0.size], np.nan)
 
 
 def reduced_force(bordered, size):

@@ -35,6 +35,7 @@ from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.lagrangian import applied_force
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW
 from lagjax.numerics.linalg import dense
+from lagjax.numerics.newton import newton
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
@@ -42,8 +43,8 @@ from lagjax.system.model import model_of
 from lagjax.system.system import System
 
 ITERATIONS = 60
-# The line search takes the best of these fractions of a Newton step.
-FRACTIONS = 0.5 ** np.arange(16.0)
+# The line search takes the best of these fractions of a Newton step, or none.
+FRACTIONS = np.append(0.5 ** np.arange(16.0), 0.0)
 # The momentum counts as reached if the residual is below this many round-offs of its terms.
 ROUND_OFFS = 1e3
 
@@ -90,25 +91,11 @@ def _reached(found, target, matrix, v):
 
 
 def _newton(residual, start):
-    size = lambda v: jnp.max(jnp.abs(residual(v)))
+    def step(v, r, i):
+        return dense.solve(jax.jacfwd(residual)(v), r)
 
-    def unfinished(state):
-        i, _, before, now = state
-        # Round-off ends the quadratic convergence: the residual no longer falls.
-        return (i < ITERATIONS) & (now > 0) & (now < before)
-
-    def step(state):
-        i, v, _, now = state
-        along = dense.solve(jax.jacfwd(residual)(v), residual(v))
-        trials = v[None] - FRACTIONS.astype(v.dtype)[:, None] * along[None]
-        sizes = jax.vmap(size)(trials)
-        sizes = jnp.where(jnp.isfinite(sizes), sizes, jnp.inf)
-        best = jnp.argmin(sizes)
-        better = sizes[best] < now
-        return i + 1, jnp.where(better, trials[best], v), now, jnp.where(better, sizes[best], now)
-
-    first = size(start)
-    return lax.while_loop(unfinished, step, (0, start, jnp.full_like(first, jnp.inf), first))[1]
+    # Round-off ends the quadratic convergence: the residual no longer falls.
+    return newton(residual, step, start, ITERATIONS, falls=1.0, fractions=FRACTIONS)
 
 
 def _tangent(linear, y):

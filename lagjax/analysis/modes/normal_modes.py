@@ -39,6 +39,7 @@ from lagjax.integrate.trajectory.drawing import drawn
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.numerics.linalg.rank import null_space
+from lagjax.numerics.newton import newton_in_python
 from lagjax.system import coordinates
 from lagjax.system.model import model_of
 from lagjax.system.user_errors import Call, check_arguments
@@ -274,16 +275,15 @@ def leads_to_others(linearisation, shapes, linearised_at) -> bool:
     along = np.linalg.qr(np.linalg.pinv(P) @ np.real(shapes).T)[0]
     across = null_space(along.T)
     size = np.max(np.abs(start)) or 1.0
-    for shape in np.real(shapes):
-        for share in (0.2, -0.2):
-            x = start + share * size * shape
-            for _ in range(NEWTON_STEPS):
-                now = linearised_at(x)
-                if not now.sound:
-                    return False
-                x = x + _step(now, across)
-            if not linearised_at(x).residual <= STEADY_AFTER:
-                return False
+
+    def step(x):
+        now = linearised_at(x)
+        return -_step(now, across) if now.sound else None
+
+    for displaced in (start + share * size * shape for shape in np.real(shapes) for share in (0.2, -0.2)):
+        found = newton_in_python(step, displaced, NEWTON_STEPS)
+        if found is None or not linearised_at(found.y).residual <= STEADY_AFTER:
+            return False
     return True
 
 

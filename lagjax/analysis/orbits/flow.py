@@ -17,6 +17,7 @@ Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §I.14; Coddington & Levins
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import diffrax
@@ -30,8 +31,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.equations import equations_of
 from lagjax.numerics.methods.runge_kutta import Dopri8
+from lagjax.numerics.newton import last_step, newton
 from lagjax.system import constraints, coordinates
 from lagjax.system.model import Model
 
@@ -46,7 +49,7 @@ SHORTEST = 1e-10
 FIRST = 0.02
 # A constraint row is dependent if at most this fraction of it is independent of the others.
 DEPENDENT_BELOW = 1e-6
-ONTO_CONSTRAINTS = 4
+ONTO_CONSTRAINTS = 3
 
 
 class Passage(NamedTuple):
@@ -108,8 +111,14 @@ class Flow(eqx.Module):
         """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
         if not self.rows:
             return z
-        newton_step = lambda z, _: (z - scale * _shortest(self.normals(t, z, scale), self.residual(t, z)), None)
-        return lax.scan(newton_step, z, None, length=ONTO_CONSTRAINTS)[0]
+        fixed, fixed_t, fixed_scale = stop_gradient((self, t, scale))
+
+        def step(at, r):
+            return fixed_scale * _shortest(fixed.normals(fixed_t, at, fixed_scale), r)
+
+        residual = partial(fixed.residual, fixed_t)
+        near = newton(residual, lambda z, r, i: step(z, r), lax.stop_gradient(z), ONTO_CONSTRAINTS)
+        return last_step(near, z, lambda z: step(near, self.residual(t, z)))
 
     def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
         """An orthonormal basis of the tangent space, in units of `scale`."""

@@ -36,6 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.analysis.orbits.flow import Flow, flow_of, scale_of
 from lagjax.jaxtools.compiled import compiled
+from lagjax.numerics.newton import damped_newton
 from lagjax.system.model import model_of
 
 TURN = 2 * np.pi
@@ -187,17 +188,11 @@ class SearchResult(NamedTuple):
     apart: Float[Array, ""]
 
 
-class Search(NamedTuple):
-    """The state of the iteration: the best candidate so far, its evaluation, and the damping to try next.
+class OrbitSearch(NamedTuple):
+    """What the next step depends on: the damping to try, and how far the guess moves in its period."""
 
-    `moves`: how far the guess moves in its period.
-    """
-
-    best: OrbitCandidate
-    evaluation: OrbitEvaluation
     damping: Float[Array, ""]
     moves: Float[Array, ""]
-    iterations: Int[Array, ""]
 
 
 class Step(NamedTuple):
@@ -225,38 +220,33 @@ def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, mos
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
     unevaluated = OrbitEvaluation(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
-    begin = Search(
-        OrbitCandidate(guess.nodes, guess.period), unevaluated, zero + FIRST_DAMPING, zero, jnp.zeros((), int)
-    )
 
     def unfinished(search):
-        limit = rtol * jnp.maximum(1.0, search.evaluation.amplified)
-        improving = (search.evaluation.size > STOP_BELOW * limit) & (search.damping < TOO_MUCH_DAMPING)
-        near = (search.evaluation.size <= CONVERGED_BELOW * limit) & (search.damping > FIRST_DAMPING)
-        return ((search.iterations == 0) | (improving & ~near)) & (search.iterations < most)
+        limit, damping = rtol * jnp.maximum(1.0, search.at.amplified), search.memory.damping
+        improving = (search.at.size > STOP_BELOW * limit) & (damping < TOO_MUCH_DAMPING)
+        near = (search.at.size <= CONVERGED_BELOW * limit) & (damping > FIRST_DAMPING)
+        return ((search.steps == 0) | (improving & ~near)) & (search.steps < most)
 
-    def iterate(search):
-        candidate = _next_candidate(flow, t, search, asked, guess.scale)
-        evaluation = _evaluate(flow, t, candidate, asked, goal, guess)
+    def judge(search, candidate, evaluation):
+        damping, moves = search.memory
         # Shrinking towards a state of rest is no progress, although a state of rest comes back after any time.
-        better = (evaluation.size < search.evaluation.size) & ~(evaluation.moves < SHRUNK_BELOW * search.moves)
-        pick = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-        damping = jnp.where(
-            better, jnp.maximum(LEAST_DAMPING, search.damping / DAMPING_FACTOR), DAMPING_FACTOR * search.damping
-        )
-        moves = jnp.where(search.iterations == 0, evaluation.moves, search.moves)
-        return Search(
-            pick(candidate, search.best), pick(evaluation, search.evaluation), damping, moves, search.iterations + 1
-        )
+        better = (evaluation.size < search.at.size) & ~(evaluation.moves < SHRUNK_BELOW * moves)
+        less, more = jnp.maximum(LEAST_DAMPING, damping / DAMPING_FACTOR), DAMPING_FACTOR * damping
+        moves = jnp.where(search.steps == 0, evaluation.moves, moves)
+        return better, OrbitSearch(jnp.where(better, less, more), moves)
 
-    search = lax.while_loop(unfinished, iterate, begin)
-    enough = CONVERGED_BELOW * rtol * jnp.maximum(1.0, search.evaluation.amplified)
-    converged = search.evaluation.size <= enough
+    search = damped_newton(
+        lambda candidate: _evaluate(flow, t, candidate, asked, goal, guess),
+        lambda search: _next_candidate(flow, t, search, asked, guess.scale),
+        judge, unfinished, OrbitCandidate(guess.nodes, guess.period), unevaluated,
+        OrbitSearch(zero + FIRST_DAMPING, zero),
+    )  # fmt: skip
+    converged = search.at.size <= CONVERGED_BELOW * rtol * jnp.maximum(1.0, search.at.amplified)
     if asked.moves:
         # A state of rest comes back after any time.
-        converged = converged & (search.evaluation.moves > jnp.sqrt(rtol))
-    apart = zero if asked.moves else _changed(flow, t, search.best, guess.scale)
-    return SearchResult(search.best, guess, search.evaluation, converged, search.iterations, apart)
+        converged = converged & (search.at.moves > jnp.sqrt(rtol))
+    apart = zero if asked.moves else _changed(flow, t, search.y, guess.scale)
+    return SearchResult(search.y, guess, search.at, converged, search.steps, apart)
 
 
 def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) -> SearchResult:
@@ -287,8 +277,8 @@ def _times(t, candidate):
 
 def _next_candidate(flow, t, search, asked, scale):
     """The candidate to which the next step leads."""
-    evaluation, best = search.evaluation, search.best
-    damping = jnp.where(search.iterations == 0, 0.0, search.damping * evaluation.size)
+    evaluation, best = search.at, search.y
+    damping = jnp.where(search.steps == 0, 0.0, search.memory.damping * evaluation.size)
     moves, log_period, _ = _step(evaluation.matrix, evaluation.residual, evaluation.bases, asked, flow.rtol, damping)
     longest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
     part = jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0, longest, 1.0))

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.jaxtools.cache import remembered
@@ -20,6 +19,7 @@ from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import numpy_of
 from lagjax.mechanics.generators import points
 from lagjax.mechanics.structure import are_angles
+from lagjax.numerics.newton import newton
 from lagjax.system import constraints, coordinates
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
@@ -133,11 +133,11 @@ def _on_constraints(model, scales, t, x, u):
 
 
 def _newton(residual, y, scale):
-    def step(_, y):
+    def step(y, r, i):
         rows = jax.jacfwd(residual)(y) * scale[None]
-        return y - scale * (jnp.linalg.pinv(rows, rtol=DEPENDENT_BELOW) @ residual(y))
+        return scale * (jnp.linalg.pinv(rows, rtol=DEPENDENT_BELOW) @ r)
 
-    return lax.fori_loop(0, ITERATIONS, step, y)
+    return newton(residual, step, y, ITERATIONS)
 
 
 def _vanishes(residual, y, scale):

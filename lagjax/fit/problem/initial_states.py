@@ -19,7 +19,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.fit.problem.records import Record, Windows, spread
@@ -33,6 +32,7 @@ from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.projection import departures, within
 from lagjax.numerics.linalg.rank import null_space
+from lagjax.numerics.newton import last_step, newton
 from lagjax.system import constraints, coordinates
 from lagjax.system.check_functions import traced_system
 from lagjax.system.coordinates import State
@@ -62,25 +62,16 @@ class Chart(NamedTuple):
         if self.across.shape[-1] == 0:
             return y
 
-        def step(problem, y):
-            """A step towards the constraints; of least squares if there are more equations than directions."""
-            rows = jax.jacfwd(lambda y: residual(problem, y))(y) @ self.across
-            return -self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
-
         fixed = stop_gradient(problem)
-        size = lambda y: jnp.max(jnp.abs(residual(fixed, y)))
 
-        def iterate(state):
-            i, y, _ = state
-            nearer = y + step(fixed, y)
-            return i + 1, nearer, size(nearer) < 0.5 * size(y)
+        def step(at, r):
+            """A step towards the constraints; of least squares if there are more equations than directions."""
+            rows = jax.jacfwd(partial(residual, fixed))(at) @ self.across
+            return self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ r)
 
-        start = stop_gradient(y)
-        _, near, _ = lax.while_loop(lambda state: (state[0] < ITERATIONS) & state[2], iterate, (0, start, True))
-        # The value of `near`; one more step, with a constant matrix, gives the derivative of the solution.
-        y = near + (y - start)
-        rows = jax.jacfwd(lambda y: residual(fixed, y))(near) @ self.across
-        return y - self.across @ jnp.linalg.solve(rows.T @ rows, rows.T @ residual(problem, y))
+        of_y = partial(residual, fixed)
+        near = newton(of_y, lambda y, r, i: step(y, r), stop_gradient(y), ITERATIONS, falls=0.5)
+        return last_step(near, y, lambda y: step(near, residual(problem, y)))
 
 
 class Starts(NamedTuple):
