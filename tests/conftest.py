@@ -26,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
-from lagjax.sweep import program_cache  # noqa: E402
+from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -74,7 +74,7 @@ def pytest_runtest_setup(item):
     if optimised and jax.config.read("jax_disable_most_optimizations"):
         # JAX would use the programs that earlier tests compiled for the same functions.
         jax.clear_caches()
-        program_cache.PROGRAMS.clear()
+        PROGRAMS.clear()
     jax.config.update("jax_disable_most_optimizations", not optimised)
 
 

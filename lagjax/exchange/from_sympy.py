@@ -23,7 +23,6 @@ import keyword
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from functools import lru_cache
 from importlib import import_module
 from itertools import count
 from typing import Any, cast
@@ -32,6 +31,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from lagjax.jaxtools.cache import once
 from lagjax.mechanics.diagnosis import listed
 from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE
@@ -90,7 +90,7 @@ class SymPyFunction(eqx.Module):
         return f"SymPyFunction({self.__name__})"
 
 
-@lru_cache(maxsize=1024)
+@once
 def _compiled(source):
     """Compile the function of a source text, under the file name that tracebacks show."""
     found: dict[str, Any] = {"jax": jax, "jnp": jnp}
@@ -186,7 +186,7 @@ def _in_jax(expression):
     return expression
 
 
-@lru_cache(maxsize=1)
+@once
 def _printer():
     """SymPy's Python printer, which sets parentheses, with JAX's names for functions and numbers."""
     from sympy.printing.pycode import PythonCodePrinter

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +22,7 @@ from lagjax.fit.search.search import Course, evaluate, listening, search
 from lagjax.fit.training.rounds import is_of_optax
 from lagjax.fit.training.training import held_problem, split_records, train
 from lagjax.integrate.solve.harvest import reported
+from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
 from lagjax.system.hybrid import Hybrid
@@ -316,7 +316,7 @@ def _scattered_starts(found, count, spread, seed):
     return xp.where(bounded, anywhere, xp.where(inside, x, start))
 
 
-@lru_cache
+@once
 def _random_numbers(seed, shape):
     """Normal numbers, and uniform ones between 0 and 1 without the ends."""
     random = np.random.default_rng(seed)

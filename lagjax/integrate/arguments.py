@@ -1,6 +1,5 @@
 """The checks that `integrate` makes of its arguments before it starts, with messages in the user's terms."""
 
-from functools import lru_cache
 from typing import Any
 
 import diffrax
@@ -13,6 +12,7 @@ from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.trajectory.error_report import account_of, warning_of
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning
+from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.projection import departures
 from lagjax.system import coordinates
@@ -250,7 +250,7 @@ def tolerance(value: Any, name: str, dtype):
     return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
 
 
-@lru_cache(maxsize=64)
+@once
 def _tolerance(value, name, dtype):
     _check_tolerance(np.min(value), name, dtype)
     _check_tolerance(np.max(value), name, dtype)

@@ -1,9 +1,19 @@
-"""Facts about systems, remembered; and pytrees in a form to compare."""
+"""The two caches of the house, of programs and of facts; and pytrees in a form to compare.
+
+The programs used last are kept, whatever they compute; one that is called again after it was dropped is compiled again.
+(Weak references would not help: a program holds the user's functions that it was compiled for, and with them 1 to 130
+MB and up to 500 of the 65,530 memory maps that Linux allows.) Dropping a program frees it, since each has a `jax.jit`
+of its own, but for JAX's traces of the functions inside it, 3 MB for each motion; so once in a while JAX's caches are
+cleared, and what is used again is compiled again.
+
+A fact follows from hashable arguments, and takes little.
+"""
 
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
+from functools import partial, wraps
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -21,7 +31,7 @@ class Recent(OrderedDict):
 
     def __init__(self, most: int):
         super().__init__()
-        self.most, self._one_thread = most, threading.Lock()
+        self.most, self.dropped, self._one_thread = most, 0, threading.Lock()
 
     def made(self, key: Hashable, make: Callable[[], T]) -> T:
         """The result of this key, made if there is none yet; made each time if the key cannot be compared."""
@@ -34,18 +44,45 @@ class Recent(OrderedDict):
             return make()
         found = make()
         with self._one_thread:
-            self[key] = found
+            # Another thread may have been faster.
+            found = self.setdefault(key, found)
             while len(self) > self.most:
                 self.popitem(last=False)
+                self.dropped += 1
         return found
 
 
-_facts = Recent(1024)
+PROGRAMS, FACTS = Recent(64), Recent(1024)
+# So many programs are dropped before JAX's caches are cleared.
+CLEAR_AFTER = 512
+
+
+def program_of(key: Hashable, make: Callable[[], T]) -> T:
+    """The program of this key, made if it is not among those used last."""
+    found = PROGRAMS.made(key, make)
+    if PROGRAMS.dropped >= CLEAR_AFTER:
+        PROGRAMS.dropped = 0
+        jax.clear_caches()
+    return found
 
 
 def remembered(thing: Any, key: Hashable, find: Callable[[], T]) -> T:
     """`find()`, or its earlier result for this key and anything that means the same as `thing`."""
-    return _facts.made((kinds(thing), key), find)
+    return FACTS.made((kinds(thing), key), find)
+
+
+def once(function: Callable[..., T]) -> Callable[..., T]:
+    """The same function, which remembers its results; where its arguments have no hash, it does not.
+
+    >>> print(once(abs)(-2.0))
+    2.0
+    """
+
+    @wraps(function)
+    def found(*args):
+        return FACTS.made((function, args), partial(function, *args))
+
+    return found
 
 
 def kinds(tree: PyTree):
@@ -64,24 +101,41 @@ def same(a: PyTree, b: PyTree) -> bool:
     return all(np.array_equal(x, y, equal_nan=np.issubdtype(x.dtype, np.inexact)) for x, y in pairs)
 
 
-class Parted(NamedTuple):
-    """The part of a tree that is not arrays: what a program of its arrays is compiled for."""
+# What stands in place of an array.
+ARRAY = ...
 
-    rest: tuple
+
+class HashablePart(NamedTuple):
+    """The part of a tree that is not arrays, which a program of its arrays is compiled for and JAX can carry along."""
+
+    leaves: tuple
     structure: Any
 
-    def together(self, arrays):
+    def combine(self, arrays: Iterable) -> Any:
         """Put the tree together again."""
         arrays = iter(arrays)
-        return jtu.tree_unflatten(self.structure, [next(arrays) if x is None else x for x in self.rest])
+        return jtu.tree_unflatten(self.structure, [next(arrays) if x is ARRAY else x for x in self.leaves])
+
+    def __reduce__(self):
+        # Equinox puts a marker into the structure of its modules and recognises it by identity. A copied structure
+        # would contain a copy of the marker, so the tree itself is copied instead.
+        return _part_of, (jtu.tree_unflatten(self.structure, self.leaves),)
 
 
-def parted(tree: PyTree) -> tuple[Parted, list]:
-    """Split off a tree's arrays; NumPy numbers are among them, as their values vary between calls."""
+def _part_of(tree: PyTree) -> HashablePart:
     leaves, structure = jtu.tree_flatten(tree)
-    varies = [is_array(x) or isinstance(x, np.generic) for x in leaves]
-    rest = tuple(None if array else x for x, array in zip(leaves, varies))
-    return Parted(rest, structure), [x for x, array in zip(leaves, varies) if array]
+    return HashablePart(tuple(leaves), structure)
+
+
+def hashable_partition(tree: PyTree) -> tuple[list, HashablePart]:
+    """Split a tree into its arrays and the rest, as `eqx.partition` does, but in a form that can be a key.
+
+    NumPy numbers are among the arrays, as their values vary between calls.
+    """
+    leaves, structure = jtu.tree_flatten(tree)
+    is_part = [is_array(x) or isinstance(x, np.generic) for x in leaves]
+    rest = tuple(ARRAY if array else x for x, array in zip(leaves, is_part))
+    return [x for x, array in zip(leaves, is_part) if array], HashablePart(rest, structure)
 
 
 def is_array(x) -> bool:

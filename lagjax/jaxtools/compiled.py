@@ -1,4 +1,11 @@
-"""Compile programs that Python calls: equinox's wrapper of `jit` takes longer than a short motion or fit."""
+"""Compile programs that Python calls: equinox's wrapper of `jit` takes longer than a short motion or fit.
+
+On a CPU the XLA of jax 0.10 has two ways to write the kernels of fused operations, with its newer emitters and without
+them. Our programs are one machine function, or hundreds of small kernels, and run as fast either way; the older way
+compiles them in two thirds of the time (processor time of the hoop until it leaves: 6.3 s in place of 9.5; of a first
+fit: 3.4 s in place of 5.3). Lanes of a sweep, in arrays, run up to a quarter slower that way, and so are compiled the
+newer way. The XLA of jax 0.12 has one way, and no such option. `LAGJAX_PLAIN=1` leaves the option out.
+"""
 
 from collections.abc import Callable
 from functools import partial, wraps
@@ -7,11 +14,28 @@ import jax
 import jax.tree_util as jtu
 import numpy as np
 
-from lagjax.jaxtools.cache import parted
-from lagjax.jaxtools.compiling import compiler_options
-from lagjax.jaxtools.program_cache import kept
+from lagjax.jaxtools.cache import hashable_partition, once, program_of
+from lagjax.jaxtools.plain import is_plain
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
+
+WITHOUT_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
+
+
+@once
+def compiler_options() -> dict | None:
+    """Options for `jax.jit` of a top-level program; None if XLA does not know them, which a tiny program tests once."""
+    if is_plain() or jax.default_backend() != "cpu":
+        return None
+    return WITHOUT_EMITTERS if _are_known(WITHOUT_EMITTERS) else None
+
+
+def _are_known(options):
+    try:
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def compiled(function: Callable, in_numpy: bool = False) -> Callable:
@@ -26,9 +50,9 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
     def program(*args):
         if not is_eager() or is_traced(args):
             return as_part(*args)
-        static, arrays = parted(args)
+        arrays, static = hashable_partition(args)
         try:
-            return finish(kept((function, static), lambda: _jitted(function, static))(arrays))
+            return finish(program_of((function, static), lambda: _jitted(function, static))(arrays))
         except jax.errors.JaxRuntimeError:
             # Equinox's wrapper has a better message for the checks that equinox puts into a program.
             return finish(as_part(*args))
@@ -41,4 +65,4 @@ def _jitted(function, static):
 
 
 def _of_arrays(function, static, arrays):
-    return one_by_one(function)(*static.together(arrays))
+    return one_by_one(function)(*static.combine(arrays))

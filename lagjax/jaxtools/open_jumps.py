@@ -9,9 +9,14 @@ the mode is the true one (the guard), and the mode beyond.
 A mode is one number: 0 or 1 for a comparison (`a > b`), a whole number for a level (`floor`). Comparisons of the same
 two numbers have one mode, wherever they stand, so that programs are told apart by what they compute: each value has a
 number of its own in a `JumpTable`, shared by several programs.
+
+The bounds of values, as far as the operations say (a cosine is between -1 and 1, a square not negative), tell which
+comparisons are decided once and for all, as those that only guard a root or a quotient against round-off:
+`jnp.where(r > 0, r, 1.0)` of a distance r, `jnp.arccos(jnp.clip(jnp.cos(q), -1, 1))`.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,8 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from lagjax.jaxtools.bounds import ALL, Bounds, of_number, of_result
 from lagjax.jaxtools.jaxpr import bodies, equations, evaluate, needed, stands_for, written
+
+Bounds = tuple[float, float]
+ALL = (-math.inf, math.inf)
+OF_RESULT = {"cos": (-1.0, 1.0), "sin": (-1.0, 1.0), "tanh": (-1.0, 1.0), "erf": (-1.0, 1.0), "logistic": (0.0, 1.0),
+             "exp": (0.0, math.inf), "exp2": (0.0, math.inf), "sqrt": (0.0, math.inf), "rsqrt": (0.0, math.inf),
+             "square": (0.0, math.inf), "cosh": (1.0, math.inf)}  # fmt: skip
+PASSES_BOUNDS = {
+    "broadcast_in_dim", "convert_element_type", "copy", "reshape", "rev", "slice", "squeeze", "stop_gradient",
+    "transpose", "gather", "dynamic_slice", "reduce_max", "reduce_min", "expand_dims",
+}  # fmt: skip
+JOINS_BOUNDS = {"concatenate", "stack", "select_n"}
 
 COMPARISONS = {"gt", "ge", "lt", "le"}
 KINKS = {"abs", "max", "min", "clamp"}
@@ -43,6 +58,44 @@ SMOOTH = {
 }  # fmt: skip
 # Operations on arrays of more numbers are not followed: those of a network, or of a picture.
 LARGEST = 16
+
+
+def bounds_of_number(x) -> Bounds:
+    """The bounds of a known array."""
+    x = np.asarray(x)
+    if x.dtype.kind not in "fiu" or not x.size or np.isnan(x).any():
+        return ALL
+    return float(x.min()), float(x.max())
+
+
+def bounds_of_result(equation, operands: Sequence[Bounds]) -> Bounds:
+    """The bounds of the first result of a primitive, from those of its operands."""
+    name = equation.primitive.name
+    if name in OF_RESULT:
+        return OF_RESULT[name]
+    if name in PASSES_BOUNDS:
+        return operands[0]
+    if name in JOINS_BOUNDS:
+        chosen = operands[1:] if name == "select_n" else operands
+        return min(low for low, _ in chosen), max(high for _, high in chosen)
+    if name == "integer_pow" and equation.params["y"] % 2 == 0:
+        return 0.0, math.inf
+    if name == "abs":
+        low, high = operands[0]
+        return (max(low, -high, 0.0), max(-low, high))
+    if name == "neg":
+        return -operands[0][1], -operands[0][0]
+    if name in ("add", "add_any", "sub"):
+        (a, b), (c, d) = operands[0], operands[1] if name != "sub" else (-operands[1][1], -operands[1][0])
+        return a + c, b + d
+    if name in ("mul", "div", "dot_general", "reduce_sum") and all(low >= 0 for low, _ in operands):
+        return 0.0, math.inf
+    if name == "mul" and equation.invars[0] is equation.invars[1]:
+        return 0.0, math.inf
+    if name in ("max", "min"):
+        of = max if name == "max" else min
+        return of(operands[0][0], operands[1][0]), of(operands[0][1], operands[1][1])
+    return ALL
 
 
 def judging(function: Callable) -> Callable:
@@ -163,7 +216,7 @@ class JumpOpening:
         if isinstance(value, np.ndarray | np.generic | float | int) and np.size(value) == 1:
             # A weak type does not tell one zero from another.
             number = self.table.number("number", float(np.ravel(value)[0]))
-            return KnownValue(value, number, frozenset(), of_number(value))
+            return KnownValue(value, number, frozenset(), bounds_of_number(value))
         # Held by the table's key: another object cannot get its address.
         return KnownValue(value, self.table.number("constant", _Held(value)), frozenset())
 
@@ -216,7 +269,7 @@ class JumpOpening:
             self.table.negative[self.table.number("result", 0, key)] = operands[0].number
         if depends and (name in COMPARISONS | OUTCOMES or name == "convert_element_type" and _to_whole(equation)):
             depends = frozenset({IN_TIME if depends <= {"t", IN_TIME} else OUTCOME})
-        bounds = of_result(equation, [x.bounds for x in operands])
+        bounds = bounds_of_result(equation, [x.bounds for x in operands])
         each = enumerate(results)
         return [KnownValue(y, self.table.number("result", i, key), depends, ALL if i else bounds) for i, y in each]
 

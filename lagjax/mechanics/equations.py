@@ -8,8 +8,6 @@ says what is wrong. The fast way is for small systems: their equations are also 
 A caller has an `Equations` and does not choose between them.
 """
 
-from functools import lru_cache
-
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
@@ -18,6 +16,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.fuse_cpu import kept_as_call
 from lagjax.jaxtools.tracing import WATCHED
@@ -163,16 +162,11 @@ def _written_for(model: Model) -> WrittenOut | None:
     leaves, structure = jtu.tree_flatten(model)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
     # In a watched motion a failed check of the user's becomes NaN in the equations.
-    key = structure, leaves, WATCHED.value
-    try:
-        hash(key)
-    except TypeError:
-        return _written.__wrapped__(*key)
-    return _written(*key)
+    return _written(structure, leaves, WATCHED.value)
 
 
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.
-@lru_cache(maxsize=64)
+@once
 def _written(structure, leaves, watched) -> WrittenOut | None:
     return write_out(jtu.tree_unflatten(structure, leaves))
 

@@ -27,7 +27,7 @@ Nothing here depends on values, so a plan holds at every state.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -38,6 +38,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.sparsity import pattern
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, slightly_off, vanishing
@@ -80,15 +81,11 @@ def plan(model: Model) -> Plan | None:
         return None
     leaves, structure = jtu.tree_flatten(model)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
-    try:
-        hash((structure, leaves))
-    except TypeError:
-        return _plan.__wrapped__(structure, leaves)
     return _plan(structure, leaves)
 
 
 # The equations are traced at several places of one program.
-@lru_cache(maxsize=64)
+@once
 def _plan(structure, leaves) -> Plan | None:
     model = jtu.tree_unflatten(structure, leaves)
     t, u = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))

@@ -9,13 +9,10 @@ from collections.abc import Callable, Sequence
 import jax
 
 from lagjax.display.progress import waiting
-from lagjax.jaxtools.cache import Recent
+from lagjax.jaxtools.cache import program_of
 from lagjax.jaxtools.jaxpr_identity import Meaning, content_of, meaning_of
 from lagjax.sweep.axes import Axes
 from lagjax.sweep.batch_program import Program, compiled, traced_point
-
-# The number of programs kept, the most recently used ones.
-PROGRAMS = Recent(32)
 
 
 def program_for(
@@ -43,4 +40,4 @@ def program_for(
     meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
     key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings
-    return PROGRAMS.made(key, make), seconds
+    return program_of(key, make), seconds

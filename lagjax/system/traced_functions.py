@@ -13,7 +13,6 @@ import dis
 import sys
 import types
 from collections.abc import Callable
-from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -23,7 +22,7 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jaxtyping import Array
 
-from lagjax.jaxtools.cache import Recent, is_array
+from lagjax.jaxtools.cache import FACTS, is_array, once
 from lagjax.jaxtools.jaxpr_identity import Itself, Meaning, meaning_of, rules_of, with_own_constants
 
 # Arrays of up to so many numbers, or of so many whole numbers (indices), that are read from outside are part of the
@@ -136,15 +135,11 @@ def traced(function: Callable, args: tuple, make: Callable[[], TracedProgram]) -
         return function
     names = names_outside(function) if signature.is_plain(args) else None
     new = lambda: _of_program(make())
-    return new() if names is None else _known.made((names, signature), new)
+    return new() if names is None else FACTS.made((names, signature), new)
 
 
 def _of_program(program):
     return Traced(program.arrays, program)
-
-
-# Functions that name nothing from outside that could change, by what they name.
-_known: Recent = Recent(256)
 
 
 class Signature:
@@ -161,10 +156,7 @@ class Signature:
 
     def is_plain(self, args) -> bool:
         """Whether arguments of this kind bring along no code of the user's."""
-        return _plain.made(self.kind, lambda: all(_is_plain(x) for x in args))
-
-
-_plain: Recent = Recent(256)
+        return FACTS.made((_is_plain, self.kind), lambda: all(_is_plain(x) for x in args))
 
 
 def signature_of(args: tuple) -> Signature:
@@ -229,7 +221,7 @@ def _finds_names(function, found) -> bool:
     return True
 
 
-@lru_cache(maxsize=1024)
+@once
 def _names_of(code) -> tuple[tuple[str, ...], bool]:
     """The names in a function's code, those of attributes included, and whether it may reach what has no name there."""
     names, opens = set(code.co_names), bool(OPENS_OUTSIDE.intersection(code.co_code[::2]))

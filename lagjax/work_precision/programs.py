@@ -16,8 +16,8 @@ from lagjax.integrate.integrate import integrate
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.harvest import reporting
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.cache import parted
-from lagjax.jaxtools.compiling import compiler_options
+from lagjax.jaxtools.cache import hashable_partition
+from lagjax.jaxtools.compiled import compiler_options
 from lagjax.jaxtools.tracing import REGULAR_FIRST
 from lagjax.system.coordinates import State
 from lagjax.system.system import System
@@ -77,14 +77,14 @@ class TimedProgram:
         start = self._motion.start
         ts = self._motion.ts if ts is None else ts
         given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
-        return [jnp.asarray(x) for x in parted((*given, start.params))[1]]
+        return [jnp.asarray(x) for x in hashable_partition((*given, start.params))[0]]
 
     def _compile(self, robust):
         motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
-        static, _ = parted(given)
+        _, static = hashable_partition(given)
 
         def solve(args):
-            tolerance, ts, q, v, params = static.together(args)
+            tolerance, ts, q, v, params = static.combine(args)
             # Decreasing times must be known at compile time.
             ts = motion.ts if runs_backward(motion.ts) else ts
             return integrate(

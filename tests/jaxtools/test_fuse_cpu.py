@@ -9,7 +9,16 @@ from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
 import lagjax.jaxtools.fuse_cpu as one_function_module
-from lagjax.jaxtools.fuse_cpu import calls_host, fits, one_function, without_checks, without_library
+from lagjax.jaxtools.fuse_cpu import (  # fmt: skip
+    ONE_KERNEL,
+    calls_host,
+    fits,
+    kept_as_call,
+    marked,
+    one_function,
+    without_checks,
+    without_library,
+)
 from lagjax.jaxtools.plain import is_plain
 
 pytestmark = [
@@ -215,3 +224,50 @@ def test_products_of_mixed_kinds():
         one = jax.jit(lambda x: one_function(lambda x: matrix @ x, x))(x)
         assert one.dtype == x.dtype
         np.testing.assert_allclose(one, np.asarray(matrix, float) @ x, rtol=1e-15)
+
+
+def branches(x):
+    """Branches in a row, none of them in a loop, since XLA may choose a loop by itself."""
+    for i in range(20):
+        x = jnp.sin(x) + lax.cond(x > i, lambda x: x, lambda x: 2 * x, x)
+    return x
+
+
+def kernels(function, folder):
+    """How many pieces of machine code XLA makes of a function of one number, and the compiled program."""
+    lowered = jax.jit(function).lower(jnp.asarray(2.0))
+    compiled = lowered.compile(compiler_options={"xla_dump_to": str(folder)})
+    return len(list(folder.glob("*.obj-file.*"))), compiled
+
+
+def test_one_kernel(tmp_path):
+    """A program compiled as one function is one kernel, with the same result; plainly compiled it is many."""
+    one, compiled = kernels(lambda x: one_function(branches, x), tmp_path / "one")
+    many, plain = kernels(branches, tmp_path / "many")
+    assert one == 1 and many > 10
+    np.testing.assert_allclose(compiled(jnp.asarray(2.0)), plain(jnp.asarray(2.0)), rtol=1e-14)
+
+
+@pytest.mark.parametrize("mark", ONE_KERNEL)
+def test_each_mark_is_needed(monkeypatch, tmp_path, mark):
+    """Twin: with either mark misspelt the same program is many kernels."""
+    misspelt = {f"{name}_" if name == mark else name: value for name, value in ONE_KERNEL.items()}
+    monkeypatch.setattr(one_function_module, "ONE_KERNEL", misspelt)
+    assert kernels(lambda x: one_function(branches, x), tmp_path)[0] > 10
+
+
+def test_a_call_stays_one():
+    """A marked call stays a call in the compiled program; twin: without the mark it is inlined."""
+
+    def twice(mark):
+        part = jax.jit(lambda x: (branches(x), x))
+        return lambda x: branches(mark(part(x))[0]) + mark(part(x + 1))[0]
+
+    calls = lambda mark: jax.jit(twice(mark)).lower(jnp.asarray(2.0)).compile().as_text().count(" call(")
+    assert calls(kept_as_call) == 2 and calls(lambda results: results) == 0
+
+
+def test_marks_reach_the_program():
+    """The attributes stand on the call in the program that XLA is given."""
+    text = jax.jit(lambda x: marked(jax.jit(jnp.sin)(x), ONE_KERNEL)).lower(1.0).as_text()
+    assert all(f'{name} = "{value}"' in text for name, value in ONE_KERNEL.items())

@@ -11,7 +11,7 @@ from jax import lax
 from jax.extend.core import Primitive
 
 from lagjax.jaxtools import fuse_cpu, jaxpr, scalarize, sparsity
-from lagjax.jaxtools.xla_marks import STAYS_A_CALL, marked
+from lagjax.jaxtools.fuse_cpu import STAYS_A_CALL, marked
 
 # From jax 0.11.1 on there are none of these.
 UP_TO_0_11_0 = {"closed_call"}

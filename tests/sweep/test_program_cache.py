@@ -10,7 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.display import progress as meter
 from lagjax.jaxtools import jaxpr_identity
-from lagjax.sweep import program_cache
+from lagjax.jaxtools.cache import PROGRAMS
 from tests.counting import compiles
 
 K, TABLE = 2.0, np.array([2.0, 7.0])
@@ -157,11 +157,11 @@ def test_a_run_that_draws_numbers():
 
 def test_a_limited_number_of_programs_is_kept(monkeypatch):
     """The most recently used programs stay, and serve a function that is written again."""
-    program_cache.PROGRAMS.clear()
-    monkeypatch.setattr(program_cache.PROGRAMS, "most", 3)
+    PROGRAMS.clear()
+    monkeypatch.setattr(PROGRAMS, "most", 3)
     for k in range(5):
         quiet(closing_over(float(k)), xs(3))
-    assert len(program_cache.PROGRAMS) == 3
+    assert len(PROGRAMS) == 3
     with compiles() as found:
         quiet(closing_over(4.0), xs(3))
     assert found == []

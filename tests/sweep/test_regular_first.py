@@ -12,6 +12,7 @@ from jax import lax
 import lagjax as lj
 from lagjax.fit.search.search import in_turn
 from lagjax.integrate.solve import harvest
+from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
 from lagjax.sweep import batch_program, program_cache
 from lagjax.sweep.axes import axes_of
@@ -65,7 +66,7 @@ def compiled(monkeypatch):
         return compiled(*args)
 
     monkeypatch.setattr(program_cache, "compiled", counted)
-    program_cache.PROGRAMS.clear()
+    PROGRAMS.clear()
     return count
 
 
@@ -74,9 +75,9 @@ def all_robust(monkeypatch):
     """Run sweeps with the robust program from the start."""
     with monkeypatch.context() as changed:
         changed.setattr(batch_program, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
-        program_cache.PROGRAMS.clear()
+        PROGRAMS.clear()
         yield
-    program_cache.PROGRAMS.clear()
+    PROGRAMS.clear()
 
 
 @pytest.mark.exhaustive
@@ -133,7 +134,7 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
     assert regular_alone(run)[2] is None and compiled["robust"] == 0
     monkeypatch.setattr(harvest, "_hides", lambda jaxpr: False)
-    program_cache.PROGRAMS.clear()
+    PROGRAMS.clear()
     np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
 
 
@@ -156,6 +157,11 @@ def test_derivatives(derivative, compiled):
     np.testing.assert_array_equal(np.isnan(regular_alone(run)[0]), BOTH["k"] < 1)
 
 
+def irregular_programs():
+    """The programs of sweeps in the cache that turned out not to be regular."""
+    return [x for x in PROGRAMS.values() if isinstance(x, batch_program.Program) and x.irregular.is_set()]
+
+
 @pytest.mark.exhaustive
 def test_many_chunks_and_workers(compiled):
     """All chunks share one robust program; after a mostly irregular chunk the first program is not called again."""
@@ -163,12 +169,12 @@ def test_many_chunks_and_workers(compiled):
     swept = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_allclose(swept.values, exact(many["k"]), rtol=1e-7)
     assert compiled == {"regular": 1, "robust": 1} and swept.compiling > 0
-    (program,) = [program for program in program_cache.PROGRAMS.values() if program.irregular.is_set()]
+    (program,) = irregular_programs()
     calls = Counter()
     remembered_program = program._replace(call=lambda *args: calls.update(["regular"]) or program.call(*args))
-    for key, kept in list(program_cache.PROGRAMS.items()):
+    for key, kept in list(PROGRAMS.items()):
         if kept is program:
-            program_cache.PROGRAMS[key] = remembered_program
+            PROGRAMS[key] = remembered_program
     again = quiet(first_coordinate, many, chunk=4, workers=4)
     np.testing.assert_array_equal(again.values, swept.values)
     assert again.compiling == 0 and not calls
@@ -194,11 +200,11 @@ def test_in_a_store(tmp_path, compiled):
     path, whole = tmp_path / "sweep", quiet(first_coordinate, chunk=3)
     half = quiet(first_coordinate, chunk=3, store=path, part=(0, 2))
     assert half.ran == 3 and half.ok.sum() == 3
-    assert any(program.irregular.is_set() for program in program_cache.PROGRAMS.values())
+    assert irregular_programs()
     done = quiet(first_coordinate, chunk=3, store=path, part=(1, 2))
     assert done.ran == 3 and done.ok.all()
     np.testing.assert_allclose(done.values, whole.values, rtol=1e-13)
-    program_cache.PROGRAMS.clear()
+    PROGRAMS.clear()
     assert quiet(first_coordinate, chunk=3, store=path).ran == 0
 
 

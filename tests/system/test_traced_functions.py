@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.jaxtools import cache as memory
-from lagjax.jaxtools import program_cache
+from lagjax.jaxtools import cache
 from lagjax.system import coordinates, traced_functions
 from lagjax.system.check_functions import traced_system
 from tests.counting import compiles
@@ -361,8 +360,8 @@ def wrong_answers(rng, histories):
 
 def forget():
     """Drop all programs and facts."""
-    for cache in (program_cache._programs, memory._facts, traced_functions._known):
-        cache.clear()
+    for kept in (cache.PROGRAMS, cache.FACTS):
+        kept.clear()
 
 
 def test_answers_of_random_histories():

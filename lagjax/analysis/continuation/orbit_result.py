@@ -19,7 +19,7 @@ from lagjax.analysis.continuation.result import (  # fmt: skip
 )
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.display import plots as plot
-from lagjax.jaxtools.packed import pack
+from lagjax.jaxtools.cache import hashable_partition
 from lagjax.system import coordinates
 
 MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4)}
@@ -83,7 +83,7 @@ class OrbitBranch(eqx.Module):
         system, params = self.orbit.system, self.orbit.params
         if self.place.kind == NUMBER and self.place.number is not None:
             params = self.place.number.put(params, self.parameter[i])
-        arrays, static = pack((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
+        arrays, static = hashable_partition((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
         return replace(
             self.orbit, q=pick(self.q), v=pick(self.v), period=self.period[i], nodes=self.nodes[i], arrays=arrays,
             static=static,

@@ -30,8 +30,8 @@ from lagjax.analysis.orbits.monodromy import OrbitProblem, problem_of, tolerance
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest, guessed
 from lagjax.analysis.params_by_name import no_such_number, numbers_in
+from lagjax.jaxtools.cache import hashable_partition
 from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.packed import pack
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.system import coordinates
 from lagjax.system.model import model_of
@@ -415,5 +415,5 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
 
 def _with_floats(orbit, problem) -> PeriodicOrbit:
     """The orbit with its parameters as floats, as the branch has them."""
-    arrays, static = pack((problem.system, coordinates.state(*problem.state).params))
+    arrays, static = hashable_partition((problem.system, coordinates.state(*problem.state).params))
     return replace(orbit, arrays=arrays, static=static)

@@ -18,7 +18,7 @@ from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest
 from lagjax.integrate.solve.harvest import Report, reported
 from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.jaxtools.packed import pack
+from lagjax.jaxtools.cache import hashable_partition
 from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.diagnosis import listed
@@ -213,7 +213,7 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     like = lambda x: coordinates.like(s.q, x)
     z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
     shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
-    arrays, static = pack((problem.system, coordinates.state(*s).params))
+    arrays, static = hashable_partition((problem.system, coordinates.state(*s).params))
     return PeriodicOrbit(
         xp.asarray(s.t), like(z[:n]), like(z[n:]), found.candidate.period, like(found.guess.turns),
         like(shift), found.evaluation.size, found.converged, found.iterations, found.candidate.nodes, arrays, static,

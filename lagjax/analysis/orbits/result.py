@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.analysis.orbits.shooting import OrbitRequest
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.packed import Packed
+from lagjax.jaxtools.cache import HashablePart
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.mechanics.diagnosis import describe
 from lagjax.system import coordinates
@@ -42,7 +42,7 @@ class PeriodicOrbit(eqx.Module):
     iterations: Int[Array, ""]
     nodes: Float[Array, "K 2n"]
     arrays: PyTree
-    static: Packed = eqx.field(static=True)
+    static: HashablePart = eqx.field(static=True)
     asked: OrbitRequest = eqx.field(static=True)
 
     @property
@@ -54,7 +54,7 @@ class PeriodicOrbit(eqx.Module):
         return self._problem()[1]
 
     def _problem(self):
-        return self.static.together(self.arrays)
+        return self.static.combine(self.arrays)
 
     @property
     def trajectory(self) -> Trajectory:

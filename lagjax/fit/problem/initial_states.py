@@ -12,7 +12,7 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (ta
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.fit.problem.records import Record, Windows, spread
 from lagjax.integrate.integrate import integrate
-from lagjax.jaxtools.cache import kinds
+from lagjax.jaxtools.cache import kinds, once
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.jaxtools.trees import stop_gradient
@@ -142,7 +142,7 @@ def _vector(tree):
     return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
-@lru_cache
+@once
 def unflatten_of(of_kinds) -> Callable:
     """The function that turns a vector into coordinates of these `kinds`."""
     structure, *arrays = of_kinds
@@ -230,7 +230,7 @@ def _parabola(t, x, samples):
     return tuple(xp.stack(part).reshape(shape) for part in (values, slopes))
 
 
-@lru_cache
+@once
 def _threes(count):
     """All choices of three among `count` samples."""
     return np.array(list(combinations(range(count), 3)))

@@ -25,10 +25,8 @@ from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed,
 from lagjax.integrate.solve.segments import solved_in_legs
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.trajectory.trajectory import SolveInfo, SolveOptions, Trajectory, pack
-from lagjax.jaxtools.cache import filled_up, parted
-from lagjax.jaxtools.compiling import compiler_options
-from lagjax.jaxtools.memory_maps import share_used
-from lagjax.jaxtools.program_cache import kept
+from lagjax.jaxtools.cache import filled_up, hashable_partition, program_of
+from lagjax.jaxtools.compiled import compiler_options
 from lagjax.jaxtools.tracing import is_eager, takes_for_regular
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
@@ -91,20 +89,18 @@ def trajectory_of(*problem) -> Trajectory:
     `jit` takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
     """
     if not is_eager():
-        # We are inside a program of the user's, which is not cached here.
-        share_used()
         return _inside(*problem)
     *motion, ts, guards, settings = problem
     # Whether compiling is announced does not change the program.
     shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
     # Padded with the last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
-    of = lambda settings: parted((*motion, many, guards, settings))
-    static, arrays = of(settings)
-    programs = kept((_Programs, static), lambda: _Programs(static, len(ts)))
+    of = lambda settings: hashable_partition((*motion, many, guards, settings))
+    arrays, static = of(settings)
+    programs = program_of((_Programs, static), lambda: _Programs(static, len(ts)))
     try:
         found = programs.run(arrays, len(ts), shown)
-        again = lambda closer: programs.run(of(closer)[1], len(ts), shown, settled=True)
+        again = lambda closer: programs.run(of(closer)[0], len(ts), shown, settled=True)
         return with_errors(again, found, settings, ts) if settings.repeated_up_to else found
     except jax.errors.JaxRuntimeError:
         return _trajectory_of(*problem)[0]
@@ -162,7 +158,7 @@ class _Programs:
 
 def _of_arrays(static, robust, count, arrays):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
-    *motion, settings = static.together(arrays)
+    *motion, settings = static.combine(arrays)
     settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
     found, settled = one_by_one(_trajectory)(*motion, settings)
     rows = found.rows()

@@ -20,9 +20,8 @@ from lagjax.integrate.trajectory.error_report import Errors, angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.save import save
 from lagjax.integrate.trajectory.to_xarray import dataset
-from lagjax.jaxtools import packed
+from lagjax.jaxtools.cache import HashablePart, hashable_partition
 from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.packed import Packed
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.jaxtools.without_lapack_batches import jitted
 from lagjax.mechanics.projection import worst_residual
@@ -75,7 +74,7 @@ class SolveOptions(NamedTuple):
 class StaticPart(NamedTuple):
     """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along."""
 
-    rest: Packed
+    rest: HashablePart
     how: SolveInfo
 
     @property
@@ -146,7 +145,7 @@ class Trajectory(eqx.Module):
         return self._problem()[2]
 
     def _problem(self):
-        return self.static.rest.together(self.arrays)
+        return self.static.rest.combine(self.arrays)
 
     def rows(self) -> dict:
         """The fields with one row per output, by name."""
@@ -341,7 +340,7 @@ def worst_drift(model, t, q, v):
 
 def pack(system, params, asked: SolveOptions, how: SolveInfo) -> tuple[PyTree, StaticPart]:
     """Split (system, params, asked) into arrays and a hashable rest."""
-    arrays, rest = packed.pack((system, params, asked))
+    arrays, rest = hashable_partition((system, params, asked))
     return arrays, StaticPart(rest, how)
 
 

@@ -4,23 +4,24 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from lagjax.jaxtools import compiling
-from lagjax.jaxtools.compiling import WITHOUT_EMITTERS, compiler_options
+from lagjax.jaxtools import compiled
+from lagjax.jaxtools.cache import FACTS
+from lagjax.jaxtools.compiled import WITHOUT_EMITTERS, compiler_options
 
 
 def test_unknown_options_are_left_out(monkeypatch):
     """An option that XLA does not know is not used; twin: a known one is, but not in plain mode."""
-    compiler_options.cache_clear()
+    FACTS.clear()
     known = compiler_options()
     assert known in (None, WITHOUT_EMITTERS) and jax.jit(jnp.sin, compiler_options=known)(0.0) == 0.0
-    compiler_options.cache_clear()
-    monkeypatch.setattr(compiling, "WITHOUT_EMITTERS", {"xla_cpu_no_such_option": False})
+    FACTS.clear()
+    monkeypatch.setattr(compiled, "WITHOUT_EMITTERS", {"xla_cpu_no_such_option": False})
     assert compiler_options() is None
-    compiler_options.cache_clear()
-    monkeypatch.setattr(compiling, "is_plain", lambda: True)
-    monkeypatch.setattr(compiling, "WITHOUT_EMITTERS", WITHOUT_EMITTERS)
+    FACTS.clear()
+    monkeypatch.setattr(compiled, "is_plain", lambda: True)
+    monkeypatch.setattr(compiled, "WITHOUT_EMITTERS", WITHOUT_EMITTERS)
     assert compiler_options() is None
-    compiler_options.cache_clear()
+    FACTS.clear()
 
 
 @pytest.mark.optimised

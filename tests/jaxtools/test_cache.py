@@ -1,0 +1,117 @@
+"""Programs of many systems in one process: only a limited number is kept, whatever they compute."""
+
+import copy
+import gc
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.jaxtools import cache
+from lagjax.jaxtools.compiled import compiled
+from tests.counting import compiles
+from tests.plain import not_plain
+
+MANY = 24
+MAPS = Path("/proc/self/maps")
+
+
+@eqx.filter_jit
+def inside(function, x):
+    """A part of a program whose traces JAX keeps."""
+    return function(x)
+
+
+@compiled
+def called(function, x):
+    """A compiled program that holds a function of the user's."""
+    return inside(function, x)
+
+
+def waves(number):
+    """A function unlike any other, with more than one kernel."""
+    return lambda x: jnp.cumsum(jnp.sin(x + number)) @ jnp.sort(jnp.cos(number * x))
+
+
+def maps():
+    """The number of memory maps of this process."""
+    gc.collect()
+    return MAPS.read_bytes().count(b"\n") if MAPS.exists() else 0
+
+
+def after_many(x):
+    """How many memory maps the later half of many functions adds, each called once."""
+    for number in range(MANY // 2):
+        called(waves(number), x)
+    before = maps()
+    for number in range(MANY // 2, MANY):
+        called(waves(number), x)
+    return maps() - before
+
+
+@not_plain
+@pytest.mark.skipif(not MAPS.exists(), reason="only Linux tells")
+def test_programs_are_bounded(monkeypatch):
+    """The memory of dropped programs is freed; the twin, which keeps all, needs more for each."""
+    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(64))
+    grown_at_all = after_many(np.ones(8))
+    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(5))
+    grown = after_many(np.ones(9))
+    assert len(cache.PROGRAMS) == 5 and grown_at_all > MANY / 2 and grown < grown_at_all / 3
+
+
+def test_traces_are_dropped_too(monkeypatch):
+    """JAX's caches are cleared after as many programs were dropped as is said, and not before."""
+    cleared = []
+    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(5))
+    monkeypatch.setattr(cache, "CLEAR_AFTER", 3)
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(number))
+    for number in range(12):
+        cache.program_of(number, object)
+    assert cleared == [7, 10]
+
+
+def test_the_last_ones_stay(monkeypatch):
+    """The programs used last are not compiled again after others were dropped; twin: one unused for long is."""
+    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(5))
+    x, functions = np.ones(10), [waves(number) for number in range(9)]
+    for function in functions:
+        called(functions[0], x)
+        called(function, x)
+    with compiles() as found:
+        called(functions[0], x)
+        called(functions[-1], x)
+    assert not found
+    with compiles() as found:
+        called(functions[1], x)
+    assert found
+
+
+@pytest.mark.parametrize("of", ["function", "argument"])
+def test_a_key_is_all_that_a_program_is_compiled_for(of):
+    """Other static arguments, or another function, give another program."""
+    other = compiled(lambda function, x: -function(x)) if of == "function" else called
+    one, two = waves(1), waves(1 if of == "function" else 2)
+    x = np.ones(4)
+    assert float(called(one, x)) != float(other(one if of == "function" else two, x))
+
+
+def test_what_has_no_hash_is_found_each_time():
+    """A result is remembered by its arguments; twin: for a list it is computed again."""
+    asked = []
+    ask = cache.once(lambda x: asked.append(x))
+    for argument in (2.0, 2.0, [2.0], [2.0]):
+        ask(argument)
+    assert asked == [2.0, [2.0], [2.0]]
+
+
+def test_a_tree_is_put_together_again():
+    """Arrays and the rest give the tree, with `None` where it was; the rest is a key, also after a copy."""
+    tree = {"a": np.ones(2), "b": None, "c": ("text", 3, np.float64(2.0))}
+    arrays, rest = cache.hashable_partition(tree)
+    again = copy.deepcopy(rest)
+    assert again == rest and hash(again) == hash(rest) and len(arrays) == 2
+    assert cache.same(again.combine(arrays), tree)
