@@ -150,8 +150,10 @@ def varies(x) -> bool:
 
 def shape_of(function: Callable, *args):
     """The shapes that a function returns for JAX or NumPy arrays; nothing is computed."""
-    shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, np.ndarray) else x
-    return eqx.filter_eval_shape(function, *jtu.tree_map(shaped, args))
+    return eqx.filter_eval_shape(
+        function,
+        *jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, np.ndarray) else x, args),
+    )
 
 
 def filled_up(count: int) -> int:

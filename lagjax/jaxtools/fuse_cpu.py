@@ -24,7 +24,7 @@ a result.
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -34,6 +34,7 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
 
 from lagjax.jaxtools.jaxpr import (
     ACCUMULATING,
@@ -185,7 +186,10 @@ def _poisoned(equation):
 
     def with_nan(*operands):
         fails = jnp.any(jnp.stack([jnp.any(operands[i]) for i in places]))
-        nan = lambda x: jnp.where(fails, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+
+        def nan(x: Array) -> Array:
+            return jnp.where(fails, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+
         return [nan(x) for x in unchecked(*operands)]
 
     if not places:
@@ -314,7 +318,10 @@ def _jvp(primitive, primals, tangents, *, jaxpr, checked, **params):
     shapes = [primal.aval.to_tangent_aval() for primal in jaxpr.jaxpr.outvars]
     if "lanes" in params:
         shapes = [aval.update(shape=(params["lanes"], *aval.shape)) for aval in shapes]
-    moves = lambda aval: aval.dtype != jax.dtypes.float0
+
+    def moves(aval: Any) -> bool:
+        return aval.dtype != jax.dtypes.float0
+
     return found[:count], [next(derivatives) if moves(aval) else ad.Zero(aval) for aval in shapes]
 
 

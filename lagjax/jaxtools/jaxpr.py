@@ -9,14 +9,14 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import wraps
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 
 # They work entry by entry, on numbers alone.
 ELEMENTWISE = {
@@ -190,8 +190,9 @@ def _alike(one, other):
 
 def _loop(jaxpr, chain):
     (x,), last = variables(chain[0]), chain[-1]
-    step = lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0]
-    looped = jax.jit(lambda value: lax.fori_loop(0, len(chain), step, value))
+    looped = jax.jit(
+        lambda value: lax.fori_loop(0, len(chain), lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0], value)
+    )
     (call,) = jax.make_jaxpr(looped)(x.aval).eqns
     return call.replace(invars=[x], outvars=last.outvars)
 
@@ -250,7 +251,10 @@ def interpreted(
     jaxpr = closed.jaxpr
     values = {x: of_constant(constant, x.aval) for x, constant in zip(jaxpr.constvars, closed.consts)}
     values.update(zip(jaxpr.invars, inputs))
-    read = lambda x: of_constant(x.val, x.aval) if isinstance(x, Literal) else values[x]
+
+    def read(x: Var | Literal) -> Any:
+        return of_constant(x.val, x.aval) if isinstance(x, Literal) else values[x]
+
     for equation in jaxpr.eqns:
         operands, inner = [read(x) for x in equation.invars], stands_for(equation)
         if inner is None or not (enters is None or enters(equation)):
@@ -313,7 +317,10 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     """
     jaxpr = program.jaxpr
     late = reached(jaxpr, (jaxpr.invars[i] for i in then))
-    is_known = lambda x: not isinstance(x, Literal) and x not in late
+
+    def is_known(x: Any) -> bool:
+        return not isinstance(x, Literal) and x not in late
+
     before = [e for e in jaxpr.eqns if not any(x in late for x in variables(e))]
     after = [e for e in jaxpr.eqns if any(x in late for x in variables(e))]
     crossing = dict.fromkeys(x for e in after for x in variables(e) if x not in late)

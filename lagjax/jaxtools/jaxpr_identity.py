@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import types
 from collections.abc import Callable, Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +125,10 @@ def _holds_constants(equation):
 
 def _in_line(jaxpr, constants, args):
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *args)))
-    read = lambda x: x.val if isinstance(x, Literal) else values[x]
+
+    def read(x: Any) -> Any:
+        return x.val if isinstance(x, Literal) else values[x]
+
     for equation in jaxpr.eqns:
         inner = equation.params.get("jaxpr")
         is_call = equation.primitive.name in ("jit", "pjit")

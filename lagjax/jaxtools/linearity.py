@@ -7,6 +7,7 @@ are taken: a force that bends where a multiplier changes its sign or with its si
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,10 @@ def _kinds(closed: ClosedJaxpr, given: list[int]) -> list[int]:
     """How each result of a program depends on its inputs: not, linearly, or in a way that does not show."""
     jaxpr = closed.jaxpr
     kinds = dict.fromkeys(jaxpr.constvars, CONSTANT) | dict(zip(jaxpr.invars, given))
-    read = lambda x: CONSTANT if isinstance(x, Literal) else kinds[x]
+
+    def read(x: Any) -> Any:
+        return CONSTANT if isinstance(x, Literal) else kinds[x]
+
     for equation in jaxpr.eqns:
         kinds.update(zip(equation.outvars, _of_equation(equation, [read(x) for x in equation.invars])))
     return [read(x) for x in jaxpr.outvars]
@@ -92,7 +96,10 @@ def _holds(function, zero, rest) -> bool:
     random, same, seen = np.random.default_rng(0), SAME[np.dtype(zero.dtype)], False
     for _ in range(STATES):
         state = jax.tree.map(lambda x: _made_up(x, random), rest)
-        at = lambda numbers, state=state: np.asarray(function(numbers, state), float)
+
+        def at(numbers: np.ndarray, state: Any = state) -> np.ndarray:
+            return np.asarray(function(numbers, state), float)
+
         start, slope = at(zero), np.asarray(jax.jacfwd(function)(zero, state), float)
         for size in SIZES:
             numbers = size * random.uniform(0.5, 2.0, zero.shape) * random.choice([-1.0, 1.0], zero.shape)

@@ -206,7 +206,10 @@ class JumpOpening:
         jaxpr = jaxpr.replace(eqns=needed(jaxpr))
         values = {x: self._constant(c) for x, c in zip(jaxpr.constvars, constants)}
         values.update(zip(jaxpr.invars, inputs))
-        read = lambda x: self._constant(written(x)) if isinstance(x, Literal) else values[x]
+
+        def read(x: Any) -> Any:
+            return self._constant(written(x)) if isinstance(x, Literal) else values[x]
+
         for equation in jaxpr.eqns:
             operands = [read(x) for x in equation.invars]
             values.update(zip(equation.outvars, self._results(jaxpr, equation, operands)))

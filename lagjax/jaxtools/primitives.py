@@ -1,13 +1,14 @@
 """Primitives of our own: operations with rules of their own for derivatives, batches and compilation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 
-__all__ = ["Primitive", "ad", "jaxpr_as_fun", "primitive"]
+__all__ = ["Primitive", "ad", "front", "jaxpr_as_fun", "linear_map_primitive", "primitive", "split"]
 
 
 def primitive(
@@ -42,3 +43,45 @@ def primitive(
         if rule is not None:
             rules[new] = rule
     return new
+
+
+def linear_map_primitive(
+    name: str,
+    along: Callable,
+    transpose: Callable,
+    shapes: Callable,
+    count: Callable,
+    *,
+    jvp: Callable,
+    batched: Callable,
+) -> Primitive:
+    """Define a linear map of directions at some points: a derivative that JAX can transpose.
+
+    **Arguments:** operands are the points, then `count(params)` directions. `along(points, directions, **params)` gives
+    the results; `transpose(points, directions, wanted, cotangents, **params)` one cotangent for each wanted direction,
+    in order, of which the abstract value stands among `directions`. The other rules are those of `primitive`.
+    """
+
+    def evaluate(*operands, **params):
+        return list(along(*split(operands, count(params)), **params))
+
+    def transposed(cotangents, *operands, **params):
+        points, directions = split(operands, count(params))
+        wanted = tuple(ad.is_undefined_primal(x) for x in directions)
+        like = [x.aval if w else x for x, w in zip(directions, wanted)]
+        found = iter(transpose(points, like, wanted, cotangents, **params))
+        return [None] * len(points) + [next(found) if w else None for w in wanted]
+
+    return primitive(name, evaluate, shapes, several=True, jvp=jvp, transpose=transposed, batched=batched)
+
+
+def split(operands: Sequence, count: int) -> tuple[tuple, tuple]:
+    """The points and the last `count` operands, which are directions at them."""
+    return tuple(operands[: len(operands) - count]), tuple(operands[len(operands) - count :])
+
+
+def front(operands: Sequence, axes: Sequence[int | None]) -> tuple[list, tuple[bool, ...], int]:
+    """The operands of a batch with its axis in front, which of them have it, and the number of lanes."""
+    lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
+    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
+    return moved, tuple(axis is not None for axis in axes), lanes

@@ -13,8 +13,9 @@ more than `LARGE` entries are left unchanged.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -232,7 +233,9 @@ def _arrays(x, y):
 
 
 def _converted(entries, dtype):
-    one = lambda x: x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
+    def one(x: Any) -> Any:
+        return x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
+
     return _filled(entries.shape, [x if x.dtype == dtype else one(x) for x in entries.reshape(-1)])
 
 
@@ -301,7 +304,10 @@ def _product(params, variables, x, y, drops_zeros):
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
-    sizes = lambda z, axes: int(np.prod([z.shape[i] for i in axes]))
+
+    def sizes(z: Any, axes: Sequence[int]) -> int:
+        return int(np.prod([z.shape[i] for i in axes]))
+
     # The operands may have other dtypes than the result: integers, or lower precision.
     x, y = (_converted(z, variables[0].aval.dtype) for z in (x, y))
     inner, batch = sizes(x, contract_x), sizes(x, batch_x)

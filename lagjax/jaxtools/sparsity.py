@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Bool
+from jaxtyping import Array, Bool
 
 from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
 
@@ -163,7 +163,10 @@ def _pad(arrays, params):
         shape = list(x.shape)
         shape[axis] = max(low, 0) + size + max(high, 0)
         wide = np.full(shape, np.asarray(fill).item(), x.dtype)
-        along = lambda s, axis=axis: (slice(None),) * axis + (s,)
+
+        def along(s: slice, axis: int = axis) -> tuple:
+            return (slice(None),) * axis + (s,)
+
         wide[along(slice(max(low, 0), max(low, 0) + size, interior + 1))] = x
         x = wide[along(slice(max(-low, 0), shape[axis] - max(-high, 0)))]
     return x
@@ -195,10 +198,11 @@ def _scatter(operands, params, equation):
     if indices.known is None:
         return [None]
     with jax.ensure_compile_time_eval():
-        add = lambda updates: lax.scatter_add(
-            jnp.zeros(onto.sets.shape, jnp.float32), jnp.asarray(indices.known), updates,
-            params["dimension_numbers"], mode=params["mode"],
-        )  # fmt: skip
+        zeros, places = jnp.zeros(onto.sets.shape, jnp.float32), jnp.asarray(indices.known)
+
+        def add(updates: Array) -> Array:
+            return lax.scatter_add(zeros, places, updates, params["dimension_numbers"], mode=params["mode"])
+
         like = jax.ShapeDtypeStruct(updates.sets.shape, jnp.float32)
         positions = jnp.arange(1, onto.sets.size + 1, dtype=jnp.float32).reshape(onto.sets.shape)
         (target,) = jax.linear_transpose(add, like)(positions)
@@ -222,12 +226,9 @@ def _dot_general(operands, params, equation):
     sides = []
     for x, c, b in zip(operands, contract, batch):
         free = [i for i in range(x.sets.ndim) if i not in (*c, *b)]
-        size = lambda axes, x=x: int(np.prod([x.sets.shape[i] for i in axes]))
-        to = lambda a, c=c, b=b, free=free, size=size: np.transpose(a, (*b, *c, *free)).reshape(
-            size(b), size(c), size(free)
-        )
+        sizes = [int(np.prod([x.sets.shape[i] for i in axes])) for axes in (b, c, free)]
         counts = np.ones(x.sets.shape, bool) if x.known is None else x.known != 0
-        sides.append((to(x.sets), to(counts)))
+        sides.append([np.transpose(a, (*b, *c, *free)).reshape(sizes) for a in (x.sets, counts)])
     (a, a_counts), (b, b_counts) = sides
     if a.size * b.shape[2] > TERMS:
         rows, columns = _union(a, (1,)), _union(b, (1,))
@@ -244,7 +245,9 @@ def _reduce(operands, params, equation):
 
 
 def _accumulate(operands, params, equation):
-    flip = lambda x: np.flip(x, params["axis"]) if params["reverse"] else x
+    def flip(x: np.ndarray) -> np.ndarray:
+        return np.flip(x, params["axis"]) if params["reverse"] else x
+
     return [SparseValue(flip(np.bitwise_or.accumulate(flip(operands[0].sets), axis=params["axis"])))]
 
 

@@ -32,8 +32,9 @@ def without_init(cls: type, fields: Mapping[str, Any]):
 
 def where(condition, a, b):
     """The arrays of `a` where the condition holds, else those of `b`, in the dtypes of these."""
-    pick = lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y
-    return jax.tree.map(pick, a, b)
+    return jax.tree.map(
+        lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y, a, b
+    )
 
 
 def like(mask, x):

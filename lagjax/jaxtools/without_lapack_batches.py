@@ -146,9 +146,8 @@ def _batched(operands, axes, *, of):
 
 def _jvp(primals, tangents, *, of):
     found, derivatives = _pushed(of, primals, [None if isinstance(t, ad.Zero) else t for t in tangents])
-    still = lambda d: d.dtype == jax.dtypes.float0
-    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
-    return found, [zero(x) if still(d) else d for x, d in zip(found, derivatives)]
+    pairs = zip(found, derivatives)
+    return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if d.dtype == jax.dtypes.float0 else d for x, d in pairs]
 
 
 def _pushed(function, primals, tangents):
@@ -190,12 +189,12 @@ def _transposed(cotangents, *operands, of):
 def _with_rewritten_derivative(equation):
     """A function with a derivative of its own, which JAX traces only when it takes it; that is rewritten then."""
     program = equation.params["call_jaxpr"]
-    original = lambda *operands: applied(program.jaxpr, equation, operands)
     function = jax.custom_jvp(lambda *operands: jaxpr_as_fun(without_batches(program))(*operands))
 
     @partial(function.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        return _pushed(original, primals, [None if isinstance(t, SymbolicZero) else t for t in tangents])
+        moving = [None if isinstance(t, SymbolicZero) else t for t in tangents]
+        return _pushed(lambda *operands: applied(program.jaxpr, equation, operands), primals, moving)
 
     like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
     (call,) = jax.make_jaxpr(lambda *x: function(*x))(*like).eqns
@@ -205,20 +204,24 @@ def _with_rewritten_derivative(equation):
 def _with_rewritten_way_back(equation):
     """A function with a backward pass of its own, which may call LAPACK though the function does not."""
     program = equation.params["call_jaxpr"]
-    original = lambda *operands: applied(program.jaxpr, equation, operands)
-    primal = lambda *operands: jaxpr_as_fun(without_batches(program))(*operands)
+
+    def primal(*operands):
+        return jaxpr_as_fun(without_batches(program))(*operands)
+
     primal.__name__ = WITH_WAY_BACK
     function = jax.custom_vjp(jax.jit(primal))
 
     def forward(*primals):
-        # What does not vary is kept still inside: the rule of the user's may depend on it.
-        still = lambda x, primal: x if primal.perturbed else lax.stop_gradient(x)
-        of_varying = lambda *operands: original(*map(still, operands, primals))
+        def of_varying(*operands):
+            # What does not vary is kept still inside: the rule of the user's may depend on it.
+            operands = [x if p.perturbed else lax.stop_gradient(x) for x, p in zip(operands, primals)]
+            return applied(program.jaxpr, equation, operands)
+
         return one_by_one(partial(jax.vjp, of_varying))(*(primal.value for primal in primals))
 
     def backward(way_back, slopes):
-        zero = lambda x: np.zeros(x.shape, x.dtype) if x.dtype == jax.dtypes.float0 else jnp.zeros(x.shape, x.dtype)
-        slopes = [zero(x) if isinstance(x, SymbolicZero) else x for x in slopes]
+        zeros = [np if x.dtype == jax.dtypes.float0 else jnp for x in slopes]
+        slopes = [xp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x for x, xp in zip(slopes, zeros)]
         return one_by_one(lambda way_back, slopes: way_back(slopes))(way_back, slopes)
 
     function.defvjp(forward, backward, symbolic_zeros=True)

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array
 
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced
@@ -145,8 +146,7 @@ def _consistent_state(model, s, free, free_velocity):
     x, live = x0, (model, t)
     if model.holonomic.any():
         x = _nearest(lambda problem, x: constraints.position_residual(*problem, x), live, x0, metric, free)
-    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
-    u = _nearest(velocity_residual, (*live, x), u0, metric, free_velocity)
+    u = _nearest(lambda problem, u: constraints.velocity_residual(*problem, u), (*live, x), u0, metric, free_velocity)
     q, v, tolerance = model.tree(x), model.tree(u), _round_off(t)
     return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
 
@@ -160,7 +160,10 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     def rows_at(problem, y):
         rows = jax.jacfwd(lambda y: residual(problem, y))(y)
         left = jnp.where(free[None, :], rows, 0.0)
-        size = lambda rows: jnp.max(jnp.abs(lax.stop_gradient(rows)), axis=1)
+
+        def size(rows: Array) -> Array:
+            return jnp.max(jnp.abs(lax.stop_gradient(rows)), axis=1)
+
         return jnp.where((size(left) > DEPENDENT_BELOW[np.dtype(y0.dtype)] * size(rows))[:, None], left, 0.0)
 
     def usable_rows(rows, dependent_below=None):
@@ -176,9 +179,9 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         return to_displacement(y, dependent_below) @ r
 
     slope = jnp.sum(jnp.abs(rows_at(fixed, start)), axis=1)
-    distance = lambda r: largest(r / jnp.where(slope > 0, slope, 1.0))
     of_y = partial(residual, fixed)
-    reached = newton(of_y, shortest_step, start, TO_REACH, size=distance, fractions=FRACTIONS)
+    slope = jnp.where(slope > 0, slope, 1.0)
+    reached = newton(of_y, shortest_step, start, TO_REACH, size=lambda r: largest(r / slope), fractions=FRACTIONS)
 
     def newton_matrix(y, multipliers):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
@@ -203,8 +206,10 @@ def _nearest(residual: Callable, problem, y0, metric, free):
             step = dense.solve(newton_matrix(y, multipliers), left)
             return step.at[n:].set(jnp.where(independent, step[n:], multipliers))
 
-        at_target = lambda state: equations(fixed, fixed_metric, target, state[:n], state[n:])
-        return newton(at_target, step, state, PER_STAGE), None
+        def left_at(state: Array) -> Array:
+            return equations(fixed, fixed_metric, target, state[:n], state[n:])
+
+        return newton(left_at, step, state, PER_STAGE), None
 
     zero = jnp.zeros_like(residual(fixed, start))
     shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
@@ -219,7 +224,10 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
     back = lax.stop_gradient(to_displacement(reached))
     near = last_step(reached, y0, lambda y: back @ residual(problem, y))
-    length = lambda y: (y - start) @ fixed_metric @ (y - start)
+
+    def length(y: Array) -> Array:
+        return (y - start) @ fixed_metric @ (y - start)
+
     off = jnp.max(jnp.abs(residual(fixed, nearest)))
     kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
     return jnp.where(kept, nearest, near)

@@ -89,8 +89,9 @@ class Equations(eqx.Module):
         fast = a, self.model.split(stacked)
         if not self.written.may_fail:
             return fast
-        robustly = lambda: _solution_or_nan(self.form, self.model, t, q, v)
-        return lax.cond(eqxi.unvmap_all(all_finite(a)), lambda: fast, robustly)
+        return lax.cond(
+            eqxi.unvmap_all(all_finite(a)), lambda: fast, lambda: _solution_or_nan(self.form, self.model, t, q, v)
+        )
 
     def verdict(self, t, q, v) -> Verdict:
         """Solve the equations at one state, and say whether the solution is valid."""

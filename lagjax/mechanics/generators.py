@@ -11,12 +11,13 @@ tried: coordinates that are not positions simply have no such symmetry.
 import numbers
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from lagjax.jaxtools.cache import shape_of
 from lagjax.jaxtools.tracing import is_traced
@@ -128,9 +129,15 @@ class Generator(eqx.Module):
 
     def at(self, t, q, params):
         """ξ (like q), τ and F at one time and position, in the dtype of the coordinates."""
-        like = lambda x, y: jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
+
+        def like(x: Array, y: Any) -> Array:
+            return jnp.broadcast_to(jnp.asarray(y, x.dtype), x.shape)
+
         xi = jtu.tree_map(jnp.zeros_like, q) if self.delta is None else jtu.tree_map(like, q, self.delta(t, q, params))
-        number = lambda f: jnp.zeros_like(t) if f is None else like(t, f(t, q, params))
+
+        def number(f: Callable | None) -> Array:
+            return jnp.zeros_like(t) if f is None else like(t, f(t, q, params))
+
         return xi, number(self.time), number(self.gauge)
 
     def check(self, s: coordinates.State):

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools.compiled import compiled
 from lagjax.mechanics.accelerations import accelerations_at
@@ -111,9 +111,13 @@ class GeneratorFlow(NamedTuple):
 
 def flow(generator: Generator, t, q, v, params) -> GeneratorFlow:
     """A generator and its total derivatives at one state."""
-    at = lambda t, q: generator.at(t, q, params)
-    (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
-    vector = lambda y: coordinates.flatten(y)[0]
+    (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(
+        lambda t, q: generator.at(t, q, params), (t, q), (jnp.ones_like(t), v)
+    )
+
+    def vector(y: PyTree) -> Array:
+        return coordinates.flatten(y)[0]
+
     return GeneratorFlow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
 
 

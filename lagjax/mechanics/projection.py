@@ -62,11 +62,17 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
     live, holonomic = (model, t), model.holonomic
     fixed = stop_gradient(live)
-    position_residual = lambda problem, x: constraints.position_residual(*problem, x)
+
+    def position_residual(problem: tuple, x: Array) -> Array:
+        return constraints.position_residual(*problem, x)
+
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
         x = _newton(position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
-    velocity_residual = lambda problem, u: constraints.velocity_residual(*problem, u)
+
+    def velocity_residual(problem: tuple, u: Array) -> Array:
+        return constraints.velocity_residual(*problem, u)
+
     u = _newton(velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
     left = jnp.concatenate([position_residual(fixed, x), velocity_residual((*fixed, x), u)])
     allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])

@@ -157,8 +157,12 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
 
 def _solved(linear: LinearEquation, jacobian, gamma, independent) -> Reactions:
     """The solution where the force may depend on the multipliers."""
-    solve = lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent)
-    return with_reactions(solve, linear.forcing, gamma, linear.response)
+    return with_reactions(
+        lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent),
+        linear.forcing,
+        gamma,
+        linear.response,
+    )
 
 
 def saddle_point_matrix(mass, jacobian, independent):
@@ -171,7 +175,10 @@ def saddle_point_matrix(mass, jacobian, independent):
 
 def _scaled_matrix(mass, jacobian, independent):
     """The saddle-point matrix with M and A each divided by its largest entry, to judge whether it is singular."""
-    scaled = lambda x: x / jnp.where(jnp.any(x != 0), jnp.max(jnp.abs(x), initial=0.0), 1.0)
+
+    def scaled(x: Array) -> Array:
+        return x / jnp.where(jnp.any(x != 0), jnp.max(jnp.abs(x), initial=0.0), 1.0)
+
     return saddle_point_matrix(scaled(mass), scaled(jacobian), independent)
 
 
@@ -300,7 +307,10 @@ def _without_vanishing(model, t, x, u):
     if not rows.gamma.size:
         return rows
     nearby = constraints.jacobian(model, t, *map(slightly_off, (x, u)))
-    size = lambda rows: jnp.max(jnp.abs(rows), axis=1)
+
+    def size(rows: Array) -> Array:
+        return jnp.max(jnp.abs(rows), axis=1)
+
     vanishes = vanishing(size(rows.jacobian), size(nearby))
     return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))
 

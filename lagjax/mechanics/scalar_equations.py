@@ -15,7 +15,7 @@ Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (wi
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,7 +57,10 @@ class WrittenOut(NamedTuple):
 
     def prepare(self, model: Model) -> tuple[tuple | None, tuple | None]:
         """The parts that do not depend on the state, of the equations and of the return to the constraints."""
-        prepare = lambda numbers: None if numbers is None else numbers.prepare(model)
+
+        def prepare(numbers: Any) -> Any:
+            return None if numbers is None else numbers.prepare(model)
+
         return prepare(self.equations), prepare(self.project)
 
 
@@ -119,5 +122,7 @@ def _projected(model: Model, t, q, v):
 
 
 def _tiny(correction, y) -> Array:
-    norm = lambda z: jnp.sum(jnp.abs(z))
+    def norm(z: Array) -> Array:
+        return jnp.sum(jnp.abs(z))
+
     return norm(correction) <= SMALL_CORRECTION * norm(y) + 1e-300

@@ -42,16 +42,19 @@ class InNumbers(eqx.Module):
     def __call__(self, t, *states_and_params):
         *states, params = states_and_params
         # Multipliers come by name, and pass unchanged.
-        together = lambda state: self.form.tree(jnp.stack(state)) if isinstance(state, tuple) else state
-        result = self.function(t, *map(together, states), params)
+        states = [self.form.tree(jnp.stack(state)) if isinstance(state, tuple) else state for state in states]
+        result = self.function(t, *states, params)
         return coordinates.numbers(result) if self.returns_coordinates else result
 
 
 def in_numbers(model: Model) -> Model:
     """The same system, with a tuple of numbers for q and for v."""
-    change = lambda function, role: InNumbers(function, model.form, returns_coordinates=role == "force")
     structure = jtu.tree_structure((0,) * model.n)
     form = model.form._replace(structure=structure, shapes=((),) * model.n)
+
+    def change(function: Callable, role: str) -> InNumbers:
+        return InNumbers(function, model.form, returns_coordinates=role == "force")
+
     return unchecked(model.system.map(change), model.params, form)
 
 

@@ -205,7 +205,10 @@ class Banded(NamedTuple):
             push, pull, rate = _rows(*state)
             known.append(rate)
             kept = _independent(plan, push, pull, x.dtype)
-            at = lambda x, u: self.row_sizes(model, t, x, u, jnp.max)
+
+            def at(x: Array, u: Array) -> Array:
+                return self.row_sizes(model, t, x, u, jnp.max)
+
             vanishes = vanishing(at(x, u), at(*map(slightly_off, (x, u))))
             operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
             singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
@@ -286,7 +289,10 @@ def _schur(plan, operators, dtype):
     _, mass_inverse, _, push, pull, kept = operators
     rows = plan.band.order.rows
     back = np.argsort(rows)
-    product = lambda multipliers: push(mass_inverse(pull(multipliers)))
+
+    def product(multipliers: Array) -> Array:
+        return push(mass_inverse(pull(multipliers)))
+
     invert = banded.solver(banded.keep(banded.entries(product, plan.band, dtype), kept[rows]))
 
     def of_kept(multipliers):
@@ -361,10 +367,11 @@ def _shortest(plan, push, pull, multipliers):
     gram = lax.stop_gradient(_gram(plan, push, pull, dtype))
     shift = NULL_SHIFT[np.dtype(dtype)] * jnp.max(gram[:, 0])
     invert = banded.solver(gram.at[:, 0].add(shift))
-    solve = lambda _, r: invert(r[rows])[back]
 
     def smaller(x, _):
-        return lax.custom_linear_solve(lambda y: push(pull(y)) + shift * y, shift * x, solve, symmetric=True), None
+        return lax.custom_linear_solve(
+            lambda y: push(pull(y)) + shift * y, shift * x, lambda _, r: invert(r[rows])[back], symmetric=True
+        ), None
 
     def outside(x, _):
         in_null_space, _ = lax.scan(smaller, x, length=NULL_POWER)

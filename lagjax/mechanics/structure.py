@@ -23,12 +23,12 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.cache import varies
 from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC, Literal, depends, interpreted
 from lagjax.jaxtools.scalarize import TooLong
-from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import force_with_ones
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
 from lagjax.numerics.linalg import banded
@@ -121,8 +121,7 @@ def _unseen_leaves(model: Model):
     """The same, for whole leaves of q."""
     unseen = []
     for i, shape in enumerate(model.form.shapes):
-        at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
-        kinds = {_dependence(f, model, at) for f in functions_of(model)}
+        kinds = {_dependence(f, model, lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in functions_of(model)}
         unseen += [kinds == {Depends.NOT}] * int(np.prod(shape))
     return np.array(unseen)
 
@@ -143,7 +142,10 @@ def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
     if model.m:
         return False
-    equations = lambda t, q, v, params: mass_and_forcing(model.of(params), t, *model.vectors(q, v))
+
+    def equations(t: Array, q: PyTree, v: PyTree, params: PyTree) -> LinearEquation:
+        return mass_and_forcing(model.of(params), t, *model.vectors(q, v))
+
     return _dependence_on_any(equations, model, lambda args: jtu.tree_leaves(args[2])) == Depends.NOT
 
 
@@ -194,8 +196,7 @@ def angles(model: Model) -> PyTree[bool]:
     """Which leaves of q are angles, in the structure of q."""
     found = []
     for i in range(len(model.form.shapes)):
-        at = lambda args, i=i: jtu.tree_leaves(args[1])[i]
-        kinds = {_dependence(f, model, at) for f in functions_of(model)}
+        kinds = {_dependence(f, model, lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in functions_of(model)}
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
     return jtu.tree_unflatten(model.form.structure, found)
 

@@ -271,7 +271,10 @@ def differentiable(residual: Callable, root: Root) -> Float[Array, " n"]:
     follow its nearest member.
     """
     y, jacobian = lax.stop_gradient((root.y, root.jacobian))
-    size = lambda axis: jnp.where((s := jnp.max(jnp.abs(jacobian), axis=axis)) > 0, s, 1.0)
+
+    def size(axis: int) -> Array:
+        return jnp.where((s := jnp.max(jnp.abs(jacobian), axis=axis)) > 0, s, 1.0)
+
     rows = size(1)
     columns = jnp.where((s := jnp.max(jnp.abs(jacobian / rows[:, None]), axis=0)) > 0, s, 1.0)
     inverted = jnp.linalg.pinv(jacobian / rows[:, None] / columns[None, :], rtol=zero_below(y.dtype))

@@ -51,7 +51,10 @@ def nodes(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def integrals(values: np.ndarray, a: np.ndarray, b: np.ndarray) -> Integrals:
     """The integrals of functions (m, 15, k) over the intervals from a to b."""
     half = 0.5 * (b - a)[:, None]
-    rule = lambda weights, f: half * np.einsum("j,mjk->mk", weights, f)
+
+    def rule(weights: np.ndarray, f: np.ndarray) -> np.ndarray:
+        return half * np.einsum("j,mjk->mk", weights, f)
+
     found, coarse = rule(KRONROD, values), rule(GAUSS, values)
     mean = 0.5 * np.einsum("j,mjk->mk", KRONROD, values)
     varies = np.abs(rule(KRONROD, np.abs(values - mean[:, None, :])))

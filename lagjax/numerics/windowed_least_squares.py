@@ -59,7 +59,10 @@ class Slopes(NamedTuple):
 
     def sizes(self) -> Unknowns:
         """The norm of the slopes with respect to each unknown."""
-        squares = lambda blocks: jnp.sum(blocks**2, axis=1)
+
+        def squares(blocks: Array) -> Array:
+            return jnp.sum(blocks**2, axis=1)
+
         shared = jnp.sum(squares(self.rows_by_shared) + squares(self.seams_by_shared), axis=0)
         shared = shared + jnp.sum(self.shared**2, axis=0)
         # The unknowns of a window also enter the seam before it.
@@ -81,8 +84,7 @@ class Slopes(NamedTuple):
 
 def filled(sizes: Unknowns) -> Unknowns:
     """Sizes in which zeros are replaced by the largest size, so that undetermined unknowns are damped and stay put."""
-    fill = lambda size: jnp.where(size > 0, size, jnp.maximum(jnp.max(size, initial=0.0), 1.0))
-    return jax.tree.map(fill, sizes)
+    return jax.tree.map(lambda size: jnp.where(size > 0, size, jnp.maximum(jnp.max(size, initial=0.0), 1.0)), sizes)
 
 
 def _each(blocks, vectors):
@@ -104,11 +106,17 @@ def _slopes(along: WindowedEquations, u: Unknowns) -> Slopes:
     """The slopes from the derivatives along `_directions(u)`, which are the leading axis."""
     (p,), (windows, k) = u.shared.shape, u.local.shape
     by_shared, by_local = (jax.tree.map(lambda x: x[part], along) for part in (slice(None, p), slice(p, None)))
-    last = lambda x: jnp.moveaxis(x, 0, -1)
+
+    def last(x: Array) -> Array:
+        return jnp.moveaxis(x, 0, -1)
+
     w, parities = jnp.arange(windows), min(windows, 2)
     # Axes: parity, k, windows, equations.
     rows, seams = (x.reshape(parities, k, *x.shape[1:]) for x in (by_local.rows, by_local.seams))
-    chosen = lambda x, parity: jnp.moveaxis(x, 1, -1)[parity % parities, w]
+
+    def chosen(x: Array, parity: Array) -> Array:
+        return jnp.moveaxis(x, 1, -1)[parity % parities, w]
+
     return Slopes(
         last(by_shared.rows),
         chosen(rows, w),

@@ -40,7 +40,10 @@ def traced_system(system: System, s: State) -> System:
     """
     check_system(system)
     given = dict(zip(OF_STATE, s))
-    energy = lambda role, f: None if f is None else traced_call(Call(role, f, OF_STATE), given, _check_energy)
+
+    def energy(role: str, f: Callable | None) -> Any:
+        return None if f is None else traced_call(Call(role, f, OF_STATE), given, _check_energy)
+
     lagrangian, dissipation = energy("L", system.lagrangian), energy("dissipation", system.dissipation)
     constraints = {}
     for name, c in system.constraints.items():

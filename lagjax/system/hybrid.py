@@ -250,7 +250,10 @@ class Hybrid(eqx.Module):
     @property
     def targets(self) -> np.ndarray:
         """For each switch the numbers of the next phase and of the phase of rest (the next one if it has none)."""
-        number = lambda name, other: self.names.index(other if name is None else name)
+
+        def number(name: str | None, other: str) -> int:
+            return self.names.index(other if name is None else name)
+
         return np.array([[number(s.to, s.to), number(s.rest, s.to)] for s in self.switches], np.int32)
 
     def __repr__(self):

@@ -76,7 +76,10 @@ class Model(eqx.Module):
     @property
     def equation_names(self) -> list[str]:
         """The name of each constraint equation, in the order in which they are stacked."""
-        places = lambda residual: [f"[{i}]" for i in range(residual.size)] if residual.shape else [""]
+
+        def places(residual: Any) -> list[str]:
+            return [f"[{i}]" for i in range(residual.size)] if residual.shape else [""]
+
         return [residual.name + place for residual in self.form.residuals for place in places(residual)]
 
     @property

@@ -90,7 +90,9 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 @partial(compiled, in_numpy=True)
 def _signature(system, t, q, v, params):
     s, found = State(t, q, v, params), {}
-    flat = lambda *trees: jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
+
+    def flat(*trees: PyTree) -> Array:
+        return jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
 
     def values_and_slopes(function, *args, slopes):
         return flat(function(*args), jax.jacfwd(function, argnums=slopes)(*args))
@@ -111,7 +113,10 @@ def _signature(system, t, q, v, params):
 def middle_state(t, q, v, params) -> State:
     """A state in the middle of a motion, among the finite ones; for a batch, of the first lane."""
     first = (0,) * (np.ndim(t) - 1)
-    one = lambda x: np.asarray(x)[first]
+
+    def one(x: Any) -> np.ndarray:
+        return np.asarray(x)[first]
+
     t, q, v = jax.tree.map(one, (t, q, v))
     params = jax.tree.map(lambda x: one(x) if first and isinstance(x, (jax.Array, np.ndarray)) else x, params)
     known = np.all([np.isfinite(x.reshape(len(t), -1)).all(axis=1) for x in jax.tree.leaves((q, v))], axis=0)

@@ -11,7 +11,7 @@ import pickle
 import sys
 from collections.abc import Callable, Mapping
 from types import FrameType, FunctionType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -154,7 +154,10 @@ class System(eqx.Module):
 
         Roles: "lagrangian", "force", "dissipation", and those of constraints, "g" and "phi".
         """
-        change_if = lambda function, role: None if function is None else change(function, role)
+
+        def change_if(function: Callable | None, role: str) -> Any:
+            return None if function is None else change(function, role)
+
         return unchecked(
             change(self.lagrangian, "lagrangian"),
             {name: type(c)(change(c.function, c.role)) for name, c in self.constraints.items()},
@@ -217,7 +220,10 @@ class System(eqx.Module):
 
 def untraced(tree):
     """A system with the user's functions in place of their jaxprs."""
-    traced = lambda x: isinstance(x, Traced)
+
+    def traced(x: Any) -> bool:
+        return isinstance(x, Traced)
+
     return jax.tree.map(lambda x: x.function if traced(x) else x, tree, is_leaf=traced)
 
 

@@ -134,7 +134,10 @@ def traced(function: Callable, args: tuple, make: Callable[[], TracedProgram]) -
     if isinstance(function, Traced) and function.program.signature == signature:
         return function
     names = names_outside(function) if signature.is_plain(args) else None
-    new = lambda: _of_program(make())
+
+    def new() -> Traced:
+        return _of_program(make())
+
     return new() if names is None else FACTS.made((names, signature), new)
 
 

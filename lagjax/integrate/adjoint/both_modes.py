@@ -34,7 +34,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.adjoint.second_order import Push, pull, turned
-from lagjax.jaxtools.primitives import ad, jaxpr_as_fun, primitive
+from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
 from lagjax.jaxtools.trees import stop_gradient
 
 # Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
@@ -147,11 +147,10 @@ def _solved_jvp(primals, tangents, *, program, rules):
 
 
 def _solved_batched(operands, axes, *, program, rules):
-    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
-    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    axes = [None if axis is None else 0 for axis in axes]
-    lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*front)
-    found = _solve_p.bind(*front, program=lanes, rules=rules.in_lanes(axes, count))
+    operands, batched, count = front(operands, axes)
+    axes = [0 if b else None for b in batched]
+    lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*operands)
+    found = _solve_p.bind(*operands, program=lanes, rules=rules.in_lanes(axes, count))
     return found, [0] * len(found)
 
 
@@ -173,8 +172,8 @@ def _split(operands, size):
     return tuple(operands[:size]), tuple(operands[size:-size]), tuple(operands[-size:])
 
 
-def _tangent(*operands, outputs, shapes, size, many):
-    x, fixed, dx = _split(operands, size)
+def _tangent(points, dx, *, outputs, shapes, size, many):
+    x, fixed = points[:size], points[size:]
     along = lambda dx: jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
     return jax.vmap(along)(dx) if many else along(dx)
 
@@ -188,7 +187,7 @@ def _tangent_jvp(primals, tangents, **params):
     x, fixed, dx = _split(primals, params["size"])
     values = _tangent_p.bind(*primals, **params)
     if _are_few(x):
-        return _linear(partial(_tangent, **params), primals, tangents, values)
+        return _linear(lambda *x: _tangent(*split(x, params["size"]), **params), primals, tangents, values)
     push = partial(turned, Push(len(x), params["outputs"]), shapes=params["shapes"])
     if not params["many"]:
         return values, push(primals, tangents)
@@ -225,8 +224,8 @@ def _linear(function, points, tangents, values):
     return values, derivative
 
 
-def _pushed(*operands, along, size):
-    return along(*operands)
+def _pushed(points, directions, *, along, size):
+    return along(*points, *directions)
 
 
 def _pushed_shapes(*operands, along, size):
@@ -238,23 +237,15 @@ def _pushed_jvp(primals, tangents, *, along, size):
     return _linear(along, primals, tangents, _pushed_p.bind(*primals, along=along, size=size))
 
 
-def _pushed_transpose(cotangents, *operands, along, size):
-    points, directions = operands[:-size], operands[-size:]
-    wanted = [ad.is_undefined_primal(direction) for direction in directions]
-    like = [direction.aval if w else direction for direction, w in zip(directions, wanted)]
+def _pushed_transpose(points, like, wanted, cotangents, *, along, size):
     push = lambda *axes: jax.vmap(lambda *axes: along(*points, *axes))(*axes)
-    slopes = _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
-    found = iter(slopes)
-    return [None] * len(points) + [next(found) if w else None for w in wanted]
+    return _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
 
 
 def _pushed_batched(operands, axes, *, along, size):
-    lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
-    front = [
-        jnp.broadcast_to(x, (lanes, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(operands, axes)
-    ]
-    found = _pushed_p.bind(*front, along=jax.vmap(along), size=size)
+    operands, batched, lanes = front(operands, axes)
+    operands = [x if b else jnp.broadcast_to(x, (lanes, *x.shape)) for x, b in zip(operands, batched)]
+    found = _pushed_p.bind(*operands, along=jax.vmap(along), size=size)
     return found, [0] * len(found)
 
 
@@ -276,9 +267,8 @@ def _along_axes(like, wanted, push, cotangents):
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, like, wanted) if w]
 
 
-def _tangent_transpose(cotangents, *operands, outputs, shapes, size, many):
-    x, fixed, dx = _split(operands, size)
-    wanted = tuple(ad.is_undefined_primal(tangent) for tangent in dx)
+def _tangent_transpose(points, dx, wanted, cotangents, *, outputs, shapes, size, many):
+    x, fixed = points[:size], points[size:]
     if _are_few(a for a, w in zip(x, wanted) if w):
         params = dict(outputs=outputs, shapes=shapes, size=size)
         cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
@@ -287,8 +277,7 @@ def _tangent_transpose(cotangents, *operands, outputs, shapes, size, many):
         nonzero = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
         cotangents = tuple(ct for ct, n in zip(cotangents, nonzero) if n)
         along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, nonzero), outputs=outputs)
-    found = iter(jax.vmap(along)(cotangents) if many else along(cotangents))
-    return [None] * (len(operands) - size) + [next(found) if w else None for w in wanted]
+    return jax.vmap(along)(cotangents) if many else along(cotangents)
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
@@ -298,10 +287,9 @@ def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
 
 
 def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
-    lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
-    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    x, fixed, dx = _split(front, size)
-    batched_x, batched_fixed, batched_dx = _split([axis is not None for axis in axes], size)
+    operands, batched, lanes = front(operands, axes)
+    x, fixed, dx = _split(operands, size)
+    batched_x, batched_fixed, batched_dx = _split(batched, size)
     widen = lambda leaves, have: [
         leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)
     ]
@@ -342,11 +330,11 @@ def _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params):
 _solve_p = primitive(
     "lagjax_trajectory", _solved, _solved_shapes, several=True, jvp=_solved_jvp, batched=_solved_batched
 )
-_tangent_p = primitive(
-    "lagjax_trajectory_tangent", _tangent, _tangent_shapes,
-    several=True, jvp=_tangent_jvp, transpose=_tangent_transpose, batched=_tangent_batched,
+_tangent_p = linear_map_primitive(
+    "lagjax_trajectory_tangent", _tangent, _tangent_transpose, _tangent_shapes, lambda params: params["size"],
+    jvp=_tangent_jvp, batched=_tangent_batched,
 )  # fmt: skip
-_pushed_p = primitive(
-    "lagjax_trajectory_tangent_pushed", _pushed, _pushed_shapes,
-    several=True, jvp=_pushed_jvp, transpose=_pushed_transpose, batched=_pushed_batched,
+_pushed_p = linear_map_primitive(
+    "lagjax_trajectory_tangent_pushed", _pushed, _pushed_transpose, _pushed_shapes, lambda params: params["size"],
+    jvp=_pushed_jvp, batched=_pushed_batched,
 )  # fmt: skip

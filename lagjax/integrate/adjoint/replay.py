@@ -26,7 +26,7 @@ from jax.core import ShapedArray
 from lagjax.integrate.adjoint.backward_sweep import BackwardMotion, Lanes, filled, swept_back, together
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, recorded
 from lagjax.jaxtools.fuse_cpu import one_function
-from lagjax.jaxtools.primitives import ad, primitive
+from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, primitive, split
 
 
 @dataclass(frozen=True)
@@ -123,13 +123,11 @@ def _known_jvp(primals, tangents, *, motion, lanes):
 
 
 def _known_batched(operands, axes, *, motion, lanes):
-    count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
-    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    batched = [axis is not None for axis in axes]
-    leaves, values = front[: motion.size], front[motion.size :]
+    operands, batched, count = front(operands, axes)
+    leaves, values = operands[: motion.size], operands[motion.size :]
     values = [x if b else jnp.broadcast_to(x, (count, *x.shape)) for x, b in zip(values, batched[motion.size :])]
     if lanes is None:
-        both, back = Lanes(count, tuple(batched[: motion.size])), lambda x: x
+        both, back = Lanes(count, batched[: motion.size]), lambda x: x
     else:
         leaves, both = _lanes_of_lanes(leaves, batched, lanes, count)
         values = [x.reshape(count * lanes.count, *x.shape[2:]) for x in values]
@@ -172,13 +170,11 @@ def _zero(x):
 
 
 def _run_batched(operands, axes, *, motion, lanes, same_run):
-    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    batched = tuple(axis is not None for axis in axes)
-    count = next(x.shape[0] for x, b in zip(front, batched) if b)
+    operands, batched, count = front(operands, axes)
     if lanes is None:
-        found = _run_p.bind(*front, motion=motion, lanes=Lanes(count, batched), same_run=same_run)
+        found = _run_p.bind(*operands, motion=motion, lanes=Lanes(count, batched), same_run=same_run)
         return found, [0] * len(found)
-    flat, both = _lanes_of_lanes(front, batched, lanes, count)
+    flat, both = _lanes_of_lanes(operands, batched, lanes, count)
     found = _run_p.bind(*flat, motion=motion, lanes=both, same_run=same_run)
     return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
 
@@ -195,14 +191,9 @@ def _lanes_of_lanes(leaves, batched, lanes, count):
     return flat, Lanes(count * lanes.count, tuple(b or inner for b, inner in zip(batched, lanes.batched)))
 
 
-def _operands(operands, motion, moved):
-    """Split the operands into the arrays of the problem, those of the record, and the tangents."""
-    size = motion.size
-    return operands[:size], operands[size : len(operands) - len(moved)], operands[len(operands) - len(moved) :]
-
-
-def _moved(*operands, motion, lanes, moved):
-    leaves, _, moving = _operands(operands, motion, moved)
+# The points are the arrays of the problem and those of the record.
+def _moved(points, moving, *, motion, lanes, moved):
+    leaves = points[: motion.size]
 
     def of_moved(*chosen):
         found = _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
@@ -212,24 +203,29 @@ def _moved(*operands, motion, lanes, moved):
 
 
 def _moved_shapes(*operands, motion, lanes, moved):
-    return [ShapedArray(x.shape, x.dtype) for x in _operands(operands, motion, moved)[1] if _is_float(x)]
+    values = split(operands, len(moved))[0][motion.size :]
+    return [ShapedArray(x.shape, x.dtype) for x in values if _is_float(x)]
 
 
 def _moved_jvp(primals, tangents, **params):
     # Forward over forward: the result cannot be transposed.
     tangents = [ad.instantiate_zeros(t) for t in tangents]
-    return jax.jvp(partial(_moved, **params), primals, tuple(tangents))
+    return jax.jvp(partial(_moved_at, **params), primals, tuple(tangents))
+
+
+def _moved_at(*operands, moved, **params):
+    return _moved(*split(operands, len(moved)), moved=moved, **params)
 
 
 def _moved_batched(operands, axes, **params):
     # Many directions at once, in forward mode.
     count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
-    found = jax.vmap(lambda *x: _moved(*x, **params), axes, axis_size=count)(*operands)
+    found = jax.vmap(partial(_moved_at, **params), axes, axis_size=count)(*operands)
     return found, [0] * len(found)
 
 
-def _moved_transpose(cotangents, *operands, motion, lanes, moved):
-    leaves, values, _ = _operands(operands, motion, moved)
+def _moved_transpose(points, moving, wanted, cotangents, *, motion, lanes, moved):
+    leaves, values = points[: motion.size], points[motion.size :]
     given = iter(cotangents)
     given = jtu.tree_unflatten(motion.found[0][0], [next(given) if _is_float(x) else None for x in values])
     of_record = jtu.tree_leaves(given.record, is_leaf=_is_zero)
@@ -244,10 +240,8 @@ def _moved_transpose(cotangents, *operands, motion, lanes, moved):
     asked = together(leaves, motion, lanes, asked[0]), *asked[1:]
     swept = partial(swept_back, motion=motion, moved=moved, lanes=lanes)
     if lanes is None:
-        found = one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
-    else:
-        found = swept(leaves, motion.recorded(values), asked)
-    return [None] * (len(leaves) + len(values)) + found
+        return one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
+    return swept(leaves, motion.recorded(values), asked)
 
 
 def _is_float(x):
@@ -263,7 +257,7 @@ _known_p = primitive(
     "lagjax_recorded_before", _known, lambda *operands, motion, lanes: list(operands[motion.size :]),
     several=True, jvp=_known_jvp, batched=_known_batched,
 )  # fmt: skip
-_moved_p = primitive(
-    "lagjax_recorded_tangent", _moved, _moved_shapes,
-    several=True, jvp=_moved_jvp, transpose=_moved_transpose, batched=_moved_batched,
+_moved_p = linear_map_primitive(
+    "lagjax_recorded_tangent", _moved, _moved_transpose, _moved_shapes, lambda params: len(params["moved"]),
+    jvp=_moved_jvp, batched=_moved_batched,
 )  # fmt: skip

@@ -22,7 +22,7 @@ from jax.core import ShapedArray
 
 from lagjax.integrate.adjoint.backward_sweep import filled
 from lagjax.integrate.adjoint.replay import Replay
-from lagjax.jaxtools.primitives import ad, primitive
+from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, split
 
 
 @eqx.filter_custom_jvp
@@ -163,13 +163,8 @@ def turned(map, points, tangents, shapes):
     return _turned_p.bind(*points, *(tangents[i] for i in moved), map=map, moved=moved, shapes=shapes)
 
 
-def _points_and_directions(operands, moved):
-    return list(operands[: len(operands) - len(moved)]), list(operands[len(operands) - len(moved) :])
-
-
-def _turned(*operands, map, moved, shapes):
-    points, moving = _points_and_directions(operands, moved)
-    return list(map.forward(points, moved, moving))
+def _turned(points, moving, *, map, moved, shapes):
+    return map.forward(list(points), moved, list(moving))
 
 
 def _turned_jvp(primals, tangents, **params):
@@ -179,24 +174,21 @@ def _turned_jvp(primals, tangents, **params):
     )
 
 
-def _turned_transpose(cotangents, *operands, map, moved, shapes):
-    points, moving = _points_and_directions(operands, moved)
-    w = [ad.instantiate_zeros(ct) for ct in cotangents]
-    found = map.backward(points, moved, w)
-    return [None] * len(points) + [x if ad.is_undefined_primal(d) else None for x, d in zip(found, moving)]
+def _turned_transpose(points, moving, wanted, cotangents, *, map, moved, shapes):
+    found = map.backward(list(points), moved, [ad.instantiate_zeros(ct) for ct in cotangents])
+    return [x for x, w in zip(found, wanted) if w]
 
 
 def _turned_batched(operands, axes, *, map, moved, shapes):
-    front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
-    axes = tuple(None if axis is None else 0 for axis in axes)
-    count = next(x.shape[0] for x, axis in zip(front, axes) if axis == 0)
-    lanes = _OverLanes(map, *(tuple(part) for part in _points_and_directions(axes, moved)), count)
+    operands, batched, count = front(operands, axes)
+    lanes = _OverLanes(map, *split([0 if b else None for b in batched], len(moved)), count)
     shapes = tuple(((count, *shape), dtype) for shape, dtype in shapes)
-    found = _turned_p.bind(*front, map=lanes, moved=moved, shapes=shapes)
+    found = _turned_p.bind(*operands, map=lanes, moved=moved, shapes=shapes)
     return found, [0] * len(found)
 
 
-_turned_p = primitive(
-    "lagjax_second_derivative", _turned, lambda *operands, shapes, **params: [ShapedArray(*shape) for shape in shapes],
-    several=True, jvp=_turned_jvp, transpose=_turned_transpose, batched=_turned_batched,
+_turned_p = linear_map_primitive(
+    "lagjax_second_derivative", _turned, _turned_transpose,
+    lambda *operands, shapes, **params: [ShapedArray(*shape) for shape in shapes],
+    lambda params: len(params["moved"]), jvp=_turned_jvp, batched=_turned_batched,
 )  # fmt: skip

@@ -241,6 +241,9 @@ def independent(band: Float[Array, "m b1"], least: float) -> Bool[Array, " m"]:
     before = jnp.concatenate([jnp.zeros(b, band.dtype), scale])
     scales = jnp.stack([before[b - d : b - d + m] for d in range(width)], axis=1)
     unit = jnp.where(jnp.isfinite(band), band, 0.0) * scale[:, None] * scales
-    keeps = lambda pivot: pivot > least**2
+
+    def keeps(pivot: Array) -> Array:
+        return pivot > least**2
+
     pivot, _ = _eliminate(unit.at[:, 0].set(1.0), keeps)
     return keeps(pivot) | ~usable

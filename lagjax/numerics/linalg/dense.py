@@ -184,7 +184,10 @@ class Saddle:
 
     def __init__(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], diagonal: bool = False):
         self.n, self.m = n, m = mass.shape[0], jacobian.shape[0]
-        entry = lambda i, j: mass[i, j] if i < n else jacobian[i - n, j] if j < n else jnp.zeros_like(mass[0, 0])
+
+        def entry(i: int, j: int) -> Array:
+            return mass[i, j] if i < n else jacobian[i - n, j] if j < n else jnp.zeros_like(mass[0, 0])
+
         self.matrix = matrix = [[entry(max(i, j), min(i, j)) for j in range(n + m)] for i in range(n + m)]
         work = [row[: i + 1] for i, row in enumerate(matrix)]
         self.lower, self.pivots = [[] for _ in work], []
@@ -221,7 +224,10 @@ class Saddle:
         if self.m and refine:
             residual = [b - sum(k * y for k, y in zip(row, x)) for b, row in zip(known, self.matrix)]
             x = [a + b for a, b in zip(x, self._substituted(residual))]
-        stack = lambda entries: jnp.stack(entries) if entries else jnp.zeros(0, forcing.dtype)
+
+        def stack(entries: list) -> Array:
+            return jnp.stack(entries) if entries else jnp.zeros(0, forcing.dtype)
+
         return stack(x[: self.n]), stack([-y for y in x[self.n :]])
 
     def _substituted(self, known):

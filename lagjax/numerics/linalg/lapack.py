@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jaxtyping import Array
 
 
 def one_by_one(function: Callable) -> Callable:
@@ -87,7 +88,10 @@ def eigen_without_null_space(matrix, inertia, zero_below):
     right_x = jnp.where(zero[None, :], vectors, standard @ vectors / jnp.where(zero, 1.0, values)[None, :])
     inverse = jnp.linalg.inv(inertia).astype(vectors.dtype)
     lefts = jnp.where(is_null[:, None], 0.0, rows @ inverse)
-    norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
+
+    def norm(x: Array, axis: int) -> Array:
+        return jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
+
     return jnp.where(is_null, 0.0, values), vectors, right_x, lefts, norm(vectors, 0) * norm(rows @ inverse, 1), is_null
 
 

@@ -14,7 +14,7 @@ The cost of a step of a method.
 """
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -23,7 +23,7 @@ import jax.tree_util as jtu
 import numpy as np
 from equinox import AbstractClassVar
 from jax import lax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta, Interpolation, weighted_sum
 
@@ -81,10 +81,9 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step, its error and the data for the dense output."""
         tableau, h = self.tableau, terms.contr(t0, t1)
-        acceleration = lambda t, q: terms.vf(t, (q, y0[1]), args)[1]
         first = solver_state if made_jump is False else None
         stages = _in_a_loop if self.in_a_loop else _one_by_one
-        first, last, combined = stages(tableau, acceleration, t0, t1, h, y0, first)
+        first, last, combined = stages(tableau, lambda t, q: terms.vf(t, (q, y0[1]), args)[1], t0, t1, h, y0, first)
         q1 = _position(y0, h, 1, combined(tableau.b_position))
         v1 = jtu.tree_map(lambda v, k: v + h * k, y0[1], combined(tableau.b_velocity))
         dq, dv = (
@@ -110,7 +109,9 @@ def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
     """The first and last stage, and a function for weighted sums of all stages; zero weights cost nothing."""
     found = [acceleration(t0, y0[0]) if first is None else first]
 
-    combined = lambda weights: weighted_sum(None, weights, found)
+    def combined(weights: Any) -> Any:
+        return weighted_sum(None, weights, found)
+
     for c, row in zip(tableau.c[1:], tableau.a):
         # Exactly t1, since the last stage must be at the same time as the first stage of the next step.
         t = t1 if c == 1 else t0 + c * (t1 - t0)
@@ -124,12 +125,15 @@ def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
     rows = np.zeros((count, count))
     for i, row in enumerate(tableau.a, start=1):
         rows[i, :i] = row
-    by = lambda weights: lambda ks: jnp.tensordot(jnp.asarray(weights, ks.dtype), ks, 1)
+
+    def weighted(weights: Array, found: PyTree) -> PyTree:
+        return jtu.tree_map(lambda ks: jnp.tensordot(jnp.asarray(weights, ks.dtype), ks, 1), found)
+
     rows, nodes = jnp.asarray(rows), jnp.asarray(tableau.c, jnp.result_type(t0))
 
     def stage(i, found):
         t = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
-        q = _position(y0, h, nodes[i], jtu.tree_map(by(rows[i]), found))
+        q = _position(y0, h, nodes[i], weighted(rows[i], found))
         return jtu.tree_map(lambda ks, k: ks.at[i].set(k), found, acceleration(t, q))
 
     start = jtu.tree_map(lambda q: jnp.zeros((count, *jnp.shape(q)), jnp.result_type(q)), y0[0])
@@ -137,7 +141,7 @@ def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
         start = jtu.tree_map(lambda ks, k: ks.at[0].set(k), start, first)
     found = lax.fori_loop(0 if first is None else 1, count, stage, start)
     first, last = (jtu.tree_map(lambda ks: ks[i], found) for i in (0, -1))
-    return first, last, lambda weights: jtu.tree_map(by(weights), found)
+    return first, last, lambda weights: weighted(weights, found)
 
 
 class Quintic(Interpolation):
@@ -162,9 +166,14 @@ class Quintic(Interpolation):
             rest = (10 * of_q - 4 * of_v + of_a / 2, -15 * of_q + 7 * of_v - of_a, 6 * of_q - 3 * of_v + of_a / 2)
             return [q0, h * v0, h * h * a0 / 2, *rest]
 
-        position = lambda *ends: sum(c * s**k for k, c in enumerate(coefficients(*ends)))
-        slope = lambda *ends: sum(k * c * s ** (k - 1) for k, c in enumerate(coefficients(*ends)) if k) / step
         ends = (*self.y0, self.a0, *self.y1, self.a1)
+
+        def position(*ends: Array) -> Array:
+            return sum(c * s**k for k, c in enumerate(coefficients(*ends)))
+
+        def slope(*ends: Array) -> Array:
+            return sum(k * c * s ** (k - 1) for k, c in enumerate(coefficients(*ends)) if k) / step
+
         return jtu.tree_map(position, *ends), jtu.tree_map(slope, *ends)
 
 

@@ -131,15 +131,21 @@ class SimplifiedNewton(optx.AbstractRootFinder):
 
     def step(self, fn, y, args, options, state, tags) -> tuple[PyTree, Iteration, Any]:
         # A branch also under `vmap`: no Jacobian is computed unless a lane needs it.
-        renew = lambda: jtu.tree_map(
-            lambda new, old: jnp.where(state.stale, new, old), _inverse_at(fn, y, args, options), state.inverse
+        inverse = lax.cond(
+            eqxi.unvmap_any(state.stale),
+            lambda: jtu.tree_map(
+                lambda new, old: jnp.where(state.stale, new, old), _inverse_at(fn, y, args, options), state.inverse
+            ),
+            lambda: state.inverse,
         )
-        inverse = lax.cond(eqxi.unvmap_any(state.stale), renew, lambda: state.inverse)
         residual, aux = fn(y, args)
         correction = inverse(residual)
         new = jtu.tree_map(lambda y, d: y - d, y, correction)
         full = jtu.tree_map(jnp.add, new, options["offset"]) if "offset" in options else new
-        known = lambda allowed: jnp.where(allowed > 0, allowed, 1.0)
+
+        def known(allowed: Array) -> Array:
+            return jnp.where(allowed > 0, allowed, 1.0)
+
         units = jtu.tree_map(lambda d, y: d / known(self.allowed(y)), correction, full)
         size = self.norm(units).astype(state.size.dtype)
         first = state.count == 0
@@ -224,8 +230,11 @@ def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_no
     missing = [name for name in tolerances if getattr(solver.root_finder, name, None) is from_controller]
     if not missing:
         return solver
-    at = lambda solver: [getattr(solver.root_finder, name) for name in missing]
-    return eqx.tree_at(at, solver, [tolerances[name] for name in missing])
+    return eqx.tree_at(
+        lambda solver: [getattr(solver.root_finder, name) for name in missing],
+        solver,
+        [tolerances[name] for name in missing],
+    )
 
 
 # Hairer & Wanner II, table IV.5.6.
@@ -386,9 +395,10 @@ class Stages(eqx.Module):
 
     def rate_and_jacobian(self):
         """h f and h J at the start of the step."""
-        along = lambda dy: jax.jvp(lambda y: self.increment(self.t0, y), (self.y0,), (dy,))
         basis = jnp.eye(self.y0.size, dtype=self.y0.dtype)
-        return jax.vmap(along, out_axes=(None, 1))(basis)
+        return jax.vmap(
+            lambda dy: jax.jvp(lambda y: self.increment(self.t0, y), (self.y0,), (dy,)), out_axes=(None, 1)
+        )(basis)
 
     def _times(self):
         # The last stage is exactly at the end of the step.
@@ -400,7 +410,10 @@ def _inverses(jacobian: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Inver
     """(gamma I - hJ)^-1, and (A^-1 x I - I x hJ)^-1 from that and one complex inverse."""
     unit = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
     real, pair = dense.inverse(float(GAMMA) * unit - jacobian), dense.inverse(complex(LAMBDA) * unit - jacobian)
-    outer = lambda right, left, like: jnp.asarray(np.outer(right, left), like.dtype)
+
+    def outer(right: Any, left: Any, like: Array) -> Array:
+        return jnp.asarray(np.outer(right, left), like.dtype)
+
     both = jnp.kron(outer(T_REAL, T_INVERSE_REAL, real), real)
     return real, Inverse(both + 2 * jnp.kron(outer(T_PAIR, T_INVERSE_PAIR, pair), pair).real)
 
@@ -456,21 +469,32 @@ def _error(equations, z, rate, to_error, finder, weights):
     scale = (finder.atol(largest) if callable(finder.atol) else finder.atol) + finder.rtol * largest
     rejects = finder.norm(equations.unravel(weights * error / jnp.where(scale > 0, scale, 1.0))) >= 1
     # (8.20): for a fast component that has already decayed, the estimate (8.19) is completely wrong.
-    again = lambda error: to_error @ (equations.increment(equations.t0, y0 + error) + weighted)
-    return lax.cond(rejects, again, lambda error: error, error)
+    return lax.cond(
+        rejects,
+        lambda error: to_error @ (equations.increment(equations.t0, y0 + error) + weighted),
+        lambda error: error,
+        error,
+    )
 
 
 @eqx.filter_custom_jvp
 def _solved(equations, *, fixed, max_steps):
     """The stages z, and the result of their iteration."""
     start, inverse, finder = fixed
-    residual = lambda z, equations: jnp.asarray(A_INVERSE, z.dtype) @ z - equations.increments(z)
     options = {
         "init_state": Iteration.first(inverse, start),
         "offset": equations.y0[None],
         "inverse_at": lambda z: Inverse(dense.inverse(equations.matrix(z))),
     }
-    found = optx.root_find(residual, finder, start, equations, options, max_steps=max_steps, throw=False)
+    found = optx.root_find(
+        lambda z, equations: jnp.asarray(A_INVERSE, z.dtype) @ z - equations.increments(z),
+        finder,
+        start,
+        equations,
+        options,
+        max_steps=max_steps,
+        throw=False,
+    )
     # A failed step is discarded by multiplying its derivative by zero, so its Jacobians must be finite.
     success = found.result == optx.RESULTS.successful
     return jnp.where(success, found.value, 0.0), found.result

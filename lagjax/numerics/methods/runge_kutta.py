@@ -14,7 +14,7 @@ Dense output of diffrax steps, given by the state at a time.
 import abc
 import functools
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -23,6 +23,7 @@ import jax.tree_util as jtu
 import numpy as np
 from equinox import AbstractClassVar
 from jax import lax
+from jaxtyping import PyTree
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
@@ -86,7 +87,9 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         for i, row in enumerate(tableau.a_lower, start=1):
             rows[i, :i] = row
         nodes, rows = jnp.asarray(np.append(0.0, tableau.c), jnp.result_type(t0)), jnp.asarray(rows)
-        by = lambda weights, ks: jtu.tree_map(lambda k: jnp.tensordot(weights.astype(k.dtype), k, 1), ks)
+
+        def by(weights: Any, ks: PyTree) -> PyTree:
+            return jtu.tree_map(lambda k: jnp.tensordot(weights.astype(k.dtype), k, 1), ks)
 
         def stage(i, ks):
             t = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
@@ -97,7 +100,10 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         if first is not None:
             ks = jtu.tree_map(lambda ks, k: ks.at[0].set(k), ks, first)
         ks = lax.fori_loop(0 if first is None else 1, count, stage, ks)
-        of = lambda weights: terms.prod(by(jnp.asarray(np.asarray(weights)), ks), control)
+
+        def of(weights: Any) -> PyTree:
+            return terms.prod(by(jnp.asarray(np.asarray(weights)), ks), control)
+
         y1 = jtu.tree_map(jnp.add, y0, of(tableau.b_sol))
         last = jtu.tree_map(lambda k: k[-1], ks) if tableau.fsal else None
         dense = {"y0": y0, "y1": y1, "k": terms.prod(ks, control)}
