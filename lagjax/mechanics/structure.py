@@ -99,31 +99,47 @@ def _of(function):
     return lambda model, *state: function(*state, model.params)
 
 
-def unseen_coordinates(model: Model) -> np.ndarray:
-    """Which coordinates are known to occur in none of L, R, Q and the constraints: (n,) booleans.
+class Invariance(NamedTuple):
+    """What is known to change nothing.
 
-    They may all be shifted, and nothing else of the motion changes.
+    - `unseen` (n,): the coordinates that occur in none of L, R, Q and the constraints; they may all be shifted.
+    - `timeless`: none of these depends on t. `even`: L has no terms linear in the velocities.
     """
-    if model.n + model.m > UP_TO:
-        return _unseen_leaves(model)
-    written, occurs = in_numbers(model), np.zeros(model.n, bool)
+
+    unseen: tuple[bool, ...]
+    timeless: bool
+    even: bool
+
+
+def invariance(model: Model) -> Invariance:
+    """What is known to change nothing; of a large system less is known."""
+
+    def values(model, t, q, v):
+        at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
+        momentum = jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
+        return [f(t, q, v, model.params) for f in functions_of(model)], momentum
+
     try:
-        for f in functions_of(written):
-            numbers = _numbers(_of(f), written)
-            _, *state = numbers.state_variables
-            occurs |= np.array([depends(numbers.program.jaxpr, [y]) for y in state[: model.n]])
+        if model.n + model.m > UP_TO:
+            raise TooLong
+        numbers = Numbers(values, in_numbers(model), most=WRITTEN)
     except TooLong:
-        return _unseen_leaves(model)
-    return ~occurs
+        return Invariance(_unseen_leaves(model), is_autonomous(model), False)
+    jaxpr, (t, *state) = numbers.program.jaxpr, numbers.state_variables
+    return Invariance(
+        tuple(not depends(jaxpr, [y]) for y in state[: model.n]),
+        not depends(jaxpr, [t]),
+        all(is_zero(x) for x in jaxpr.outvars[-model.n :]),
+    )
 
 
-def _unseen_leaves(model: Model):
-    """The same, for whole leaves of q."""
-    unseen = []
+def _unseen_leaves(model: Model) -> tuple[bool, ...]:
+    """The coordinates that are known to occur nowhere, by whole leaves of q."""
+    unseen: list[bool] = []
     for i, shape in enumerate(model.form.shapes):
         kinds = {_dependence(f, model, lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in functions_of(model)}
         unseen += [kinds == {Depends.NOT}] * int(np.prod(shape))
-    return np.array(unseen)
+    return tuple(unseen)
 
 
 def is_diagonal(model: Model) -> bool:

@@ -40,7 +40,7 @@ from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.structure import angles, is_autonomous, structure, unseen_coordinates
+from lagjax.mechanics.structure import angles, invariance, structure
 from lagjax.numerics.linalg import lapack
 from lagjax.numerics.newton import MOST, differentiable, least_squares_root, zero_below
 from lagjax.system import coordinates
@@ -253,9 +253,9 @@ def equilibria(
     model = model_of(system, *s)
     steady = Steady(model, s.t, np.zeros(symmetries.count, s.t.dtype), coordinates.vector(s.q), symmetries)
     q, v = jax.tree.map(lambda x: x.astype(s.t.dtype), (q, v))
-    lasting = not symmetries.count and is_autonomous(model)
+    known = invariance(model)
+    lasting, unseen = not symmetries.count and known.timeless, np.array(known.unseen)
     concrete = is_eager() and not is_traced((steady, q, v))
-    unseen = unseen_coordinates(model)
     expected = int(np.sum(np.delete(unseen, list(symmetries.places))))
     rows = searched(steady, q, v, lasting, expected, concrete)
     as_table = lambda rows: Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())

@@ -24,7 +24,7 @@ from lagjax.jaxtools.cache import remembered
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.mechanics.diagnosis import explain_failure, where
-from lagjax.mechanics.structure import structure, unseen_coordinates
+from lagjax.mechanics.structure import invariance
 from lagjax.numerics.linalg import dense, lapack
 from lagjax.numerics.linalg.rank import DEPENDENT_BELOW
 from lagjax.system import constraints, coordinates
@@ -70,18 +70,17 @@ def steadiness_of(kind: LinearisationKind, s: State, parts: LinearParts) -> Stea
     return Steadiness(relative, jnp.max(relative, initial=0.0))
 
 
-def check_steady(model, linearisation, steadiness: Steadiness, linearised: Callable) -> None:
-    """Raise if a state is not in steady motion, or its linear equations are singular or change with time.
+def check_steady(
+    linearisation: "Linearisation", steadiness: Steadiness, equations: list[str], linearised: Callable
+) -> None:
+    """Raise if a state is not in steady motion, or its linear equations change with time.
 
-    `linearisation`: the `Linearisation` at the state; `linearised(t, q, v, params)`: the `Linearisation` at another
+    `equations`: the name of each constraint equation; `linearised(t, q, v, params)`: the `Linearisation` at another
     state.
     """
     kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     relative, a = np.asarray(steadiness.relative), np.asarray(parts.a)
-    dtype, n = relative.dtype, len(kind.unseen)
-    if not parts.sound:
-        raise ValueError(explain_failure(model, s) or _singular(kind, parts, s))
-    names, equations = model.names, model.equation_names
+    dtype, n, names = relative.dtype, len(kind.unseen), linearisation.names
     holonomic = [name for name, h in zip(equations, kind.holonomic) if h]
     labels = [f"'{name}'" for name in holonomic]
     labels += [f"d/dt '{name}'" if h else f"'{name}'" for name, h in zip(equations, kind.holonomic)]
@@ -108,10 +107,10 @@ def check_steady(model, linearisation, steadiness: Steadiness, linearised: Calla
                 else "Fix: found = lj.equilibria(system, params, starts=q) gives the equilibrium nearby."
             )
         )
-    _check_time(model, linearisation, linearised)
+    _check_time(linearisation, equations, linearised)
 
 
-def _singular(kind, parts, s):
+def _singular(parts: LinearParts, s: State) -> str:
     names = coordinates.names(s.q)
     _, _, right = np.linalg.svd(np.nan_to_num(np.asarray(parts.mass)))
     i = int(np.argmax(np.abs(np.asarray(parts.velocities) @ right[-1])))
@@ -122,7 +121,7 @@ def _singular(kind, parts, s):
     )
 
 
-def _check_time(model, linearisation, linearised):
+def _check_time(linearisation: "Linearisation", equations: list[str], linearised: Callable) -> None:
     """Raise if the matrices differ further along the motion."""
     kind, s, parts = linearisation.kind, linearisation.state, linearisation.parts
     u = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)])
@@ -139,7 +138,7 @@ def _check_time(model, linearisation, linearised):
         if changed is None:
             continue
         what, i, j, before, after = changed
-        names, equations = model.names, model.equation_names
+        names = linearisation.names
         entry = f"'{equations[i]}' by '{names[j]}'" if what.startswith("constraint") else f"'{names[i]}', '{names[j]}'"
         raise ValueError(
             f"the linear equations change along the motion: {what} of {entry} is {before:.6g}, and {time:.3g} later it "
@@ -299,24 +298,21 @@ def linearise(system, t, q, v, params) -> Linearisation:
     if not np.all(np.asarray(linearisation.parts.independent)[list(kind.independent)]):
         kind = kind._replace(independent=_chosen(kind, model, s, traced))
         linearisation, steadiness = _linearised(kind, model, s)
-    check_steady(model, linearisation, steadiness, lambda *later: linearised(kind, model, State(*later)))
+    if not linearisation.sound:
+        raise ValueError(explain_failure(model, s) or _singular(linearisation.parts, s))
+    later = lambda *state: linearised(kind, model, State(*state))
+    check_steady(linearisation, steadiness, model.equation_names, later)
     return linearisation
 
 
 def _kind(model, s: State) -> LinearisationKind:
     """The static part of the linearisation."""
     system, holonomic = model.system, tuple(model.holonomic.tolist())
-    unseen, linear_terms, timeless = remembered(model, _kind, lambda: _structure_facts(model))
+    known = remembered(model, invariance, lambda: invariance(model))
     at_rest = not is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
     conservative = system.force is None and system.dissipation is None and all(holonomic)
-    at_rest = conservative and at_rest and not linear_terms
-    return LinearisationKind(unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, timeless)
-
-
-def _structure_facts(model):
-    known = structure(model)
-    unseen = tuple(bool(x) for x in unseen_coordinates(model))
-    return unseen, known is None or bool(known.linear_terms), known is not None and not known.explicit_time
+    at_rest = conservative and at_rest and known.even
+    return LinearisationKind(known.unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, known.timeless)
 
 
 def _chosen(kind, model, s, traced) -> tuple[bool, ...]:

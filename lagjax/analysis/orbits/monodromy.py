@@ -34,7 +34,7 @@ from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, flow_of, inde
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import WATCHED, is_eager, is_traced, numpy_of
 from lagjax.mechanics.diagnosis import explain_failure
-from lagjax.mechanics.structure import are_angles, conserves_jacobi_integral, is_autonomous, unseen_coordinates
+from lagjax.mechanics.structure import are_angles, invariance
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
@@ -70,15 +70,9 @@ class Reasons(NamedTuple):
 
 def reasons_of(model) -> Reasons:
     """The reasons that the programs of a system show."""
-    system, autonomous = model.system, is_autonomous(model)
-    potential = system.force is None and system.dissipation is None
-    momenta = potential and system.is_holonomic
-    return Reasons(
-        autonomous,
-        autonomous and conserves_jacobi_integral(model),
-        tuple(bool(x) for x in unseen_coordinates(model)),
-        momenta,
-    )
+    system, known = model.system, invariance(model)
+    conserves = system.force is None and system.dissipation is None and system.is_holonomic
+    return Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
 
 
 def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
