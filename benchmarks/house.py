@@ -13,7 +13,8 @@
 
 A walk counts the functions that are called with the system, or its model, at the first call from Python: `stays`
 distinct functions, `files` in which they lie, `returns` to a file that had been left (stays less files), `climbs` from
-a file to one of a package above it.
+a file to one of a package above it. `calls to diffeqsolve`, and `files`: the functions that are running, `integrate`
+first, when it calls diffrax; closures count with the function that makes them, wrappers of `jaxtools` do not count.
 
     python -m benchmarks.house [--json FILE]
 """
@@ -127,12 +128,25 @@ def source():
     yield row("files with a test of their name, %", round(100 * np.mean([p.stem in tests for p in own]), 1), 90, "more")
 
 
+def running(frame):
+    """(file, function) of all that is running here, from `integrate` on."""
+    found = []
+    while frame is not None and frame.f_code.co_name != "checked":
+        if frame.f_code.co_filename.startswith(str(ROOT)):
+            path = Path(frame.f_code.co_filename).relative_to(ROOT)
+            found.append((path, frame.f_code.co_qualname.split(".<locals>")[0]))
+        frame = frame.f_back
+    return {place for place in found if place[0].parts[0] != "jaxtools"}
+
+
 def walk(call):
-    """(stays, files, climbs) of the system, or hybrid, during a call."""
-    found, root = {}, str(ROOT)
+    """(stays, files, climbs) of the system, or hybrid, during a call; and what runs when diffrax is called."""
+    found, root, to_loop = {}, str(ROOT), set()
 
     def seen(frame, event, _):
         code = frame.f_code
+        if event == "call" and code.co_name == "diffeqsolve" and not to_loop:
+            to_loop.update(running(frame))
         if event != "call" or not code.co_filename.startswith(root):
             return
         for name in code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]:
@@ -147,7 +161,7 @@ def walk(call):
     files = [path for path, _ in found]
     floor = lambda path: FLOORS.index(path.parts[0]) if path.parts[0] in FLOORS else len(FLOORS)
     climbs = sum(floor(b) > floor(a) for a, b in zip(files, files[1:]))
-    return len(found), len(set(files)), climbs
+    return len(found), len(set(files)), climbs, to_loop
 
 
 def walks(wanted):
@@ -167,10 +181,13 @@ def walks(wanted):
     for name, (call, most, most_climbs, most_returns) in doors.items():
         if not wanted(name):
             continue
-        stays, files, climbs = walk(call)
+        stays, files, climbs, to_loop = walk(call)
         yield row(f"{name}: stays", stays, most)
         yield row(f"{name}: climbs", climbs, most_climbs)
         yield row(f"{name}: returns", stays - files, most_returns)
+        if name == "integrate":
+            yield row("integrate: calls to diffeqsolve", len(to_loop), 8)
+            yield row("integrate: files to diffeqsolve", len({path for path, _ in to_loop}), 4)
 
 
 if __name__ == "__main__":

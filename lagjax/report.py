@@ -117,8 +117,7 @@ def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecis
     """Compare methods on a run; with `others` also with other tools. `settings` are those of `lj.work_precision`."""
     instead, by_hand = None, run.by_hand
     if others and by_hand is not None:
-        acceleration = lambda *state: by_hand(*state)[0]
-        instead = usual_others(acceleration, run.q0, run.v0, run.params, run.ts)
+        instead = usual_others(lambda *state: by_hand(*state)[0], run.q0, run.v0, run.params, run.ts)
     return comparison.work_precision(
         run.system, run.q0, run.v0, run.params,
         ts=run.ts, events=run.events, error=run.error, others=instead, patience_with_others=PATIENCE, **settings,

@@ -179,7 +179,7 @@ def explain(system, t, q, v, params=None):
     """
     check_system(system, t, q, v, params, phases=True)
     s = coordinates.state(t, q, v, params)
-    if isinstance(system, Hybrid):
+    if system.in_phases:
         return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
     return _explain(system, s)
 
@@ -214,7 +214,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     if found_structure is not None:
         rows += _of_structure(found_structure)
     rows += [(name, "yes") for name in ("force", "dissipation") if getattr(system, name) is not None]
-    if (jumps := jumps_found(system, *s)) is not None:
+    if (jumps := jumps_found(model, s)) is not None:
         rows += [("jumps and kinks", "; ".join(words))] if (words := jumps.in_words()) else []
         rows += [("not followed", "; ".join(jumps.missed))] if jumps.missed else []
     rows.append(("solved", _how_solved(equations_of(model, fast=True), found_structure)))

@@ -99,7 +99,7 @@ def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> 
     if "system" in known:
         system: Any = same_system(known["system"], described, path)
         if described.phase is not None:
-            if not isinstance(system, Hybrid) or not 0 <= described.phase < len(system.systems):
+            if not system.in_phases or not 0 <= described.phase < len(system.systems):
                 raise ValueError(f"{path} starts in phase {described.phase}, which this system does not have.")
             system = replace_fields(system, first=np.asarray(described.phase, np.int32))
         fields |= {"system": system, "first": system.first_phase}

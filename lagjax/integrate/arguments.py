@@ -17,9 +17,7 @@ from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.projection import departures
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import Model
-from lagjax.system.system import System
 from lagjax.system.warn import warn
 
 # Tolerances that each dtype reaches with a margin.
@@ -114,9 +112,8 @@ def _kind(thing):
     return f"the class {thing.__name__}" if isinstance(thing, type) else type(thing).__name__
 
 
-def check_drift(drift: Any, system: System | Hybrid) -> str:
-    """Return the drift control to use; raise if it is unknown."""
-    constrained = any(phase.constraints for phase in system.phases)
+def check_drift(drift: Any, constrained: bool) -> str:
+    """Return the drift control to use; raise if it is unknown. `constrained`: whether there are constraints."""
     if drift is None:
         return "project" if constrained else "none"
     if drift not in ("project", "baumgarte", "none"):

@@ -116,9 +116,10 @@ def _instants(trajectory) -> list[Instant]:
     hybrid = isinstance(trajectory, HybridTrajectory)
     rows = []
     for i in reached[np.unique(np.linspace(0, reached.size - 1, OUTPUTS).astype(int))] if reached.size else ():
-        at = lambda tree: jax.tree.map(lambda x: np.asarray(x)[i], tree)
-        state = State(t[i], at(trajectory.q), at(trajectory.v), trajectory.params)
-        rows.append(Instant(state, at(trajectory.multipliers), int(trajectory.phase[i]) if hybrid else 0))
+        motion = trajectory.q, trajectory.v, trajectory.multipliers
+        q, v, multipliers = jax.tree.map(lambda x: np.asarray(x)[i], motion)
+        state = State(t[i], q, v, trajectory.params)
+        rows.append(Instant(state, multipliers, int(trajectory.phase[i]) if hybrid else 0))
     end = trajectory.end
     last = trajectory.last_phase() if hybrid else 0
     return [*rows, Instant(State(end.t, end.q, end.v, trajectory.params), end.multipliers, last)]

@@ -5,12 +5,12 @@ is said only where one of these numbers shows it, and with the number; otherwise
 
 - The rate of progress at the end, not the average rate, tells how many steps are missing.
 - Velocities or accelerations that have grown a millionfold, or that grow while steps shrink, approach a singularity.
-- An acceleration that changes within the shortest rejected step, and did not along the accepted ones, jumps. With only
-  time, position or velocity on the other side, it is seen which of them the jump depends on.
+- Steps are rejected at jumps and kinks of forces, where these are read off their programs and `jumps="ignored"`.
 - Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
   stability of an explicit method (a stiff system), imaginary ones as frequencies to be resolved.
 
-This takes a compilation and some seconds, and is done only after a failure. `benchmarks/campaigns/advice.py` applies each fix.
+This takes a compilation and some seconds, and is done only after a failure. `benchmarks/campaigns/advice.py` applies
+each fix.
 
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
 """
@@ -23,12 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
+from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
+from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.projected_solver import Field
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import of_a_step
 from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.without_lapack_batches import jitted
 from lagjax.mechanics.consistent_state import unreachable_ahead
 from lagjax.mechanics.diagnosis import describe, explain_failure
@@ -40,10 +43,6 @@ from lagjax.system.coordinates import State
 LOOKED_AT, SETTLED = 160, 40
 # diffrax's constants for the choice of the next step.
 SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
-# A jump: an acceleration that changes by this share within a rejected step this much shorter than the accepted ones,
-JUMP, SHORT = 0.05, 1e-2
-# or than this part of the time so far; more than so many times what its rate explains; in one of so many steps.
-NO_TIME, UNEXPLAINED, TRIED = 1e-7, 10.0, 12
 # A step times an eigenvalue that limits it; and the ratio of eigenvalues from which the larger one is fast.
 LIMITED, FAST = 0.3, 30.0
 # The same product for the stability of an explicit method, which ends at two to six.
@@ -99,7 +98,7 @@ def stopped_early(trajectory, settings, guards: str = "") -> str:
     if settings.controller is not None:
         return f"{said}\nFix: {_of_controller(trajectory, settings)}."
     steps, path = last_steps(trajectory, settings), _Path(trajectory)
-    found = _singularity(path, steps) or _jump(path, steps) or _undefined(path, steps)
+    found = _singularity(path, steps) or _jump(trajectory, settings, steps) or _undefined(path, steps)
     if found:
         return _with_cause(said, found)
     return (
@@ -127,7 +126,7 @@ def _used_up(trajectory, settings, guards):
             return said
         method = method_of(settings, trajectory.model)
         implicit = isinstance(method, diffrax.AbstractImplicitSolver)
-        found = _singularity(path, steps) or _jump(path, steps) or _fast(path, steps, implicit)
+        found = _singularity(path, steps) or _jump(trajectory, settings, steps) or _fast(path, steps, implicit)
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
@@ -168,7 +167,7 @@ def _attempts(trajectory, settings):
     terms = diffrax.ODETerm(Field(equations_of(model)))
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
-    at_start = _on_path(model, first.t, (first.q, first.v), jnp.zeros(3))
+    at_start = _on_path(model, first.t, (first.q, first.v), 0.0)
     tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
 
     def attempt(t0, t1, y):
@@ -205,7 +204,10 @@ def last_steps(trajectory, settings) -> Steps:
 def _attempt(method, terms, t0, t1, y, params, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
-    rows = lambda tree: jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
+
+    def rows(tree):
+        return jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
+
     allowed = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
     largest = jnp.max(rows(error) / jnp.where(allowed > 0, allowed, 1.0))
     return after, jnp.where((result == diffrax.RESULTS.successful) & jnp.isfinite(largest), largest, jnp.inf)
@@ -218,18 +220,17 @@ class _Path:
         self.model, self.names = trajectory.model, trajectory.model.names
         self.in_dict = isinstance(trajectory.end.q, dict)
         t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
-        self.span = abs(float(trajectory.end.t - trajectory.t[0]))
+        span = abs(float(trajectory.end.t - trajectory.t[0]))
         # The largest velocity and acceleration that the start and the way so far account for.
         a, u = np.max(np.abs(self.at(t, y, 0.0))), np.max(np.abs(self.velocity(y)))
         x, x1 = (np.asarray(coordinates.flatten(part)[0]) for part in (y[0], trajectory.end.q))
         moved = np.max(np.abs(x1 - x))
-        pace = max(u, np.sqrt(a * moved), moved / self.span if self.span > 0 else 0.0)
+        pace = max(u, np.sqrt(a * moved), moved / span if span > 0 else 0.0)
         self.usual = pace, max(a, pace**2 / max(np.max(np.abs(x)), moved, 1e-300))
 
     def at(self, t, y, s):
-        """The acceleration at q + s v + s² a/2, v + s a; t, q, v are taken at s, or at s[0], s[1], s[2]."""
-        s = jnp.broadcast_to(jnp.asarray(s, dtype=float), 3)
-        return np.asarray(_on_path(self.model, jnp.asarray(t), y, s))
+        """The acceleration at t + s, q + s v + s² a/2, v + s a."""
+        return np.asarray(_on_path(self.model, jnp.asarray(t), y, jnp.asarray(s, dtype=float)))
 
     def velocity(self, y):
         """The velocities of a state, (n,)."""
@@ -255,9 +256,9 @@ class _Path:
 def _on_path(model, t, y, s):
     q, v = y
     a, _ = equations_of(model).accelerations(t, q, v)
-    by = lambda scale, x, dx: jax.tree.map(lambda x, dx: x + scale * dx, x, dx)
-    place, velocity = by(0.5 * s[1] ** 2, by(s[1], q, v), a), by(s[2], v, a)
-    return model.vector(equations_of(model).accelerations(t + s[0], place, velocity)[0])
+    place = jax.tree.map(lambda q, v, a: q + s * v + 0.5 * s**2 * a, q, v, a)
+    velocity = jax.tree.map(lambda v, a: v + s * a, v, a)
+    return model.vector(equations_of(model).accelerations(t + s, place, velocity)[0])
 
 
 @jitted
@@ -273,7 +274,10 @@ def _jacobian(model, t, y):
 def _singularity(path, steps):
     """Velocities or accelerations that have grown without bound, or that grow while steps shrink."""
     kept = steps.kept if steps.kept.size else np.array([0])
-    sizes = lambda i: (np.abs(path.velocity(steps.y[i])), np.abs(path.at(steps.t[i], steps.y[i], 0.0)))
+
+    def sizes(i):
+        return (np.abs(path.velocity(steps.y[i])), np.abs(path.at(steps.t[i], steps.y[i], 0.0)))
+
     first, last, limit = sizes(kept[0]), sizes(kept[-1]), steps.t[kept[-1]]
     if not all(np.all(np.isfinite(x)) and x.size for x in last):
         return None
@@ -309,41 +313,18 @@ def _event(path, i, usual):
     return f', or an event on the way there, events={{"near": lj.Crossing({guard})}}'
 
 
-def _jump(path, steps):
-    """A change of the acceleration, within one of the shortest rejected steps, that its rate does not explain."""
-    rejected, lengths = np.flatnonzero(~steps.accepted), np.abs(steps.h)
-    longest = max(SHORT * np.max(lengths[steps.kept], initial=0.0), NO_TIME * path.span)
-    for i in rejected[np.argsort(lengths[rejected])][:TRIED]:
-        found = _jump_in(path, steps.t[i], steps.y[i], float(steps.h[i])) if lengths[i] < longest else None
-        if found:
-            cause, fix = found
-            return f"{cause}; {len(rejected)} of {len(lengths)} steps were rejected", fix
-    return None
-
-
-def _jump_in(path, t, y, h):
-    before, soon, after = (path.at(t, y, share * h) for share in (0.0, 1e-3, 1.0))
-    if not np.all(np.isfinite([before, after])):
+def _jump(trajectory: Trajectory, settings: Settings, steps: Steps) -> tuple[str, str] | None:
+    """Comparisons in the forces, where steps were rejected and these are taken as they come."""
+    rejected, end = int(np.sum(~steps.accepted)), trajectory.end
+    if settings.jumps != "ignored" or not rejected:
         return None
-    change, explained = np.abs(after - before), 1e3 * np.abs(soon - before)
-    which = int(np.argmax(change))
-    sizes = np.abs(before), np.abs(after)
-    if not change[which] > max(JUMP * np.max(sizes), UNEXPLAINED * explained[which]):
+    jumps = jumps_found(trajectory.model, State(end.t, end.q, end.v, trajectory.params))
+    if jumps is None:
         return None
-    # With only t, q or v on the other side of the jump.
-    alone = [path.at(t, y, np.where(np.arange(3) == k, h, 0.0))[which] for k in range(3)]
-    by = int(np.argmax(np.abs(alone - before[which])))
-    name, speed = path.names[which], path.velocity(y)[which]
     return (
-        f"the acceleration of '{name}' changes from {before[which]:.3g} to {after[which]:.3g} within {abs(h):.1g} of "
-        f"t = {t:.9g}, with the {('time', 'position', 'velocity')[by]}",
-        'jumps="found", the default, which reads a comparison off the force itself; or '
-        + (
-            f"name the times at which it does, jump_ts=jnp.array([{t:.9g}, ...])",
-            'a lj.Hybrid with a switch at that position, lj.Switch("before", to="after", when=...)',
-            f"a lj.Hybrid with a switch where the velocity of '{name}' is {speed:.6g}, and, where both sides push back "
-            "to it, a phase that holds it there, when=lj.sticks(...)",
-        )[by],
+        f"forces that jump or have a kink, with {'; '.join([*jumps.in_words(), *jumps.missed])}; {rejected} of "
+        f"{len(steps.h)} steps were rejected",
+        'jumps="found", the default, by which each is the end of a step',
     )
 
 

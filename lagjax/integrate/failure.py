@@ -16,12 +16,12 @@ from lagjax.integrate import arguments
 from lagjax.integrate.diagnose_guard import of_guards
 from lagjax.integrate.diagnose_stop import stopped_early
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
-from lagjax.integrate.solve.programs import Settings, trajectory_of
+from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import columns
-from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
+from lagjax.integrate.trajectory.parts import pack
 from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
-from lagjax.integrate.trajectory.trajectory import Trajectory, pack
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.primitives import primitive
 from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.diagnosis import describe, explain_failure
@@ -43,7 +43,10 @@ def _batched(operands, axes):
     return _code_p.bind(code), axis
 
 
-_same = lambda code: code
+def _same(code):
+    return code
+
+
 _code_p = primitive("result_code", _same, _same, batched=_batched)
 
 
@@ -58,7 +61,7 @@ STILL = 1e-12
 def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guards=None) -> NoReturn:
     """Raise the error of a failed motion; `start` is its first state, `guards` those of each phase."""
     about_guards = of_guards(trajectory, guards)
-    if isinstance(trajectory, HybridTrajectory):
+    if trajectory.in_phases:
         _raise_in_phase(trajectory, start, settings, about_guards)
     _raise(trajectory, start, settings, about_guards)
 
@@ -94,15 +97,19 @@ def _raise_in_phase(trajectory, start, settings, about_guards) -> NoReturn:
     count, phase = len(switches), trajectory.last_phase()
     entered = start
     if count:
-        at = lambda tree: jax.tree.map(lambda x: np.asarray(x)[count - 1], tree)
-        entered = State(*at((switches.t, switches.q_after, switches.v_after)), trajectory.params)
+        after = switches.t, switches.q_after, switches.v_after
+        entered = State(*jax.tree.map(lambda x: np.asarray(x)[count - 1], after), trajectory.params)
     there = f"in phase '{hybrid.names[phase]}', entered at t = {float(entered.t):.9g}: "
-    arrays, static = pack(hybrid.systems[phase], trajectory.params, trajectory.asked, trajectory.static.how)
+    problem, how = (hybrid.systems[phase], trajectory.params, trajectory.asked), trajectory.static.how
+    arrays, static = pack(problem, how, trajectory.static.integrate)
     fields = {
         name: getattr(trajectory, name) for name in ("q", "v", "end", "stats", "scaled_error", "result", "tolerance")
     }
     names = hybrid.systems[phase].constraints
-    of_phase = lambda tree: {name: tree[name] for name in names}
+
+    def of_phase(tree):
+        return {name: tree[name] for name in names}
+
     fields["end"] = fields["end"]._replace(multipliers=of_phase(fields["end"].multipliers))
     alone = Trajectory(
         t=trajectory.t, multipliers=of_phase(trajectory.multipliers), events={}, arrays=arrays, static=static, **fields
@@ -171,10 +178,13 @@ def _not_seen(trajectory, settings):
     """The guards that are below zero at the end of the last phase, which is integrated without them."""
     hybrid, end, i = trajectory.system, trajectory.end, trajectory.last_phase()
     ts = np.array([end.t, trajectory.t[-1]], np.asarray(trajectory.t).dtype)
-    alone = trajectory_of(hybrid.systems[i], end.q, end.v, trajectory.params, ts, None, settings)
+    alone = trajectory.static.integrate(hybrid.systems[i], end.q, end.v, trajectory.params, ts, None, settings)
     values = {}
     for switch in (hybrid.switches[k] for k in hybrid.leaving(i)):
-        of = lambda at, switch=switch: float(switch.value(at.t, at.q, at.v, at.multipliers, trajectory.params))
+
+        def of(at, switch=switch):
+            return float(switch.value(at.t, at.q, at.v, at.multipliers, trajectory.params))
+
         values[switch.in_words()] = of(end), of(alone.end)
     below = {name: pair for name, pair in values.items() if not pair[1] >= 0}
     said = "; ".join(f"that of {name} is {g1:.3g}, and {g0:.3g} at the start" for name, (g0, g1) in below.items())

@@ -15,27 +15,25 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import arguments
 from lagjax.integrate.adjoint.replay import Replay
-from lagjax.integrate.dense_output import at
 from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
-from lagjax.integrate.solve.backward_time import in_either_direction, runs_backward
+from lagjax.integrate.solve.backward_time import backward_trajectory_of, runs_backward
 from lagjax.integrate.solve.error_estimate import steps_to_repeat
-from lagjax.integrate.solve.harvest import patient, report
+from lagjax.integrate.solve.harvest import report
 from lagjax.integrate.solve.over_jumps import warn_of_lost
 from lagjax.integrate.solve.phases import phases_in, refuse_beside_switches, traced_phases
-from lagjax.integrate.solve.programs import Settings
+from lagjax.integrate.solve.programs import trajectory_of
+from lagjax.integrate.solve.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
-from lagjax.integrate.trajectory.trajectory import BY_INTEGRATION, Trajectory
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.tracing import SILENT, WATCHED, is_traced
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.system import System
-
-BY_INTEGRATION["at"] = at
 
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
@@ -158,15 +156,16 @@ def integrate(
     ts = arguments.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, v0, params)
     dtype = state.t.dtype
-    system = traced_phases(system.starting(start), state)
+    system = traced_phases(system if start is None else system.starting(start), state)
     for phase in system.phases:
         warn_of_odd_dissipation(phase.dissipation, state)
-    if isinstance(system, Hybrid):
+    crossings, left = crossings_of(events, event), left_to_diffrax(event)
+    if system.in_phases:
         refuse_beside_switches(system, state, ts, adjoint, event)
-        guards = phases_in(system, state, crossings_of(events, event))
+        guards = phases_in(system, state, crossings)
     else:
-        guards = guards_of(crossings_of(events, event), system, state)
-    drift, left = arguments.check_drift(drift, system), left_to_diffrax(event)
+        guards = guards_of(crossings, system, state) if crossings else None
+    drift = arguments.check_drift(drift, any(phase.constraints for phase in system.phases))
     arguments.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
     settings = Settings(
         method=method,
@@ -188,9 +187,9 @@ def integrate(
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )
-    ts, backward = arguments.times(ts, dtype), runs_backward(ts)
-    trajectory = in_either_direction(system, state.q, state.v, state.params, ts, guards, settings, backward)
-    trajectory = report(trajectory)
+    ts = arguments.times(ts, dtype)
+    solve = backward_trajectory_of if runs_backward(ts) else trajectory_of
+    trajectory = report(solve(system, state.q, state.v, state.params, ts, guards, settings))
     if throw:
         trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings, guards)
     return trajectory

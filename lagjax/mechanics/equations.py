@@ -141,29 +141,22 @@ def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> 
     With `fast` the equations of a small system are also written out, and take states number by number
     (`Equations.inside`). Without `fallback` they are assumed regular; the caller deals with states where they are not.
     """
-    written, users = None, None
+    written, users, prepared = None, None, (None, None)
     if fast and is_small(model):
         model, users = in_numbers(model), model.form
-        written = _written_for(model)
-    prepared = (None, None) if written is None else written.prepare(model)
+        leaves, structure = jtu.tree_flatten(model)
+        leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+        # In a watched motion a failed check of the user's becomes NaN in the equations.
+        written = _written(structure, leaves, WATCHED.value)
+    if written is not None:
+        both = written.equations, written.project
+        prepared = tuple(None if numbers is None else numbers.prepare(model) for numbers in both)
     fallback = fallback and written is not None and written.may_fail
-    return Equations(model, prepared, _form(model), written, fallback, users)
-
-
-def _form(model: Model):
     sparse, unknowns = plan(model), model.n + model.m
-    if sparse is not None:
-        return Banded(sparse)
     # Other small systems are written out, where zeros cost nothing.
     may_divide = has_networks(model) and not model.m and unknowns <= UP_TO
-    return Dense(unknowns, may_divide and is_diagonal(model))
-
-
-def _written_for(model: Model) -> WrittenOut | None:
-    leaves, structure = jtu.tree_flatten(model)
-    leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
-    # In a watched motion a failed check of the user's becomes NaN in the equations.
-    return _written(structure, leaves, WATCHED.value)
+    form = Dense(unknowns, may_divide and is_diagonal(model)) if sparse is None else Banded(sparse)
+    return Equations(model, prepared, form, written, fallback, users)
 
 
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.

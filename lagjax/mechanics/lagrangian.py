@@ -41,7 +41,7 @@ def mass_and_forcing(model, t, x, u) -> LinearEquation:
     else:
         # One column of M for each velocity, stacked as rows: M is symmetric.
         mass = jax.vmap(inertia)(jnp.eye(x.size, dtype=x.dtype))
-    return LinearEquation(mass.astype(x.dtype), forcing, response(model, t, x, u))
+    return LinearEquation(mass.astype(x.dtype), forcing, response(model, t, x, u) if model.reacts else None)
 
 
 def forcing_and_inertia(model, t, x, u):

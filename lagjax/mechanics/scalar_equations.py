@@ -15,7 +15,7 @@ Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (wi
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -54,14 +54,6 @@ class WrittenOut(NamedTuple):
     equations: Numbers
     project: Numbers | None
     may_fail: bool
-
-    def prepare(self, model: Model) -> tuple[tuple | None, tuple | None]:
-        """The parts that do not depend on the state, of the equations and of the return to the constraints."""
-
-        def prepare(numbers: Any) -> Any:
-            return None if numbers is None else numbers.prepare(model)
-
-        return prepare(self.equations), prepare(self.project)
 
 
 def has_networks(model: Model) -> bool:

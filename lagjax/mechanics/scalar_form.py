@@ -66,7 +66,7 @@ class Numbers:
     """
 
     def __init__(self, function, model: Model, most=math.inf):
-        arrays, static = eqx.partition((model, *model.example), varies)
+        arrays, static = eqx.partition((model, *model.form.example), varies)
         self.shapes = []
 
         def of_leaves(*leaves):

@@ -15,7 +15,7 @@ periodic (made of sines and cosines), or anything else; the kind of a primitive'
 operands.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -137,7 +137,10 @@ def _unseen_leaves(model: Model) -> tuple[bool, ...]:
     """The coordinates that are known to occur nowhere, by whole leaves of q."""
     unseen: list[bool] = []
     for i, shape in enumerate(model.form.shapes):
-        kinds = {_dependence(f, model, lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in functions_of(model)}
+        leaf = slice(i, i + 1)
+        kinds = {
+            _dependence(f, model, lambda args, leaf=leaf: jtu.tree_leaves(args[1])[leaf]) for f in functions_of(model)
+        }
         unseen += [kinds == {Depends.NOT}] * int(np.prod(shape))
     return tuple(unseen)
 
@@ -156,13 +159,14 @@ def is_diagonal(model: Model) -> bool:
 
 def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
-    if model.m:
-        return False
+    return not any(phase.m or _sees_velocities(phase) for phase in model.phases)
 
+
+def _sees_velocities(model: Model) -> bool:
     def equations(t: Array, q: PyTree, v: PyTree, params: PyTree) -> LinearEquation:
         return mass_and_forcing(model.of(params), t, *model.vectors(q, v))
 
-    return _dependence_on_any(equations, model, lambda args: jtu.tree_leaves(args[2])) == Depends.NOT
+    return _dependence(equations, model, lambda args: jtu.tree_leaves(args[2])) != Depends.NOT
 
 
 def is_zero(x) -> bool:
@@ -212,7 +216,10 @@ def angles(model: Model) -> PyTree[bool]:
     """Which leaves of q are angles, in the structure of q."""
     found = []
     for i in range(len(model.form.shapes)):
-        kinds = {_dependence(f, model, lambda args, i=i: jtu.tree_leaves(args[1])[i]) for f in functions_of(model)}
+        leaf = slice(i, i + 1)
+        kinds = {
+            _dependence(f, model, lambda args, leaf=leaf: jtu.tree_leaves(args[1])[leaf]) for f in functions_of(model)
+        }
         found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
     return jtu.tree_unflatten(model.form.structure, found)
 
@@ -279,7 +286,8 @@ def _contains(function, name, model: Model, argument=1) -> bool:
     sizes, known = [int(np.prod(shape)) for shape in model.form.shapes], model.names
     leaf = int(np.searchsorted(np.cumsum(sizes), known.index(name), side="right"))
     if sizes[leaf] == 1:
-        return _dependence(function, model, lambda args: jtu.tree_leaves(args[argument])[leaf]) != Depends.NOT
+        at = lambda args: jtu.tree_leaves(args[argument])[leaf : leaf + 1]
+        return _dependence(function, model, at) != Depends.NOT
     alone = in_numbers(unchecked(System(function), model.params, model.form._replace(residuals=())))
     try:
         # The function may be a force: all its entries count.
@@ -314,7 +322,7 @@ def what_changes_jacobi_integral(model: Model) -> Iterator[str]:
 
 def sees_time(function, model: Model) -> bool:
     """Whether a function of (t, q, v, params) depends on t."""
-    return _dependence(function, model, lambda args: args[0]) != Depends.NOT
+    return _dependence(function, model, lambda args: args[:1]) != Depends.NOT
 
 
 def is_autonomous(model: Model) -> bool:
@@ -333,14 +341,9 @@ def functions_of(model: Model):
     return [f for f in functions if f is not None]
 
 
-def _dependence(function, model: Model, leaf_of):
-    """How the outputs of a function of (t, q, v, params) depend on one leaf of these."""
-    return _dependence_on_any(function, model, lambda args: [leaf_of(args)])
-
-
-def _dependence_on_any(function, model: Model, leaves_of):
-    """How they depend on any of several leaves."""
-    arrays, static = eqx.partition((*model.example, model.params), varies)
+def _dependence(function: Callable, model: Model, leaves_of: Callable) -> Depends:
+    """How the outputs of a function of (t, q, v, params) depend on any of some leaves of these."""
+    arrays, static = eqx.partition((*model.form.example, model.params), varies)
 
     def of_arrays(arrays):
         return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)

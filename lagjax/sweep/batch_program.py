@@ -20,7 +20,8 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
-from lagjax.integrate.solve.harvest import PATIENCE, reporting, watched
+from lagjax.integrate.solve.harvest import reporting, watched
+from lagjax.integrate.solve.settings import PATIENCE
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.jaxpr import ClosedJaxpr, bodies

@@ -20,7 +20,7 @@ from lagjax.display.printable import by_line, printable
 from lagjax.files.npz import MALFORMED
 from lagjax.files.table import Table
 from lagjax.files.tree_json import KINDS_OF_ARRAY, NotWritable, Reader, Writer
-from lagjax.integrate.trajectory.load import check_is_system, described_system, same_system, trajectory_of
+from lagjax.integrate.trajectory.load import check_is_system, described_system, same_system, trajectory_from
 from lagjax.integrate.trajectory.save import described, parts
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.sweep.axes import Axes
@@ -87,7 +87,7 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
                 matching.append(kept)
             except ValueError as error:
                 mismatches.append(error)
-        return trajectory_of(found, kept)
+        return trajectory_from(found, kept)
 
     reader = Reader(lambda name: _from_json(arrays.pop(name)), marked_value, table)
     try:

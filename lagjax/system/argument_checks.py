@@ -13,6 +13,7 @@ from lagjax.system.system import System
 P = ParamSpec("P")
 R = TypeVar("R")
 CONSTRAINTS = (Holonomic, Nonholonomic)
+SYSTEMS = (System, Hybrid)
 
 
 def check_system(system: Any, *others: Any, phases: bool = False) -> None:
@@ -20,7 +21,7 @@ def check_system(system: Any, *others: Any, phases: bool = False) -> None:
 
     `others`: the following arguments, among which the system may be.
     """
-    if type(system) is System or isinstance(system, (System, Hybrid) if phases else System):
+    if type(system) is System or isinstance(system, SYSTEMS if phases else System):
         return
     known_system(system)
     if isinstance(system, Hybrid):
@@ -41,7 +42,7 @@ def _describe(thing):
 
 
 def _remedy(system, others):
-    places = [i for i, x in enumerate(others, 2) if isinstance(x, System | Hybrid)]
+    places = [i for i, x in enumerate(others, 2) if isinstance(x, SYSTEMS)]
     if places:
         return (
             f"Usual cause: arguments in another order; the system is argument {places[0]} here.\n"
@@ -54,7 +55,7 @@ def _remedy(system, others):
             "Usual cause: a constraint without its system.\n"
             'Fix: system = lj.System(lagrangian, constraints={"rod": constraint}).'
         )
-    if isinstance(getattr(system, "system", None), System | Hybrid):
+    if isinstance(getattr(system, "system", None), SYSTEMS):
         return "Usual cause: a result of a system in place of the system.\nFix: its .system."
     name = getattr(system, "__name__", "lagrangian") if callable(system) else "lagrangian"
     name = "lagrangian" if name == "<lambda>" else name

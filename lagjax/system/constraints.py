@@ -124,12 +124,13 @@ def _check_callable(function, kind, signature):
 
 def position_residual(model, t, x) -> Float[Array, " mh"]:
     """`g(t, q)` of the holonomic constraints, stacked."""
-    return _stack([c.g(t, model.tree(x), model.params) for c in _all(model) if c.of_positions], x.dtype)
+    q, of_positions = model.tree(x), [c for c in model.system.constraints.values() if c.of_positions]
+    return _stack([c.g(t, q, model.params) for c in of_positions], x.dtype)
 
 
 def velocity_residual(model, t, x, u) -> Float[Array, " m"]:
     """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
-    return _stack([c.velocity_residual(model, t, x, u) for c in _all(model)], x.dtype)
+    return _stack([c.velocity_residual(model, t, x, u) for c in model.system.constraints.values()], x.dtype)
 
 
 def jacobian(model, t, x, u) -> Float[Array, "m n"]:
@@ -148,11 +149,7 @@ def baumgarte_feedback(model, t, x, u, rate):
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
     """
-    return _stack([c.feedback(model, t, x, u, rate) for c in _all(model)], x.dtype)
-
-
-def _all(model):
-    return list(model.system.constraints.values())
+    return _stack([c.feedback(model, t, x, u, rate) for c in model.system.constraints.values()], x.dtype)
 
 
 def _stack(parts, dtype):

@@ -42,6 +42,23 @@ class Form(NamedTuple):
     dtype: np.dtype
     residuals: tuple[Residual, ...]
 
+    @property
+    def n(self) -> int:
+        """The number of coordinates."""
+        return sum(int(np.prod(shape)) for shape in self.shapes)
+
+    @property
+    def m(self) -> int:
+        """The number of constraint equations."""
+        return sum(residual.size for residual in self.residuals)
+
+    @property
+    def example(self) -> tuple:
+        """A state (t, q, v) of this form, to trace with."""
+        leaves = [jax.ShapeDtypeStruct(shape, self.dtype) for shape in ((), *self.shapes)]
+        q = jtu.tree_unflatten(self.structure, leaves[1:])
+        return leaves[0], q, q
+
     def tree(self, x):
         """A vector (..., n) in the structure of q."""
         if len(self.shapes) == 1:
@@ -57,16 +74,8 @@ class Model(eqx.Module):
     system: Any
     params: PyTree
     form: Form = eqx.field(static=True)
-
-    @property
-    def n(self) -> int:
-        """The number of coordinates."""
-        return sum(int(np.prod(shape)) for shape in self.form.shapes)
-
-    @property
-    def m(self) -> int:
-        """The number of constraint equations."""
-        return sum(residual.size for residual in self.form.residuals)
+    n: int = eqx.field(static=True)
+    m: int = eqx.field(static=True)
 
     @property
     def names(self) -> list[str]:
@@ -88,18 +97,11 @@ class Model(eqx.Module):
         return np.array([residual.of_positions for residual in self.form.residuals for _ in range(residual.size)], bool)
 
     @property
-    def example(self) -> tuple:
-        """A state (t, q, v) of this form, to trace with."""
-        leaves = [jax.ShapeDtypeStruct(shape, self.form.dtype) for shape in ((), *self.form.shapes)]
-        q = jtu.tree_unflatten(self.form.structure, leaves[1:])
-        return leaves[0], q, q
-
-    @property
     def phases(self) -> "tuple[Model, ...]":
         """The model of each phase; the model itself where the system is no hybrid."""
         if not self.system.in_phases:
             return (self,)
-        return tuple(model_of(phase, *self.example, self.params) for phase in self.system.phases)
+        return tuple(model_of(phase, *self.form.example, self.params) for phase in self.system.phases)
 
     def tree(self, x):
         """A vector (..., n) in the user's structure."""
@@ -111,7 +113,7 @@ class Model(eqx.Module):
 
     def vectors(self, q, v) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """A position and a velocity as vectors."""
-        return self.vector(q), self.vector(v)
+        return coordinates.flatten(q)[0], coordinates.flatten(v)[0]
 
     def split(self, stacked: Float[Array, " m"]) -> dict[str, Array]:
         """One array for each constraint, by name, from a vector over all constraint equations."""
@@ -194,4 +196,4 @@ def _shape_of(constraint, *state):
 
 def unchecked(system, params, form) -> Model:
     """A model of these parts: to make a module the usual way takes long."""
-    return without_init(Model, {"system": system, "params": params, "form": form})
+    return without_init(Model, {"system": system, "params": params, "form": form, "n": form.n, "m": form.m})

@@ -33,9 +33,9 @@ def force(function, lagrangian=free):
 
 
 KINDS = {
-    "friction": ("with the velocity", r"where the velocity of 'q' is 0.5, .*when=lj.sticks"),
-    "switched": ("with the time", r"jump_ts=jnp.array"),
-    "stop": ("with the position", "a switch at that position"),
+    "friction": ("with sign of v in the force", 'jumps="found"'),
+    "switched": ("with t in the force", 'jumps="found"'),
+    "stop": ("with max of q in the Lagrangian", 'jumps="found"'),
     "singularity": ("a singularity of the motion: .* grows without bound as t -> 1.1107", "ts that end before 1.1107"),
     "stiff": ("a stiff system", r"method=lj.Radau5\(\), whose"),
     "spring": ("a stiff spring", r"a constraint in place.*Radau5\(step_powers=\(0, 1\)\)"),

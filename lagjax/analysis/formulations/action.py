@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.analysis.energy import Motion
-from lagjax.integrate.dense_output import in_one_solve
+from lagjax.integrate.trajectory.dense_output import in_one_solve
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced

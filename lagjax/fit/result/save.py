@@ -10,7 +10,6 @@ from lagjax.files import npz
 from lagjax.files.tree_json import NotGiven, NotWritable, Writer
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
 from lagjax.system.signature import UnknownSystem, signature
 
 
@@ -49,6 +48,6 @@ def _known_of_system(fit) -> dict[str, Any]:
     params = jax.tree.map(np.asarray, fit.problem.params(fit.unknowns.shared, 0))
     t = np.asarray(np.asarray(fit.problem.windows.ts)[0, 0], jax.tree.leaves(q)[0].dtype)
     state = State(t, q, v, params)
-    phase = int(system.first) if isinstance(system, Hybrid) else None
+    phase = int(system.first) if system.in_phases else None
     about = {"words": repr(system), "angles": (), "signature": signature(system, state), "state": tuple(state)}
     return about | {"starts": jax.tree.map(np.asarray, fit.known_starts()), "phase": phase}

@@ -124,7 +124,10 @@ def swept_back(leaves, found: Recorded, asked, *, motion: BackwardMotion, moved,
 def together(leaves, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
     """The cotangents of outputs, with those of all outputs at one time added to the first of these."""
     _, first = _outputs(leaves, motion, lanes)
-    summed = lambda first, ct: jnp.zeros_like(ct).at[first].add(ct)
+
+    def summed(first, ct):
+        return jnp.zeros_like(ct).at[first].add(ct)
+
     summed = summed if lanes is None else jax.vmap(summed)
     return jax.tree.map(lambda ct: summed(first, ct), of_outputs)
 
@@ -176,12 +179,18 @@ class _Way:
 
     def at(self, tree, i):
         """The i-th rows."""
-        of = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+
+        def of(tree, i):
+            return jax.tree.map(lambda x: x[i], tree)
+
         return of(tree, i) if self.lanes is None else jax.vmap(of)(tree, i)
 
     def each(self, function: Callable, more: int) -> Callable:
         """Turn `function(problem, ...)` into one of the arrays and `more` arguments, mapped over the lanes."""
-        of = lambda *x: function(self.motion.problem(x[: len(x) - more]), *x[len(x) - more :])
+
+        def of(*x):
+            return function(self.motion.problem(x[: len(x) - more]), *x[len(x) - more :])
+
         return of if self.lanes is None else self.lanes.each(of, more)
 
     def safe(self, tree):
@@ -200,7 +209,10 @@ class _Way:
 
     def at_time(self, t, ct):
         """The cotangent of a time as that of the equal end of a step."""
-        of = lambda ts, t, ct: jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
+
+        def of(ts, t, ct):
+            return jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
+
         ends = self.where.controller.ts
         of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
         return of(self.leaves[ends], t, ct)
@@ -213,14 +225,14 @@ class _Way:
 
         def end(by, chosen, *start):
             start = start if self.of_times else (t0, t1, *start)
-            step = lambda problem, *start: by(self.copied(problem.solver, *start), *start)
-            return self.each(step, 3)(*filled(leaves, self.moved, chosen), *start)
+            step = self.each(lambda problem, *start: by(self.copied(problem.solver, *start), *start), 3)
+            return step(*filled(leaves, self.moved, chosen), *start)
 
         _, pull, valid = jax.vjp(partial(end, ProjectedSolver.again), *start, has_aux=True)
         if self.motion.robust:
             # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
-            robustly = lambda ct: jax.vjp(partial(end, ProjectedSolver.again_robustly), *start)[1](ct)
-            pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, robustly)
+            robustly = partial(end, ProjectedSolver.again_robustly)
+            pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, lambda ct: jax.vjp(robustly, *start)[1](ct))
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
@@ -248,7 +260,10 @@ class _Way:
         output = jnp.maximum(s.output, 0)
         time = self.at(self.ts, output)
         hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
-        only = lambda condition, tree: jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
+
+        def only(condition, tree):
+            return jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
+
         ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
         of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct))
         total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
@@ -278,5 +293,8 @@ class _Way:
 
 def _outputs(leaves, motion, lanes):
     """The output times, and the first output at each of them, for one lane or for all."""
-    of = lambda *leaves: (motion.problem(leaves).ts, motion.problem(leaves).first)
+
+    def of(*leaves):
+        return motion.problem(leaves).ts, motion.problem(leaves).first
+
     return of(*leaves) if lanes is None else lanes.each(of)(*leaves)

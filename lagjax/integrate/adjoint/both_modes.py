@@ -67,8 +67,12 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     # Undifferentiated, the solve is a program that other transformations may look into, as into a call.
     program = jax.make_jaxpr(lambda *leaves: solve_flat(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
     with_record = jax.jit(partial(solve_flat, Replay(), True))
-    no_steps = lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0
-    rules = _Solve(with_record if recorded else None, outputs, no_steps, len(jtu.tree_leaves(x)))
+    rules = _Solve(
+        with_record if recorded else None,
+        outputs,
+        lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0,
+        len(jtu.tree_leaves(x)),
+    )
     found = _solve_p.bind(*leaves, program=program, rules=rules)
     return jtu.tree_unflatten(shapes["y"], found)
 
@@ -94,20 +98,22 @@ class _Solve:
             return leaves
         none = self.no_steps(*record)
         none = none if self.axes is None else jnp.all(none.reshape(none.shape[0], -1), axis=1)
-        still = lambda x: jnp.where(none.reshape(none.shape + (1,) * (x.ndim - none.ndim)), lax.stop_gradient(x), x)
+
+        def still(x):
+            return jnp.where(none.reshape(none.shape + (1,) * (x.ndim - none.ndim)), lax.stop_gradient(x), x)
+
         # Arrays that all lanes share must not get a lane axis.
         own = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
         return [still(x) if m else x for x, m in zip(leaves, own)]
 
     def in_lanes(self, axes, count):
         """Return the same for lanes, whose axis comes first in the results."""
-        lanes = lambda function: jax.vmap(function, axes, axis_size=count)
 
         def outputs(adjoint, *operands):
             more = [0] * (len(operands) - len(axes))
             return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
 
-        recorded = self.recorded and lanes(self.recorded)
+        recorded = self.recorded and jax.vmap(self.recorded, axes, axis_size=count)
         return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
 
 
@@ -122,7 +128,10 @@ def _solved_shapes(*leaves, program, rules):
 def _solved_jvp(primals, tangents, *, program, rules):
     # Arrays without a tangent are constants: a tangent of zeros would be carried through every step.
     moved = [i for i in range(rules.size) if not isinstance(tangents[i], ad.Zero)]
-    zero = lambda y: ad.Zero(jax.typeof(y).to_tangent_aval())
+
+    def zero(y):
+        return ad.Zero(jax.typeof(y).to_tangent_aval())
+
     if rules.recorded is None or not moved or _are_few(primals[i] for i in moved):
         # Bind the primitive, so that a second derivative finds this rule again.
         values, record = _solve_p.bind(*primals, program=program, rules=rules), []
@@ -174,7 +183,10 @@ def _split(operands, size):
 
 def _tangent(points, dx, *, outputs, shapes, size, many):
     x, fixed = points[:size], points[size:]
-    along = lambda dx: jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
+
+    def along(dx):
+        return jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
+
     return jax.vmap(along)(dx) if many else along(dx)
 
 
@@ -238,7 +250,7 @@ def _pushed_jvp(primals, tangents, *, along, size):
 
 
 def _pushed_transpose(points, like, wanted, cotangents, *, along, size):
-    push = lambda *axes: jax.vmap(lambda *axes: along(*points, *axes))(*axes)
+    push = jax.vmap(partial(along, *points))
     return _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
 
 
@@ -272,17 +284,17 @@ def _tangent_transpose(points, dx, wanted, cotangents, *, outputs, shapes, size,
     if _are_few(a for a, w in zip(x, wanted) if w):
         params = dict(outputs=outputs, shapes=shapes, size=size)
         cotangents = [ad.instantiate_zeros(ct) for ct in cotangents]
-        along = lambda cotangents: _pull_by_pushing(x, fixed, wanted, cotangents, **params)
+        along = partial(_pull_by_pushing, x, fixed, wanted, **params)
     else:
         nonzero = tuple(not isinstance(ct, ad.Zero) for ct in cotangents)
         cotangents = tuple(ct for ct, n in zip(cotangents, nonzero) if n)
-        along = lambda cotangents: pull(x, fixed, cotangents, which=(wanted, nonzero), outputs=outputs)
+        along = partial(pull, x, fixed, which=(wanted, nonzero), outputs=outputs)
     return jax.vmap(along)(cotangents) if many else along(cotangents)
 
 
 def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
     """Push along the axes of all wanted arrays, and return the products of these derivatives with the cotangents."""
-    push = lambda *axes: _tangent_p.bind(*x, *fixed, *axes, many=True, **params)
+    push = partial(_tangent_p.bind, *x, *fixed, many=True, **params)
     return _along_axes(x, wanted, push, cotangents)
 
 
@@ -290,9 +302,10 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     operands, batched, lanes = front(operands, axes)
     x, fixed, dx = _split(operands, size)
     batched_x, batched_fixed, batched_dx = _split(batched, size)
-    widen = lambda leaves, have: [
-        leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)
-    ]
+
+    def widen(leaves, have):
+        return [leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)]
+
     params = dict(outputs=outputs, shapes=shapes, size=size, many=many)
     if not any(batched_x + batched_fixed):
         # Many directions at one point: do not repeat the solve itself.
@@ -306,7 +319,10 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     # all lanes, such as a network's, are not repeated: products with them, and for their gradient, are matrix products.
     per_lane = [many or a or b for a, b in zip(batched_x, batched_dx)]
     x, dx = (widen(y, [b or not a for b, a in zip(have, per_lane)]) for y, have in ((x, batched_x), (dx, batched_dx)))
-    along = lambda dx: _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params)
+
+    def along(dx):
+        return _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params)
+
     if many:
         # The directions of each lane one after the other.
         dy = lax.map(along, [jnp.moveaxis(d, 1, 0) for d in dx])

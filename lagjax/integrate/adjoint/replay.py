@@ -127,12 +127,12 @@ def _known_batched(operands, axes, *, motion, lanes):
     leaves, values = operands[: motion.size], operands[motion.size :]
     values = [x if b else jnp.broadcast_to(x, (count, *x.shape)) for x, b in zip(values, batched[motion.size :])]
     if lanes is None:
-        both, back = Lanes(count, batched[: motion.size]), lambda x: x
+        both = Lanes(count, batched[: motion.size])
     else:
         leaves, both = _lanes_of_lanes(leaves, batched, lanes, count)
         values = [x.reshape(count * lanes.count, *x.shape[2:]) for x in values]
-        back = lambda x: x.reshape(count, lanes.count, *x.shape[1:])
-    found = [back(x) for x in _known_p.bind(*leaves, *values, motion=motion, lanes=both)]
+    found = _known_p.bind(*leaves, *values, motion=motion, lanes=both)
+    found = found if lanes is None else [x.reshape(count, lanes.count, *x.shape[1:]) for x in found]
     return found, [0] * len(found)
 
 
@@ -146,8 +146,9 @@ def _run_jvp(primals, tangents, *, motion, lanes, same_run):
 def _pushed(leaves, tangents, motion, lanes):
     """Values and tangents of one run; it is no linear map, so it cannot be transposed."""
     moved, moving = _moving(tangents)
-    of_moved = lambda *chosen: _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
-    values, found = jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))
+    run = partial(_run, motion=motion, lanes=lanes)
+    start = tuple(leaves[i] for i in moved)
+    values, found = jax.jvp(lambda *chosen: run(*filled(leaves, moved, chosen)), start, tuple(moving))
     return values, [d if _is_float(x) else _zero(x) for x, d in zip(values, found)]
 
 

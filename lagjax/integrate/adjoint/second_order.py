@@ -67,8 +67,11 @@ def _pull_tangent(x, fixed, cotangents, which, outputs, at, direction):
 
 def _pushed(x, fixed, outputs, at, direction):
     """The derivative of the outputs with respect to the x at the indices `at`, along a direction."""
-    of_moved = lambda *chosen: outputs(diffrax.ForwardMode(), *filled(x, at, chosen), *fixed)
-    return jax.jvp(of_moved, tuple(x[i] for i in at), tuple(direction))[1]
+    return jax.jvp(
+        lambda *chosen: outputs(diffrax.ForwardMode(), *filled(x, at, chosen), *fixed),
+        tuple(x[i] for i in at),
+        tuple(direction),
+    )[1]
 
 
 @dataclass(frozen=True)
@@ -146,12 +149,16 @@ class _OverLanes:
     count: int
 
     def forward(self, points, moved, moving):
-        along = lambda points, moving: self.one.forward(points, moved, moving)
-        return jax.vmap(along, (list(self.points), list(self.moving)), axis_size=self.count)(points, moving)
+        return jax.vmap(
+            lambda points, moving: self.one.forward(points, moved, moving),
+            (list(self.points), list(self.moving)),
+            axis_size=self.count,
+        )(points, moving)
 
     def backward(self, points, moved, w):
-        back = lambda points, w: self.one.backward(points, moved, w)
-        found = jax.vmap(back, (list(self.points), 0), axis_size=self.count)(points, w)
+        found = jax.vmap(
+            lambda points, w: self.one.backward(points, moved, w), (list(self.points), 0), axis_size=self.count
+        )(points, w)
         return [x if axis == 0 else jnp.sum(x, axis=0) for x, axis in zip(found, self.moving)]
 
 

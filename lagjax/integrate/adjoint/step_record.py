@@ -122,7 +122,10 @@ def with_room(problem: StepProblem, memory: float | None) -> StepProblem:
     """The problem with room for a record of `memory` bytes, half of them for rows; None: the usual room."""
     if memory is None:
         return problem._replace(room=Room(ROWS, PLACES))
-    size = lambda tree: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+    def size(tree):
+        return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
     place = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, _first(problem)))
     # On the way back a piece is run again while the later one is held, and its ends are corrected: XLA keeps four.
     of_row, of_place = 4 * size((problem.t0, problem.t1, problem.y0)), size(place)
@@ -148,7 +151,9 @@ def recorded(problem: StepProblem, max_steps: int | None) -> Recorded:
     place = _first(p)
     places = jax.tree.map(lambda x: jnp.broadcast_to(x, (p.room.places, *jnp.shape(x))), place)
     start = _RecordRun(place, _no_rows(p), zero, zero, _success(), outputs, p.after[0])
-    continues = lambda run: _continues(p, run, max_steps)
+
+    def continues(run):
+        return _continues(p, run, max_steps)
 
     def onward(state):
         run, places, stride = state
@@ -157,8 +162,9 @@ def recorded(problem: StepProblem, max_steps: int | None) -> Recorded:
         places = lax.cond(eqxi.unvmap_any(full), lambda: _thinned(places, full), lambda: places)
         stride = jnp.where(full, 2 * stride, stride)
         here = continues(run) & (number % stride == 0)
-        put = lambda all, x: _put(all, jnp.minimum(number // stride, p.room.places - 1), x, here)
-        places = jax.tree.map(put, places, run.place)
+        places = jax.tree.map(
+            lambda all, x: _put(all, jnp.minimum(number // stride, p.room.places - 1), x, here), places, run.place
+        )
         return _until(p, run, (number + 1) * many, max_steps), places, stride
 
     state = start, places, jnp.asarray(1)
@@ -208,13 +214,14 @@ def _first(p: StepProblem) -> RecordPlace:
 
 def _no_rows(p: StepProblem) -> RecordRows:
     # Rows without a step hold the start: they may be evaluated, and must be finite although the result is unused.
-    rows = lambda x: jnp.broadcast_to(x, (p.room.rows, *x.shape))
+    def rows(x):
+        return jnp.broadcast_to(x, (p.room.rows, *x.shape))
+
     return RecordRows(rows(p.t0), rows(p.t0), jax.tree.map(rows, p.y0))
 
 
 def _thinned(places, full):
-    half = lambda x: jnp.concatenate([x[::2], x[len(x) // 2 :]])
-    return jax.tree.map(lambda x: jnp.where(full, half(x), x), places)
+    return jax.tree.map(lambda x: jnp.where(full, jnp.concatenate([x[::2], x[len(x) // 2 :]]), x), places)
 
 
 def _continues(p: StepProblem, run: _RecordRun, max_steps):
@@ -227,7 +234,9 @@ def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
 
     Batched by JAX, a loop selects whole arrays in each turn for lanes that are done; here only changed entries are.
     """
-    continues = lambda run: _continues(p, run, max_steps) & (run.accepted < limit)
+
+    def continues(run):
+        return _continues(p, run, max_steps) & (run.accepted < limit)
 
     def turn(run: _RecordRun) -> _RecordRun:
         here, place, row = continues(run), run.place, run.accepted % p.room.rows

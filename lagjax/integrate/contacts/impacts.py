@@ -67,7 +67,10 @@ class Impact(OfPhases):
 
     def mapped(self, on: Callable) -> "Impact":
         """Return the same with `on(role, function, takes)` in place of each function."""
-        part = lambda role, f, *takes: on(role, f, takes) if callable(f) else f
+
+        def part(role, f, *takes):
+            return on(role, f, takes) if callable(f) else f
+
         return Impact(
             part("gap", self.gap, *OF_POSITION),
             part("restitution", self.restitution, "speed"),
@@ -117,8 +120,15 @@ class _Rebound(eqx.Module):
         mu, sliding = self.impact.friction, self.impact.sliding
         assert sliding is not None
         mu = mu(params) if callable(mu) else mu
-        momentum = lambda v: jax.grad(self.before.lagrangian, argnums=2)(t, q, v, params)
-        metric = lambda d: coordinates.flatten(d)[0] @ coordinates.flatten(jax.jvp(momentum, (v,), (d,))[1])[0]
+
+        def metric(d):
+            return (
+                coordinates.flatten(d)[0]
+                @ coordinates.flatten(
+                    jax.jvp(lambda v: jax.grad(self.before.lagrangian, argnums=2)(t, q, v, params), (v,), (d,))[1]
+                )[0]
+            )
+
         n, h = metric(by_gap), metric(along)
         speed, k = jax.jvp(lambda v: sliding(t, q, v, params), (v,), (by_gap,))
         smooth = speed + jump * k

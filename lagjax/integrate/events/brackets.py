@@ -191,7 +191,10 @@ def _bend(g, rate, h):
     for x, dx, share in zip(g[1:-1], rate[1:-1], INNER):
         powers = share ** np.arange(4)
         value, slope = CUBIC @ powers, np.polynomial.polynomial.polyder(CUBIC, axis=1) @ powers[:3]
-        by = lambda weights: sum(w * x for w, x in zip(weights.tolist(), ends))
+
+        def by(weights):
+            return sum(w * x for w, x in zip(weights.tolist(), ends))
+
         off = jnp.maximum(off, jnp.maximum(jnp.abs(x - by(value)), jnp.abs(h * dx - by(slope))))
     return off
 
@@ -200,7 +203,9 @@ def between(left: Node, right: Node, h):
     """(state, acceleration) at the inner nodes, by the quintic, and by the cubics through (q, v) and (v, a)."""
     (q0, v0), (q1, v1), a0, a1 = left.y, right.y, left.a, right.a
     inverse = 1 / jnp.where(h > 0, h, 1.0)
-    scaled = lambda c, x: jtu.tree_map(lambda x: c * x, x)
+
+    def scaled(c, x):
+        return jtu.tree_map(lambda x: c * x, x)
 
     def by(coefficients, derivatives, share, *ends):
         powers = np.polynomial.polynomial.polyder(coefficients, derivatives, axis=1)
@@ -350,17 +355,21 @@ class Sight(eqx.Module):
         ]
         # Where the slope is infinite, half of the digits remain.
         half = jnp.sqrt(eps)
-        noise = lambda x, d: jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x))
+        noise = [
+            jnp.where(jnp.isfinite(d), eps * (jnp.abs(d) + jnp.abs(x)), half * jnp.abs(x)) for x, d in zip(g, digits)
+        ]
         values = tuple(
-            GuardValue(x, dx, noise(x, d), turning.turns, at_rest)
-            for x, dx, d, turning, at_rest in zip(g, rate, digits, right.values, still)
+            GuardValue(x, dx, off, turning.turns, at_rest)
+            for x, dx, off, turning, at_rest in zip(g, rate, noise, right.values, still)
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
 
     def _along(self, places, directions, args):
         """The guards at places (t, y), and their derivatives along one direction for each place: pairs of tuples."""
-        value = lambda t, y: self.value(t, y, args)
-        push = lambda place, direction: self._known(*jax.jvp(value, place, direction))
+
+        def push(place, direction):
+            return self._known(*jax.jvp(lambda t, y: self.value(t, y, args), place, direction))
+
         if not self.guards.long:
             return [push(*x) for x in zip(places, directions)]
         together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
@@ -369,7 +378,10 @@ class Sight(eqx.Module):
 
     def _known(self, g, rate):
         """The guards and their rates, without infinite slopes and NaN where a guard may not stop the motion."""
-        finite = lambda x, other: jnp.where(jnp.isfinite(x), x, other)
+
+        def finite(x, other):
+            return jnp.where(jnp.isfinite(x), x, other)
+
         may_rest = [kind.may_rest for kind in self.guards.kinds]
         return (
             tuple(finite(x, 1.0) if rests else x for x, rests in zip(g, may_rest)),

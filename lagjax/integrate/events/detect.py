@@ -54,7 +54,7 @@ from lagjax.integrate.events.brackets import (
 )
 from lagjax.integrate.events.event import EventKind
 from lagjax.jaxtools.fuse_cpu import apart
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools.trees import like, stop_gradient
 from lagjax.mechanics.equations import all_finite
 
 # The most looks inside one step: an extremum takes three, a jump fifty.
@@ -194,17 +194,23 @@ class EventController(diffrax.AbstractStepSizeController):
             ended = ended | (c & kind.terminal)
 
         def with_new():
-            put = lambda x, all: jnp.where(new.reshape(-1, *[1] * x.ndim), x[None], all)
-            return jtu.tree_map(put, (lax.stop_gradient(t1), y1), (watched.t, watched.y))
+            here = lax.stop_gradient(t1), y1
+            return jtu.tree_map(lambda x, all: jnp.where(like(new, all), x, all), here, (watched.t, watched.y))
 
         t, y = lax.cond(eqxi.unvmap_any(jnp.any(new)), with_new, lambda: (watched.t, watched.y))
         followed = tuple(f._replace(count=f.count + c) for f, c in zip(move.followed, crossed))
         begins = keep & ~watched.begun
-        known = lambda values, turns: tuple(v._replace(turns=v.turns | x) for v, x in zip(values, turns))
+
+        def known(values, turns):
+            return tuple(v._replace(turns=v.turns | x) for v, x in zip(values, turns))
+
         here, at_left = known(values, move.turns), known(watched.values, move.turns_left)
         a, values = _where(takes | begins, (a, here), (watched.a, at_left))
         later = Watched(watched.begun | keep, a, values, followed, t, y, move.part)
-        small = lambda w: w._replace(t=None, y=None)
+
+        def small(w):
+            return w._replace(t=None, y=None)
+
         later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
         return takes, move.at, ended, later
 

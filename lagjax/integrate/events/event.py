@@ -202,8 +202,8 @@ class Guards(eqx.Module):
     def __call__(self, t, q, v, multipliers, params) -> tuple[Float[Array, ""], ...]:
         """Return the value of each guard; true counts as one, false as minus one."""
         q, v = (q, v) if self.together is None else (self.together(q), self.together(v))
-        of = lambda kind: (t, q, v, multipliers, params) if kind.takes_multipliers else (t, q, v, params)
-        return tuple(_number(f(*of(kind)), t) for f, kind in zip(self.functions, self.kinds))
+        more = [(multipliers, params) if kind.takes_multipliers else (params,) for kind in self.kinds]
+        return tuple(_number(f(t, q, v, *rest), t) for f, rest in zip(self.functions, more))
 
 
 class Condition(eqx.Module):
@@ -272,10 +272,8 @@ def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
     return diffrax.Event(asking) if asking else None
 
 
-def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False) -> Guards | None:
-    """Return the guards of all crossings, called once on shapes; None without crossings. `start`: the first state."""
-    if not crossings:
-        return None
+def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False) -> Guards:
+    """Return the guards of one or more crossings, called once on shapes. `start`: the first state."""
     functions, of_guards = [], []
     given = dict(zip(OF_STATE, start)) | {"multipliers": model_of(system, *start).zero_multipliers()}
     for name, crossing in crossings.items():

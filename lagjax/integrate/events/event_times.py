@@ -148,8 +148,10 @@ def _flow(live, tau, z, *, rate):
 @_flow.def_jvp
 def _flow_jvp(primals, tangents, *, rate):
     (live, tau, z), (moves, dtau, dz) = primals, tangents
-    zero_if_none = lambda x, dx: jnp.zeros_like(x) if dx is None else dx
-    filled = lambda z, dz: jtu.tree_map(zero_if_none, z, dz, is_leaf=lambda x: x is None)
+
+    def filled(z, dz):
+        return jtu.tree_map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, z, dz, is_leaf=lambda x: x is None)
+
     dz = filled(z, dz)
 
     def of_both(live, z):
@@ -179,7 +181,10 @@ def _wait(live, z, owner, resolution, *, flow):
 def _wait_jvp(primals, tangents, *, flow):
     (live, z, owner, resolution), (moves, dz, *_) = primals, tangents
     tau = _wait(live, z, owner, resolution, flow=flow)
-    after = lambda live, tau, z: _guard(live, flow(live, tau, z, rate=_rate), owner)
+
+    def after(live, tau, z):
+        return _guard(live, flow(live, tau, z, rate=_rate), owner)
+
     g, rate = jax.jvp(lambda tau: after(live, tau, z), (tau,), (jnp.ones_like(tau),))
     _, dg = eqx.filter_jvp(lambda live, z: after(live, tau, z), (live, z), (moves, dz))
     # Where the guard jumps, it determines no derivative.

@@ -27,7 +27,7 @@ from lagjax.jaxtools.jaxpr import outputs_of, run
 from lagjax.jaxtools.open_jumps import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps
 from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import OF_STATE, takes_of
-from lagjax.system.model import model_of
+from lagjax.system.model import Model
 from lagjax.system.system import System
 
 # More modes than this are not followed: each adds to the program that watches the motion.
@@ -172,10 +172,11 @@ class Jumps:
         return jnp.stack([f(*state[:-1], free).astype(dtype) for f in self.numbers(system, 3)])
 
 
-def found(system: System, t, q, v, params) -> Jumps | None:
+def found(model: Model, state: State) -> Jumps | None:
     """The jumps and kinks of a system; None if there are none. Only shapes of the state count."""
-    state = State(t, q, v, params)
-    programs = {role: _traced(getattr(system, role), system, state) for role in ROLES if getattr(system, role)}
+    functions = {role: getattr(model.system, role) for role in ROLES}
+    given = state._asdict() | {"multipliers": model.zero_multipliers() if model.reacts else {}}
+    programs = {role: _traced(function, given) for role, function in functions.items() if function is not None}
     programs = {role: traced for role, traced in programs.items() if has_jumps(traced.program.jaxpr)}
     if not programs:
         return None
@@ -204,11 +205,9 @@ class _Program(NamedTuple):
     multipliers: tuple
 
 
-def _traced(function, system, state: State) -> _Program:
-    """The program of a function, with the numbers of its inputs, and on what of the state each depends."""
+def _traced(function: Callable, given: dict[str, Any]) -> _Program:
+    """The program of a function of what is `given`, with the numbers of its inputs, and on what each depends."""
     takes = takes_of(function)
-    zeros = model_of(system, *state).zero_multipliers() if "multipliers" in takes else {}
-    given = state._asdict() | {"multipliers": zeros}
     arguments = tuple(given[name] for name in takes)
     shapes = []
 
@@ -227,6 +226,7 @@ def _traced(function, system, state: State) -> _Program:
     for name, argument in zip(takes, arguments):
         depends = frozenset() if name == "params" else frozenset({name})
         inputs += [((name, i) if name != "t" else ("t",), depends) for i in range(len(leaves_of(None, argument)))]
+    zeros = given["multipliers"] if "multipliers" in takes else {}
     multipliers = tuple((name, x.shape) for name, x in zeros.items())
     return _Program(program, inputs, shapes[0], takes, multipliers)
 
@@ -361,7 +361,10 @@ def _between(rule, before, after, table):
 def _sought(roles, ts):
     fixed = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, (roles, ts))
     roles_fixed, (first, last) = fixed[0], (fixed[1][0], fixed[1][-1])
-    modes_at = lambda t: _results(roles_fixed, t).modes
+
+    def modes_at(t):
+        return _results(roles_fixed, t).modes
+
     grid = first + (last - first) * jnp.linspace(0.0, 1.0, SAMPLES + 1, dtype=ts.dtype)
     modes = jax.vmap(modes_at)(grid)
     changes = modes[1:] != modes[:-1]
@@ -372,7 +375,10 @@ def _sought(roles, ts):
     too_many = jnp.sum(changes) > ROOM
     there, number = (number < changes.size) & ~too_many, jnp.minimum(number, changes.size - 1)
     low, high = grid[number // count], grid[number // count + 1]
-    mine = lambda modes: jnp.take_along_axis(modes, (number % count)[:, None], axis=1)[:, 0]
+
+    def mine(modes):
+        return jnp.take_along_axis(modes, (number % count)[:, None], axis=1)[:, 0]
+
     each = jax.vmap(modes_at)
     before = mine(each(low))
 
@@ -389,7 +395,9 @@ def _sought(roles, ts):
         found = _results(roles, t, before, after)
         return (found.x - found.changes_at)[component]
 
-    along = lambda t, *rest: jax.jvp(lambda t: difference(t, *rest), (t,), (jnp.ones_like(t),))
+    def along(t, *rest):
+        return jax.jvp(lambda t: difference(t, *rest), (t,), (jnp.ones_like(t),))
+
     t = high
     for _ in range(NEWTON):
         g, rate = jax.vmap(along)(t, number % count, before, after)

@@ -76,11 +76,9 @@ class Sliding(eqx.Module):
             return jnp.stack([f(t, model.tree(x), model.tree(u), given) for f in self.differences])
 
         _, rates = jax.jvp(difference, (t, x, u), (jnp.ones_like(t), u, a))
-        push = lambda change: jax.jvp(lambda u: difference(t, x, u), (u,), (change,))[1]
-        pushes, count = [push(change) for change in changes], len(self.which)
+        pushes, count = [jax.jvp(partial(difference, t, x), (u,), (change,))[1] for change in changes], len(self.which)
         active = [given.slides[i] for i in self.which]
-        one = lambda i, j: 1.0 if i == j else 0.0
-        rows = [[jnp.where(active[i], pushes[j][i], one(i, j)) for j in range(count)] for i in range(count)]
+        rows = [[jnp.where(active[i], pushes[j][i], float(i == j)) for j in range(count)] for i in range(count)]
         rows = [[jnp.where(active[j] | (i == j), x, 0.0) for j, x in enumerate(row)] for i, row in enumerate(rows)]
         shares, _ = dense.solve_without_exchanges(rows, [jnp.where(active[i], -rates[i], 0.0) for i in range(count)])
         shares = [jnp.where(on, share, 0.0) for on, share in zip(active, shares)]

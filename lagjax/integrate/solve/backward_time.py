@@ -24,9 +24,13 @@ import diffrax
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
+from lagjax.integrate.events.event import Guards
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.trajectory.trajectory import Snapshot, Trajectory, pack
+from lagjax.integrate.solve.settings import Settings
+from lagjax.integrate.trajectory.parts import Snapshot, pack
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.system.coordinates import is_traced
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System
@@ -61,10 +65,11 @@ class ReflectedCondition(eqx.Module):
         return self.condition(-t, (q, _negative(v)), args, **kwargs)
 
 
-def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: bool) -> Trajectory:
-    """Call `trajectory_of` for increasing or, if `backward`, decreasing times."""
-    if not backward:
-        return trajectory_of(system, q0, v0, params, ts, guards, settings)
+def backward_trajectory_of(
+    system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Float[Array, " T"], guards: Guards | None,
+    settings: Settings,
+) -> Trajectory:  # fmt: skip
+    """What `trajectory_of` is for increasing times, for decreasing ones."""
     if guards is not None:
         # Directions of crossings stay: they are meant along the run of the motion, as in SciPy.
         guards = replace(guards, functions=tuple(map(Reflected, guards.functions)))
@@ -72,7 +77,8 @@ def in_either_direction(system, q0, v0, params, ts, guards, settings, backward: 
         reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
     )
     asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
-    arrays, static = pack(system, params, asked, reflected.static.how._replace(backward=True))
+    how = reflected.static.how._replace(backward=True)
+    arrays, static = pack((system, params, asked), how, backward_trajectory_of)
     events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
     v, end = _negative(reflected.v), reflect_snapshot(reflected.end)
     return replace(reflected, t=ts, v=v, end=end, events=events, arrays=arrays, static=static)

@@ -111,10 +111,13 @@ def _compared(xp, first, second, ts) -> Trajectory:
     # Outputs that were not reached are NaN, and come last.
     sizes = np.fmax.accumulate(abs(x)) if xp is np else lax.cummax(jnp.nan_to_num(abs(x)))
     errors = (abs(x - y) + share * sizes).astype(ts.dtype)
-    of_times = lambda name, found: _of_times(xp, xp.asarray(found.t), xp.asarray(second.events[name].t), share)
-    times = {name: of_times(name, found) for name, found in first.events.items()}
+    both = {name: (xp.asarray(found.t), xp.asarray(second.events[name].t)) for name, found in first.events.items()}
+    times = {name: _of_times(xp, *pair, share) for name, pair in both.items()}
     found = Errors(*_like_trajectory(errors, first), times, second.result, steps)
-    of_motion = lambda row: row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
+
+    def of_motion(row):
+        return row[: 2 * sum(np.size(x) for x in jax.tree.leaves(first.end.q))].reshape(2, -1)
+
     worst = of_motion(np.fmax.reduce(errors) if xp is np else jnp.nanmax(errors, axis=0))
     excess = scaled_error(xp, worst, of_motion(sizes[-1]), first, ts, tuple(map(xp.asarray, first.tolerance)))
     if well is not True:

@@ -22,9 +22,6 @@ from lagjax.jaxtools.primitives import primitive
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED
 from lagjax.jaxtools.trees import stop_gradient
 
-# In a batch, whose lanes wait for each other: the number of steps after which a motion is given up, to be run alone.
-PATIENCE = jax.make_user_context(default_value=None)
-
 
 class Report(NamedTuple):
     """How motions went, taken together: the first bad result, all steps, the worst scaled_error and residual.
@@ -69,12 +66,6 @@ def reported(found: PyTree, of: Callable[[Any], Report | Settled]) -> PyTree:
     mark = of(found)
     kept = _report_p.bind(*map(jnp.asarray, (*leaves, *mark)), kind=type(mark))[: -len(mark)]
     return eqx.combine(jtu.tree_unflatten(structure, kept), rest)
-
-
-def patient(max_steps: int | None) -> int | None:
-    """The number of steps that a motion may take, within `PATIENCE`."""
-    limits = [limit for limit in (max_steps, PATIENCE.value) if limit is not None]
-    return min(limits, default=None)
 
 
 def reporting(function: Callable) -> Callable:
@@ -170,5 +161,8 @@ def _jvp(primals, tangents, kind):
     return _report_p.bind(*primals, kind=kind), list(tangents)
 
 
-_same = lambda *operands, kind: list(operands)
+def _same(*operands, kind):
+    return list(operands)
+
+
 _report_p = primitive("report", _same, _same, several=True, jvp=_jvp, batched=_batched)

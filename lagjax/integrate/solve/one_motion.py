@@ -1,15 +1,13 @@
 """Integrate one motion from its start to its end, event or failure: start, diffrax's loop, outputs, result.
 
+`solved` is the recipe, and the functions that it calls follow in their order; after them what `_loop` gives to diffrax.
 No Python code here branches on values: a start that cannot be integrated is refused inside the program, which then
 ends within a few rejected steps, and the lane keeps the reason in its result.
-
-Stepping through a motion by diffrax's loop, with outputs at given times and with guards followed on the way.
 """
 
 import importlib.util
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -23,8 +21,10 @@ from lagjax.integrate.adjoint.replay import Replay, replayed
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, with_room
 from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
+from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
+from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
 from lagjax.integrate.stepping.tolerances import (
@@ -38,8 +38,9 @@ from lagjax.integrate.stepping.tolerances import (
     span_of,
     tolerances_at,
 )
+from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.integrate.trajectory.trajectory import Snapshot, worst_drift
+from lagjax.integrate.trajectory.trajectory import worst_drift
 from lagjax.jaxtools.fuse_cpu import calls_host, one_function
 from lagjax.jaxtools.trees import like, stop_gradient
 from lagjax.mechanics.equations import Equations, all_finite, equations_of
@@ -51,239 +52,12 @@ from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
+from lagjax.system.system import System
 
 # Packages whose checks at run time are known to pass, since `solve` examines their subjects itself.
 CHECKED_PACKAGES = {"lagjax", "diffrax", "optimistix"}
 # Baumgarte's feedback decays a violation by e this many times over the time span.
 BAUMGARTE_DECAYS = 50.0
-
-
-class Solution(NamedTuple):
-    """The result of the loop: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
-
-    `located`: where guards are zero; None without guards. `record`: that of the steps, if they can be replayed.
-    """
-
-    reached: Float[Array, " T"]
-    outputs: PyTree[Float[Array, "T ..."]]
-    end: tuple[Float[Array, " 1"], PyTree[Float[Array, "1 ..."]]]
-    stats: dict[str, Array]
-    result: diffrax.RESULTS
-    located: Located | None
-    record: Recorded | None = None
-
-
-def solution_of(
-    equations: Equations, start: State, y0, refused, scales: Scales | None, ts, guards, settings, adjoint
-) -> Solution:
-    """Step through a motion by diffrax; if `refused`, end within a few steps. Without `scales` by `atol` alone."""
-    problem = (equations, start, y0, refused, scales)
-    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
-        return _loop(*problem, settings, ts, adjoint, guards)
-    # In reverse mode diffrax differentiates only outputs: crossings, once their times are known, become outputs.
-    first = _loop(*stop_gradient((*problem, settings, ts)), diffrax.ForwardMode(), stop_gradient(guards))
-    end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
-    times = jnp.concatenate([ts, first.located.t])
-    times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
-    order = jnp.argsort(times)
-    without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
-    second = _loop(*problem, without, times[order], adjoint, repeated=True)
-    place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
-    of_outputs, of_crossings = (
-        jax.tree.map(lambda x: x[place[part]], second.outputs) for part in (slice(ts.size), slice(ts.size, None))
-    )
-    return first._replace(
-        reached=jnp.where(jnp.isfinite(second.reached[place[: ts.size]]), first.reached, jnp.inf),
-        outputs=of_outputs,
-        end=second.end,
-        located=at_known_times(guards, equations, resolution(ts), first.located, of_crossings, bent),
-    )
-
-
-def _possible_adjoint(adjoint, settings):
-    """Return the adjoint; diffrax's own instead of a `Replay` if a motion is not stepped from output to output."""
-    replayable = _arriving(settings) and not settings.progress
-    return diffrax.RecursiveCheckpointAdjoint() if isinstance(adjoint, Replay) and not replayable else adjoint
-
-
-def _loop(equations, start, y0, refused, scales, settings, ts, adjoint, guards=None, repeated=False):
-    adjoint = _possible_adjoint(adjoint, settings)
-    feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
-    fast, written = None, equations.written
-    if written is not None and feedback is None:
-        unrolled = written.equations.length <= settings.unroll_up_to
-        fast = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
-    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and outputs but no separate end.
-    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
-    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, scales))
-    controller = _controller(equations, start, ts, settings, scales, bare, repeated)
-    terms = diffrax.ODETerm(Field(equations, feedback) if fast is None else FastField(equations))
-    if bare:
-        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
-    else:
-        solver = _solver(equations, fast, feedback, refused, settings, adjoint)
-        subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
-        saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
-    if guards is not None:
-        controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
-    arguments = (
-        terms, solver, ts[0], ts[-1], settings.dt0, y0, start.params, saveat, controller, _by_position(settings.event),
-    )  # fmt: skip
-    solve = partial(_diffeqsolve, max_steps=settings.max_steps, adjoint=adjoint, progress=settings.progress)
-    calls_python = lambda: _user_calls_python(equations, terms, start, guards, settings, controller)
-    if isinstance(adjoint, Replay):
-        assert isinstance(controller, StepToOutputs)
-        first, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
-        problem = StepProblem(
-            terms, solver, controller, ts, first, after, ts[0], ts[-1], settings.dt0, y0, start.params
-        )  # fmt: skip
-        problem = with_room(problem, settings.memory)
-        return _replayed(replayed(problem, settings.max_steps, not calls_python(), adjoint), ts)
-    # Reverse mode needs the operations inside, so the solve is then not wrapped.
-    if isinstance(adjoint, diffrax.ForwardMode):
-        reached, outputs, *rest = one_function(solve, *arguments, checked=not calls_python(), in_blocks=True)
-    else:
-        reached, outputs, *rest = solve(*arguments)
-    assert reached is not None and outputs is not None
-    if bare:
-        end = jax.tree.map(lambda x: x[-1:], (reached, outputs))
-    else:
-        (reached, end_t), (outputs, end_y) = reached, outputs
-        end = end_t, end_y
-    return Solution(reached, outputs, end, *rest)
-
-
-def _replayed(found: Recorded, ts) -> Solution:
-    end = found.t[None], jax.tree.map(lambda x: x[None], found.y)
-    return Solution(jnp.where(found.reached, ts, jnp.inf), found.outputs, end, found.stats, found.result, None, found)
-
-
-def _diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event, *, max_steps, adjoint, progress):
-    solution = diffrax.diffeqsolve(
-        terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
-        event=event, max_steps=max_steps, throw=False, progress_meter=_progress_meter(progress),
-    )  # fmt: skip
-    watching = isinstance(controller, EventController)
-    located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
-    return solution.ts, solution.ys, solution.stats, solution.result, located
-
-
-def _user_calls_python(equations, terms, start, guards, settings, controller):
-    """Whether the user's functions, method or controller may call Python at run time, if only to check something.
-
-    If not, only diffrax's checks are left. They concern the times and the first step, which `solve` examines itself.
-    """
-    parts = (settings.method, settings.controller)
-    if any(part is not None and type(part).__module__.split(".")[0] not in CHECKED_PACKAGES for part in parts):
-        return True
-    (t, q, v, params), written = start, equations.written
-    if written is None:
-        traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
-    else:
-        traced = []
-        if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
-            return True
-    if guards is not None:
-        multipliers = equations.model.zero_multipliers()
-        traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
-    conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
-    given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
-    given |= dict(saveat=None, stepsize_controller=controller)
-    for condition in conditions:
-        traced.append(jax.make_jaxpr(lambda t, y, condition=condition: condition(t, y, params, **given))(t, (q, v)))
-    return any(calls_host(program.jaxpr) for program in traced)
-
-
-def method_alone(settings, method):
-    """Return a method as it steps a motion on equations that are not written out."""
-    return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
-
-
-def _with_root_finder(settings, scales):
-    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
-    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
-    if scales is not None and isinstance(method, Radau5):
-        as_nothing = AsNothing(scales, settings.rtol)
-        ours = isinstance(method.root_finder, SimplifiedNewton)
-        tolerances = settings.rtol[0], as_nothing if ours else as_nothing(jnp.zeros_like(scales.first))
-    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
-        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
-    return with_tolerances(method, *tolerances)
-
-
-def _solver(equations, fast, feedback, refused, settings, adjoint):
-    return ProjectedSolver(
-        solver=_in_a_loop(settings.method, adjoint),
-        equations=equations,
-        fast=fast,
-        feedback=feedback,
-        refused=refused,
-        tolerances=Tolerances(settings.rtol, settings.atol),
-        controlled=settings.controller is None,
-        project=settings.drift == "project",
-        arriving=_arriving(settings),
-        jump_ts=settings.jump_ts,
-    )
-
-
-def _in_a_loop(method, adjoint):
-    """Return the method with a loop over its stages, of the kind that the derivative needs."""
-    if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
-        return replace(method, in_a_loop=True)
-    # A subclass may have a tableau of its own, which diffrax's implementation does not know.
-    ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
-    method = method.shipped if ours else method
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint | Replay):
-        return forward_differentiable(method)
-    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
-
-
-def _arriving(settings):
-    # A user's controller chooses its steps itself; a condition for diffrax may read the controller's tolerances.
-    return settings.controller is None and settings.event is None
-
-
-def _controller(equations, start, ts, settings, scales, bare, repeated):
-    if settings.controller is not None:
-        return settings.controller
-    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
-    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
-    controller = diffrax.PIDController(
-        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
-        force_dtmin=False,
-    )  # fmt: skip
-    angle = tuple(are_angles(equations.model).tolist())
-    if not bare and (scales is not None or settings.apart or any(angle)):
-        controller = PerCoordinateTolerance(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
-    arriving = _arriving(settings) and not bare
-    if settings.jump_ts is None and not repeated:
-        return StepToOutputs(controller, ts, settings.shares) if arriving else controller
-    jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
-    return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
-
-
-def resolution(ts):
-    """Return the smallest difference of two times that can be told apart."""
-    return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-
-
-def _by_position(event):
-    """Return the user's event with `args` by position: diffrax passes it by name, but a user may call it `params`."""
-    if event is None:
-        return None
-    wrap = lambda condition: lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
-    return diffrax.Event(jax.tree.map(wrap, event.cond_fn, is_leaf=callable))
-
-
-def _progress_meter(progress):
-    if not progress:
-        return diffrax.NoProgressMeter()
-    if importlib.util.find_spec("tqdm") is None:
-        return diffrax.TextProgressMeter()
-    return diffrax.TqdmProgressMeter()
-
-
 # A start may be off the constraints by this many tolerances; it is then moved onto them.
 START_TOLERANCES = 100.0
 # A motion of a hundred periods changes the Jacobi integral by ten to a hundred tolerances.
@@ -302,7 +76,10 @@ TRANSLATED = {
 }
 
 
-def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=None):
+def solved(
+    system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Float[Array, " T"], guards: Guards | None,
+    settings: Settings, adjoint: diffrax.AbstractAdjoint, sizes_so_far: Float[Array, "2 n"] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Return the fields of the trajectory of one system by name, with `settled`: whether the robust solve would agree.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
@@ -313,10 +90,19 @@ def solved(system, q0, v0, params, ts, guards, settings, adjoint, sizes_so_far=N
     equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
     if guards is not None and equations.users is not None:
         guards = guards.in_numbers(equations.users.tree)
-    q, v = equations.inside(q0), equations.inside(v0)
-    start = _start(equations, q, v, ts, settings, sizes_so_far)
+    start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings, sizes_so_far)
     settings = replace(settings, atol=start.atol)
-    solution = _stepped(equations, start, ts, guards, settings, adjoint)
+    if settings.dt0 is not None:
+        # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
+        settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
+    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
+        solution = _loop(equations, start, ts, guards, settings, adjoint)
+    else:
+        solution = _loop_twice(equations, start, ts, guards, settings, adjoint)
+    if guards is not None and solution.located is not None:
+        end = end_of(guards, solution.located, *solution.end)
+        # The step in which the event ended the motion goes on beyond the event.
+        solution = solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
     outputs = _outputs(equations, start, solution, ts, settings)
     fields = _result(equations, start, solution, outputs, guards, settings)
     rows = jax.vmap(equations.outside)
@@ -342,17 +128,6 @@ class Start(NamedTuple):
     refused: Bool[Array, ""]
     atol: Float[Array, " 2"]
     scales: Scales | None
-
-
-class Outputs(NamedTuple):
-    """The motion at the outputs and, as the last row, at its end; which outputs were `reached`; which are finite.
-
-    At outputs that were not reached it is the start's state.
-    """
-
-    motion: Snapshot
-    reached: Bool[Array, " T"]
-    sound: Bool[Array, " T"]
 
 
 def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
@@ -382,18 +157,124 @@ def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
     return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), atol, scales)
 
 
-def _stepped(equations, start, ts, guards, settings, adjoint) -> Solution:
-    y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+class Solution(NamedTuple):
+    """The result of the loop: times that it reached (infinite elsewhere), states there, its last time and state, (1,).
+
+    `located`: where guards are zero; None without guards. `record`: that of the steps, if they can be replayed.
+    """
+
+    reached: Float[Array, " T"]
+    outputs: PyTree[Float[Array, "T ..."]]
+    end: tuple[Float[Array, " 1"], PyTree[Float[Array, "1 ..."]]]
+    stats: dict[str, Array]
+    result: diffrax.RESULTS
+    located: Located | None
+    record: Recorded | None = None
+
+
+def _loop(
+    equations: Equations, start: Start, ts: Float[Array, " T"], guards: Guards | None, settings: Settings,
+    adjoint: diffrax.AbstractAdjoint, repeated: bool = False,
+) -> Solution:  # fmt: skip
+    """Step through a motion by diffrax; if refused, end within a few steps. Without `scales` by `atol` alone.
+
+    `repeated`: the times of crossings are known, and are among `ts`.
+    """
     first = State(ts[0], start.q, start.v, equations.model.params)
-    if settings.dt0 is not None:
-        # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
-        settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
-    solution = solution_of(equations, first, y0, start.refused, start.scales, ts, guards, settings, adjoint)
-    if solution.located is None:
-        return solution
-    end = end_of(guards, solution.located, *solution.end)
-    # The step in which the event ended the motion goes on beyond the event.
-    return solution._replace(end=end, reached=jnp.where(ts <= end[0], solution.reached, jnp.inf))
+    y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+    if isinstance(adjoint, Replay) and (settings.progress or not _arriving(settings)):
+        # A motion that is not stepped from output to output has no record.
+        adjoint = diffrax.RecursiveCheckpointAdjoint()
+    feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
+    fast, written = None, equations.written
+    if written is not None and feedback is None:
+        unrolled = written.equations.length <= settings.unroll_up_to
+        fast = settings.method if unrolled else _in_a_loop(settings.method, adjoint)
+    # BacksolveAdjoint integrates a larger state backwards: it takes the bare method, and outputs but no separate end.
+    bare = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    settings = eqx.tree_at(lambda s: s.method, settings, _with_root_finder(settings, start.scales))
+    controller = _controller(equations, ts, settings, start.scales, bare, repeated)
+    terms = diffrax.ODETerm(Field(equations, feedback) if fast is None else FastField(equations))
+    if bare:
+        solver, saveat = settings.method, diffrax.SaveAt(ts=ts)
+    else:
+        solver = _solver(equations, fast, feedback, start.refused, settings, adjoint)
+        subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
+        saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
+    if guards is not None:
+        controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
+    silent = not _user_calls_python(equations, terms, first, guards, settings, controller)
+    if isinstance(adjoint, Replay):
+        assert isinstance(controller, StepToOutputs)
+        before, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
+        problem = StepProblem(
+            terms, solver, controller, ts, before, after, ts[0], ts[-1], settings.dt0, y0, first.params
+        )  # fmt: skip
+        found = replayed(with_room(problem, settings.memory), settings.max_steps, silent, adjoint)
+        end = found.t[None], jax.tree.map(lambda x: x[None], found.y)
+        reached = jnp.where(found.reached, ts, jnp.inf)
+        return Solution(reached, found.outputs, end, found.stats, found.result, None, found)
+
+    def solve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event):
+        solution = diffrax.diffeqsolve(
+            terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
+            event=event, max_steps=settings.max_steps, throw=False, progress_meter=_progress_meter(settings.progress),
+        )  # fmt: skip
+        watching = isinstance(controller, EventController)
+        located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
+        return solution.ts, solution.ys, solution.stats, solution.result, located
+
+    arguments = (
+        terms, solver, ts[0], ts[-1], settings.dt0, y0, first.params, saveat, controller, _by_position(settings.event),
+    )  # fmt: skip
+    # Reverse mode needs the operations inside, so the solve is then not wrapped.
+    if isinstance(adjoint, diffrax.ForwardMode):
+        reached, outputs, *rest = one_function(solve, *arguments, checked=silent, in_blocks=True)
+    else:
+        reached, outputs, *rest = solve(*arguments)
+    assert reached is not None and outputs is not None
+    if bare:
+        end = jax.tree.map(lambda x: x[-1:], (reached, outputs))
+    else:
+        (reached, end_t), (outputs, end_y) = reached, outputs
+        end = end_t, end_y
+    return Solution(reached, outputs, end, *rest)
+
+
+def _loop_twice(
+    equations: Equations, start: Start, ts: Float[Array, " T"], guards: Guards, settings: Settings,
+    adjoint: diffrax.AbstractAdjoint,
+) -> Solution:  # fmt: skip
+    """The same in reverse mode, where diffrax differentiates only outputs: crossings, once their times are known,
+    become outputs."""
+    first = _loop(*stop_gradient((equations, start, ts, guards, settings)), diffrax.ForwardMode())
+    end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
+    times = jnp.concatenate([ts, first.located.t])
+    times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
+    order = jnp.argsort(times)
+    without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
+    second = _loop(equations, start, times[order], None, without, adjoint, repeated=True)
+    place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
+    of_outputs, of_crossings = (
+        jax.tree.map(lambda x: x[place[part]], second.outputs) for part in (slice(ts.size), slice(ts.size, None))
+    )
+    return first._replace(
+        reached=jnp.where(jnp.isfinite(second.reached[place[: ts.size]]), first.reached, jnp.inf),
+        outputs=of_outputs,
+        end=second.end,
+        located=at_known_times(guards, equations, resolution(ts), first.located, of_crossings, bent),
+    )
+
+
+class Outputs(NamedTuple):
+    """The motion at the outputs and, as the last row, at its end; which outputs were `reached`; which are finite.
+
+    At outputs that were not reached it is the start's state.
+    """
+
+    motion: Snapshot
+    reached: Bool[Array, " T"]
+    sound: Bool[Array, " T"]
 
 
 def _outputs(equations, start, solution, ts, settings) -> Outputs:
@@ -472,3 +353,122 @@ def _scaled_error(equations, t, q, v, stats, settings):
 
 def _among(result, others):
     return jnp.any(jnp.stack([result == other for other in others]))
+
+
+def _user_calls_python(equations, terms, start, guards, settings, controller):
+    """Whether the user's functions, method or controller may call Python at run time, if only to check something.
+
+    If not, only diffrax's checks are left. They concern the times and the first step, which `solve` examines itself.
+    """
+    parts = (settings.method, settings.controller)
+    if any(part is not None and type(part).__module__.split(".")[0] not in CHECKED_PACKAGES for part in parts):
+        return True
+    (t, q, v, params), written = start, equations.written
+    if written is None:
+        traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
+    else:
+        traced = []
+        if any(numbers.calls_host for numbers in (written.equations, written.project) if numbers is not None):
+            return True
+    if guards is not None:
+        multipliers = equations.model.zero_multipliers()
+        traced.append(jax.make_jaxpr(lambda t, q, v: guards(t, q, v, multipliers, params))(t, q, v))
+    conditions = jax.tree.leaves(settings.event.cond_fn, is_leaf=callable) if settings.event is not None else ()
+    given = dict(terms=terms, solver=settings.method, t0=t, t1=t, dt0=None, max_steps=settings.max_steps)
+    given |= dict(saveat=None, stepsize_controller=controller)
+    for condition in conditions:
+        traced.append(jax.make_jaxpr(lambda t, y, condition=condition: condition(t, y, params, **given))(t, (q, v)))
+    return any(calls_host(program.jaxpr) for program in traced)
+
+
+def method_alone(settings, method):
+    """Return a method as it steps a motion on equations that are not written out."""
+    return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
+
+
+def _with_root_finder(settings, scales):
+    """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
+    method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
+    if scales is not None and isinstance(method, Radau5):
+        as_nothing = AsNothing(scales, settings.rtol)
+        ours = isinstance(method.root_finder, SimplifiedNewton)
+        tolerances = settings.rtol[0], as_nothing if ours else as_nothing(jnp.zeros_like(scales.first))
+    if isinstance(getattr(method, "root_finder", None), diffrax.VeryChord):
+        return eqx.tree_at(lambda method: method.root_finder, method, SimplifiedNewton(*tolerances))
+    return with_tolerances(method, *tolerances)
+
+
+def _solver(equations, fast, feedback, refused, settings, adjoint):
+    return ProjectedSolver(
+        solver=_in_a_loop(settings.method, adjoint),
+        equations=equations,
+        fast=fast,
+        feedback=feedback,
+        refused=refused,
+        tolerances=Tolerances(settings.rtol, settings.atol),
+        controlled=settings.controller is None,
+        project=settings.drift == "project",
+        arriving=_arriving(settings),
+        jump_ts=settings.jump_ts,
+    )
+
+
+def _in_a_loop(method, adjoint):
+    """Return the method with a loop over its stages, of the kind that the derivative needs."""
+    if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
+        return replace(method, in_a_loop=True)
+    # A subclass may have a tableau of its own, which diffrax's implementation does not know.
+    ours = isinstance(method, ExplicitRungeKutta) and method.tableau is method.shipped.tableau
+    method = method.shipped if ours else method
+    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.DirectAdjoint | Replay):
+        return forward_differentiable(method)
+    return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
+
+
+def _arriving(settings):
+    # A user's controller chooses its steps itself; a condition for diffrax may read the controller's tolerances.
+    return settings.controller is None and settings.event is None
+
+
+def _controller(equations, ts, settings, scales, bare, repeated):
+    if settings.controller is not None:
+        return settings.controller
+    # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
+    dtmin = 16 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    # The largest error counts, not the mean: more coordinates should not loosen the tolerance of each.
+    controller = diffrax.PIDController(
+        rtol=settings.rtol[0], atol=settings.atol[0], norm=optx.max_norm, dtmin=dtmin, dtmax=settings.max_step,
+        force_dtmin=False,
+    )  # fmt: skip
+    angle = tuple(are_angles(equations.model).tolist())
+    if not bare and (scales is not None or settings.apart or any(angle)):
+        controller = PerCoordinateTolerance(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
+    arriving = _arriving(settings) and not bare
+    if settings.jump_ts is None and not repeated:
+        return StepToOutputs(controller, ts, settings.shares) if arriving else controller
+    jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
+    return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
+
+
+def resolution(ts):
+    """Return the smallest difference of two times that can be told apart."""
+    return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+
+
+def _by_position(event):
+    """Return the user's event with `args` by position: diffrax passes it by name, but a user may call it `params`."""
+    if event is None:
+        return None
+
+    def by_position(condition):
+        return lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
+
+    return diffrax.Event(jax.tree.map(by_position, event.cond_fn, is_leaf=callable))
+
+
+def _progress_meter(progress):
+    if not progress:
+        return diffrax.NoProgressMeter()
+    if importlib.util.find_spec("tqdm") is None:
+        return diffrax.TextProgressMeter()
+    return diffrax.TqdmProgressMeter()

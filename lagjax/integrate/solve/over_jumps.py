@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -32,10 +31,20 @@ from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.integrate.solve.one_motion import resolution, solved
-from lagjax.integrate.solve.segments import AT_ONCE, NOT_BELOW, ROWS, nothing, reached, sizes_of, with_those_of
+from lagjax.integrate.solve.segments import (
+    AT_ONCE,
+    NOT_BELOW,
+    ROWS,
+    if_any,
+    nothing,
+    reached,
+    sizes_of,
+    unknown,
+    with_those_of,
+)
 from lagjax.integrate.stepping.tolerances import DIED_OUT
+from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.integrate.trajectory.trajectory import Snapshot
 from lagjax.jaxtools.fuse_cpu import apart
 from lagjax.jaxtools.open_jumps import IN_TIME
 from lagjax.jaxtools.trees import like, stop_gradient, where
@@ -124,8 +133,7 @@ def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
         differences = jumps.numbers(system, 2)
         sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
         smooth = System(smooth.lagrangian, smooth.constraints, Mixed(smooth.force, sliding), smooth.dissipation)
-    of = lambda i, guard: ModeGuard(guard, sliding if i in which else None, i)
-    guards = tuple(of(i, guard) for i, guard in enumerate(guards))
+    guards = tuple(ModeGuard(guard, sliding if i in which else None, i) for i, guard in enumerate(guards))
     pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
     return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
@@ -170,8 +178,7 @@ def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, 
         # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
         way = lax.while_loop(lambda way: way.continues & (way.count <= MOST_JUMPS), next_leg, first)
     else:
-        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None)
-        way, _ = lax.scan(step, first, None, length=turns)
+        way, _ = lax.scan(partial(if_any, next_leg), first, None, length=turns)
     return {
         **way.rows,
         "end": way.end,
@@ -198,10 +205,8 @@ def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
 
 def _first(model, q0, v0, ts, guards, modes, settings) -> ModeWay:
     dtype, many = ts.dtype, ts.shape[0]
-    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
-    of_rows = lambda tree: jax.tree.map(lambda x: nan((many, *x.shape)), tree)
-    multipliers = {name: nan(x.shape) for name, x in model.zero_multipliers().items()}
-    rows = {"q": of_rows(q0), "v": of_rows(v0), "multipliers": of_rows(multipliers)}
+    multipliers = unknown(model.zero_multipliers())
+    rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, many)
     sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
     # A motion that rests at zero, held by friction, has round-off alone to tell its size.
     sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
@@ -241,14 +246,14 @@ def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, t
     counts = here & ~ending.wrong
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
     known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), all, new)
+    rows = jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), way.rows, rows)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     again = here & ending.wrong
     further = way._replace(
         t=jnp.where(moves, end.t, way.t), q=where(moves, end.q, way.q), v=where(moves, end.v, way.v),
         modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
         free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
-        continues=again | (moves & (end.t < ts[-1])), rows=put(way.rows, rows),
+        continues=again | (moves & (end.t < ts[-1])), rows=rows,
         events=where(counts, with_those_of(found["events"], way.events), way.events), end=where(counts, end, way.end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
@@ -298,8 +303,7 @@ def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay
 def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
     state = stop_gradient(tuple(end))
-    value = lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count])
-    g, terms = jax.jvp(value, state, uneven(state))
+    g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count]), state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 

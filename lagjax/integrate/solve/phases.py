@@ -46,8 +46,8 @@ class Reset(eqx.Module):
         if self.settle is None:
             return q, v, jnp.asarray(False)
         assert self.when is not None
-        value = lambda t, q, when=self.when: when(t, q, v, params)
-        _, opening = jax.jvp(value, (t, q), (jnp.ones_like(t), v))
+        when = self.when
+        _, opening = jax.jvp(lambda t, q: when(t, q, v, params), (t, q), (jnp.ones_like(t), v))
         rests = opening <= self.slower_than
         at_rest = self.settle(t, q, v, params)
         return q, jtu.tree_map(lambda x, y: jnp.where(rests, x, y), at_rest, v), rests
@@ -62,8 +62,11 @@ class Reset(eqx.Module):
 
 
 def traced_phases(system: System | Hybrid, start: State) -> Any:
-    """The system, or hybrid, with all its functions checked and traced for such states."""
-    return traced_hybrid(system, start) if isinstance(system, Hybrid) else traced_system(system, start)
+    """The system, or hybrid with its switches, with all its functions checked and traced for such states."""
+    if not system.in_phases:
+        return traced_system(system, start)
+    hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))
+    return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
 
 
 def check_phases(hybrid: Hybrid, start: State):
@@ -117,8 +120,8 @@ def _phase(hybrid, i, start, events):
     numbers, system = hybrid.leaving(i), hybrid.systems[i]
     names = {_name(hybrid, k): hybrid.switches[k] for k in numbers}
     crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
-    both = [guards_of(crossings, system, start, holds=True), guards_of(events, system, start)]
-    given = [guards for guards in both if guards is not None]
+    both = (crossings, True), (events, False)
+    given = [guards_of(named, system, start, holds) for named, holds in both if named]
     guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
     resets = tuple(_reset(hybrid.switches[k], hybrid, system) for k in numbers)
     return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
@@ -142,12 +145,6 @@ def _reset(switch: Switch, hybrid, system) -> Reset:
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
     return Reset(function, takes, settle, switch.when, switch.slower_than)
-
-
-def traced_hybrid(hybrid: Hybrid, start: State) -> Hybrid:
-    """The hybrid with all functions of its phases and switches checked, and traced for such states."""
-    hybrid = replace_fields(hybrid, systems=tuple(traced_system(system, start) for system in hybrid.systems))
-    return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
 
 
 def _traced_switch(hybrid, k, start):
@@ -218,5 +215,4 @@ class Nearest(eqx.Module):
 
 def _alike(found, wanted):
     same = jtu.tree_structure(found) == jtu.tree_structure(wanted)
-    shapes = lambda tree: [jnp.shape(x) for x in jtu.tree_leaves(tree)]
-    return same and shapes(found) == shapes(wanted)
+    return same and jtu.tree_map(jnp.shape, found) == jtu.tree_map(jnp.shape, wanted)

@@ -4,7 +4,8 @@ The program itself is in `one_motion.py`, and for motions in phases in `segments
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 
 import diffrax
@@ -12,20 +13,21 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from lagjax.display.progress import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
+from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
-from lagjax.integrate.jumps.find import with_jumps_in_time
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost
 from lagjax.integrate.solve.segments import solved_in_legs
+from lagjax.integrate.solve.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
-from lagjax.integrate.trajectory.trajectory import SolveInfo, SolveOptions, Trajectory, pack
-from lagjax.jaxtools.cache import filled_up, hashable_partition, program_of
+from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
+from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.cache import HashablePart, filled_up, hashable_partition, program_of
 from lagjax.jaxtools.compiled import compiler_options
 from lagjax.jaxtools.tracing import is_eager, takes_for_regular
 from lagjax.jaxtools.trees import stop_gradient
@@ -34,51 +36,11 @@ from lagjax.mechanics.scalar_equations import has_networks
 from lagjax.mechanics.structure import is_free_of_velocities
 from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, evaluations_a_step
 from lagjax.numerics.methods.runge_kutta import Dopri8, in_our_form
+from lagjax.system.coordinates import State
 from lagjax.system.model import Model, model_of
 
-# A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
-# in a loop. In batches of a rod or a double pendulum copies are twice as fast. A single motion's step is a fifth slower
-# in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
-# are taken without copies: the first takes two thirds of the time, each of the next ones a fifth more.
-UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
-
-
-# Making an equinox module takes longer than computing a short motion.
-@jtu.register_dataclass
-@dataclass(frozen=True)
-class Settings:
-    """How to integrate: everything but the system, the state and the times."""
-
-    method: diffrax.AbstractSolver | None
-    controller: diffrax.AbstractStepSizeController | None
-    event: diffrax.Event | None
-    adjoint: diffrax.AbstractAdjoint | None
-    rtol: Float[Array, " 2"]
-    atol: Float[Array, " 2"]
-    dt0: Float[Array, ""] | None
-    # Infinite if the length of steps is not limited.
-    max_step: Float[Array, ""]
-    jump_ts: Float[Array, " J"] | None
-    # Shares of the proposed first step, and of the time between outputs for the longest step: see `Arriving`.
-    shares: Float[Array, " 2"]
-    # Motions of up to this many steps are integrated again for an error estimate.
-    repeated_up_to: Int[Array, ""]
-    # Whether `atol` was not given and follows the motion's own size; the value above is then a placeholder.
-    by_size: bool = eqx.field(static=True)
-    apart: bool = eqx.field(static=True)
-    max_steps: int | None = eqx.field(static=True)
-    drift: str = eqx.field(static=True)
-    progress: bool | None = eqx.field(static=True)
-    # The size of the record for reverse mode, in bytes; None for the usual one.
-    memory: float | None = eqx.field(static=True, default=None)
-    # False if the equations are assumed regular, until that turns out to be wrong.
-    robust: bool = eqx.field(static=True, default=True)
-    # Whether jumps of forces are found and followed.
-    jumps: str = eqx.field(static=True, default="found")
-    # A right-hand side of up to this many operations is copied to each of a method's stages.
-    unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
 
 
 def trajectory_of(*problem) -> Trajectory:
@@ -95,13 +57,17 @@ def trajectory_of(*problem) -> Trajectory:
     shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
     # Padded with the last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
-    of = lambda settings: hashable_partition((*motion, many, guards, settings))
+
+    def of(settings):
+        return hashable_partition((*motion, many, guards, settings))
+
     arrays, static = of(settings)
     programs = program_of((_Programs, static), lambda: _Programs(static, len(ts)))
     try:
         found = programs.run(arrays, len(ts), shown)
-        again = lambda closer: programs.run(of(closer)[0], len(ts), shown, settled=True)
-        return with_errors(again, found, settings, ts) if settings.repeated_up_to else found
+        if not settings.repeated_up_to:
+            return found
+        return with_errors(lambda s: programs.run(of(s)[0], len(ts), shown, settled=True), found, settings, ts)
     except jax.errors.JaxRuntimeError:
         return _trajectory_of(*problem)[0]
 
@@ -114,8 +80,8 @@ def _inside(*problem):
     settings = replace(settings, robust=not regular)
     found, settled = _trajectory_of(*motion, settings)
     if settings.repeated_up_to:
-        again = lambda closer: _trajectory_of(*stop_gradient(motion), closer)[0]
-        found = with_errors_inside(again, found, settings, motion[4])
+        still = stop_gradient(motion)
+        found = with_errors_inside(lambda s: _trajectory_of(*still, s)[0], found, settings, motion[4])
     return report_settled(found, settled) if regular else found
 
 
@@ -123,40 +89,34 @@ class _Programs:
     """The compiled programs of one kind of motion: with the equations assumed regular (None once they turned out not to
     be), and with the robust solve. JAX keeps them as long as this object lives."""
 
-    def __init__(self, static, count):
+    def __init__(self, static: HashablePart, count: int):
         jit = partial(jax.jit, compiler_options=compiler_options())
         self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
         self.robust: Callable = jit(partial(_of_arrays, static, True, count))
         self._count, self._compiled = count, set()
 
-    def run(self, arrays, count, shown, settled=False):
-        """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given."""
-        if self.regular is not None:
-            found, rows, well = self._run_program(self.regular, arrays, shown)
-            if settled or well:
-                return self._first_outputs(found, rows, count)
+    def run(self, arrays: list, count: int, shown: bool | None, settled: bool = False) -> Trajectory:
+        """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given.
+
+        A program announces that it compiles, as `shown` says (see `waiting`).
+        """
+        while True:
+            program = self.regular or self.robust
+            with nullcontext() if program in self._compiled else waiting(shown, "compiling"):
+                found, rows, well = program(arrays)
+            self._compiled.add(program)
+            if program is self.robust:
+                jax.block_until_ready((found, rows))
+            if program is self.robust or settled or well:
+                break
             self.regular = None
-        found, rows, _ = jax.block_until_ready(self._run_program(self.robust, arrays, shown))
-        return self._first_outputs(found, rows, count)
-
-    def _run_program(self, program, arrays, shown):
-        """Run a program; the first time announce that it compiles, as `shown` says (see `waiting`)."""
-        if program in self._compiled:
-            return program(arrays)
-        with waiting(shown, "compiling"):
-            found = program(arrays)
-        self._compiled.add(program)
-        return found
-
-    def _first_outputs(self, found, rows, count):
-        """The trajectory with `count` outputs, from padded `rows`."""
         if count == self._count:
             return found
         # In NumPy: JAX would compile a program for each number of outputs.
         return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
 
 
-def _of_arrays(static, robust, count, arrays):
+def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
     *motion, settings = static.combine(arrays)
     settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
@@ -172,7 +132,8 @@ def _trajectory_of(*problem):
 
 def _trajectory(system, q0, v0, params, ts, guards, settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
-    model = model_of(system, ts[0], q0, v0, params)
+    start = State(ts[0], q0, v0, params)
+    model = model_of(system, *start)
     s, method = settings, method_of(settings, model)
     asked = SolveOptions(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
@@ -181,12 +142,12 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
-    jumps = followed(settings, system, ts[0], q0, v0, params)
+    jumps = None if settings.jumps == "ignored" else followed(settings, model, start)
     in_time = jumps if jumps is not None and jumps.in_time else None
     jumps = jumps if jumps is not None and jumps.count else None
     solve = solved_in_legs if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
 
-    def of_arrays(x, fixed, adjoint, differentiated):
+    def solve_arrays(x, fixed, adjoint, differentiated):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
         too_many = None
@@ -203,21 +164,19 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
 
     if settings.adjoint is None:
         # Each leg of a motion in phases is replayed separately.
-        fields = solve_in_both_modes(of_arrays, x, fixed, recorded=solve is solved)
+        fields = solve_in_both_modes(solve_arrays, x, fixed, recorded=solve is solved)
     else:
-        fields, _ = of_arrays(x, fixed, settings.adjoint, True)
-    arrays, described = pack(system, params, asked, how)
+        fields, _ = solve_arrays(x, fixed, settings.adjoint, True)
+    arrays, described = pack((system, params, asked), how, trajectory_of)
     settled = fields.pop("settled")
     of = HybridTrajectory if system.in_phases else Trajectory
     return of(t=ts, **fields, arrays=arrays, static=described), settled
 
 
-def followed(settings, system, t, q, v, params):
+def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
     """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
-    if settings.jumps == "ignored":
-        return None
-    found = [jumps for phase in system.phases if (jumps := jumps_found(phase, t, q, v, params)) is not None]
-    if system.in_phases:
+    found = [jumps for phase in model.phases if (jumps := jumps_found(phase, start)) is not None]
+    if model.system.in_phases:
         why = "in the phases of a lj.Hybrid"
     elif settings.controller is not None or settings.event is not None:
         why = "with a stepsize_controller, or a condition for diffrax, of your own"
@@ -248,10 +207,10 @@ def method_of(settings, model: Model):
     if chosen is None:
         # BacksolveAdjoint integrates a state that is not a pair (q, v).
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)
-        if not pairs or not _are_free_of_velocities(model):
+        if not pairs or not is_free_of_velocities(model):
             return Dopri8()
         return nystrom_for(model)
-    if isinstance(chosen, Nystrom) and not _are_free_of_velocities(model):
+    if isinstance(chosen, Nystrom) and not is_free_of_velocities(model):
         cause = "there are constraints" if any(phase.m for phase in model.phases) else "these do"
         raise ValueError(
             f"{type(chosen).__name__} is for accelerations that do not depend on velocities, and {cause}.\n"
@@ -269,7 +228,3 @@ def nystrom_for(model: Model) -> Nystrom:
     # The motion of a network is less smooth than that of closed forms: at equal error, from 1e-3 to 1e-11, order 8
     # takes two thirds to nine tenths of the evaluations of order 12, and half with many outputs.
     return Nystrom8() if has_networks(model) else Nystrom12()
-
-
-def _are_free_of_velocities(model):
-    return all(is_free_of_velocities(phase) for phase in model.phases)

@@ -11,10 +11,9 @@ zero, it is crossed at once, in a leg of no length: this handles two guards at o
 contact that has stopped sliding.
 
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
-
-The crossings recorded over all legs of a motion in phases.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, reduce
 from typing import Any, NamedTuple
@@ -31,9 +30,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import Crossings, Guards
 from lagjax.integrate.solve.one_motion import resolution, solved
-from lagjax.integrate.trajectory.hybrid_trajectory import NO_PHASE, SWITCHES, Switches
+from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, Switches
+from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.integrate.trajectory.trajectory import Snapshot
 from lagjax.jaxtools.fuse_cpu import apart
 from lagjax.jaxtools.trees import like, stop_gradient, where
 from lagjax.mechanics.equations import all_finite
@@ -46,12 +45,14 @@ def nothing(guards: Guards | None, names, q, v, multipliers) -> dict[str, Crossi
     """The events of these names before any crossing; `multipliers`: those of all phases, NaN."""
     room = {kind.name: kind.most for kind in (() if guards is None else guards.kinds)}
 
-    def none(most):
-        rows = lambda tree: jax.tree.map(lambda x: jnp.full((most, *x.shape), jnp.nan, x.dtype), tree)
-        t = jnp.full(most, jnp.nan, jax.tree.leaves(q)[0].dtype)
-        return Crossings(t, rows(q), rows(v), rows(multipliers), jnp.asarray(0), jnp.asarray(False))
+    t = jnp.zeros((), jax.tree.leaves(q)[0].dtype)
+    rows = {name: unknown((t, q, v, multipliers), room[name]) for name in names}
+    return {name: Crossings(*known, jnp.asarray(0), jnp.asarray(False)) for name, known in rows.items()}
 
-    return {name: none(room[name]) for name in names}
+
+def unknown(tree: PyTree, *rows: int) -> PyTree:
+    """NaN in place of each number of a tree; with a number of rows, so many of it."""
+    return jax.tree.map(lambda x: jnp.full((*rows, *jnp.shape(x)), jnp.nan, jnp.result_type(x)), tree)
 
 
 def with_those_of(leg: dict[str, Crossings], before: dict[str, Crossings]) -> dict[str, Crossings]:
@@ -134,7 +135,9 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
     def next_legs(way: PhaseWay) -> PhaseWay:
         for i in range(len(hybrid.systems)):
             here = way.continues & (way.phase == i)
-            leg = lambda way, i=i, here=here: _leg(hybrid, i, here, way, params, ts, phases[i], settings, adjoint)
+            leg = partial(
+                _leg, hybrid, i, here, params=params, ts=ts, phase=phases[i], settings=settings, adjoint=adjoint
+            )
             way = lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
         return way
 
@@ -142,8 +145,7 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
         way = lax.while_loop(lambda way: way.continues, next_legs, first)
     else:
         # Each turn takes every lane at least one leg further.
-        step = lambda way, _: (lax.cond(eqxi.unvmap_any(way.continues), next_legs, lambda way: way, way), None)
-        way, _ = lax.scan(step, first, None, length=hybrid.most_switches + 1)
+        way, _ = lax.scan(partial(if_any, next_legs), first, None, length=hybrid.most_switches + 1)
     rows = way.rows
     return {
         "q": rows.q,
@@ -161,28 +163,27 @@ def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint
     }
 
 
+def if_any(next_leg: Callable, way: Any, _: None) -> tuple[Any, None]:
+    """A turn of `scan`: the next leg, if any lane continues."""
+    return lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None
+
+
 def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
-    nan = lambda shape: jnp.full(shape, jnp.nan, dtype)
-    of_rows = lambda tree, n: jax.tree.map(lambda x: nan((n, *x.shape)), tree)
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
-    rows = OutputRows(
-        of_rows(q0, many), of_rows(v0, many), of_rows(multipliers, many),
-        jnp.full(many, NO_PHASE, jnp.int32),
-    )  # fmt: skip
-    record = lambda tree: of_rows(tree, room)
-    none = jnp.full(room, NO_PHASE, jnp.int32)
+    rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32))
+    none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q0, v0), room)
     switches = Switches(
-        t=nan(room), way=none, to=none, q=record(q0), v=record(v0), q_after=record(q0), v_after=record(v0),
-        impulse=record(v0), count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
+        t=unknown(ts[0], room), way=none, to=none, q=of_q, v=of_v, q_after=of_q, v_after=of_v, impulse=of_v,
+        count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches),
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists = (first >= 0) & (first < phases)
-    known = lambda tree: jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), tree)
-    start = Snapshot(ts[0], known(q0), known(v0), jax.tree.map(lambda x: nan(x.shape), multipliers))
+    known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
+    start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return PhaseWay(
@@ -224,8 +225,7 @@ def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings,
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
     known = (ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)
     known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
-    none = lambda name, x: end.multipliers.get(name, jnp.full_like(x, jnp.nan))
-    end = end._replace(multipliers={name: none(name, x) for name, x in way.end.multipliers.items()})
+    end = end._replace(multipliers=unknown(way.end.multipliers) | end.multipliers)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     further = PhaseWay(
         t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
@@ -279,8 +279,7 @@ def _ending(
 def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
     state = stop_gradient(tuple(end))
-    value = lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count])
-    g, terms = jax.jvp(value, state, uneven(state))
+    g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count]), state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
@@ -291,7 +290,10 @@ def reached(q):
 
 def _filled(rows: OutputRows, known, found, i) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
+
+    def put(all, new):
+        return jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
+
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
     return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
 
@@ -313,7 +315,10 @@ def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
     place = onward & (jnp.arange(s.t.shape[0]) == s.count)
-    put = lambda all, new: jax.tree.map(lambda x, y: jnp.where(like(place, x), y[None].astype(x.dtype), x), all, new)
+
+    def put(all, new):
+        return jax.tree.map(lambda x, y: jnp.where(like(place, x), y[None].astype(x.dtype), x), all, new)
+
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
     record = Switches(
         t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),

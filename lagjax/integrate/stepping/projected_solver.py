@@ -231,7 +231,10 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
             return True
         rtol, atol = (self.tolerances.rtol[0], self.tolerances.atol[0]) if self.controlled else (0.0, 0.0)
         share = OUTPUT_TOLERANCES * rtol if self.controlled else LOST
-        largest = lambda tree: jnp.max(jnp.abs(ravel_pytree(tree)[0]))
+
+        def largest(tree):
+            return jnp.max(jnp.abs(ravel_pytree(tree)[0]))
+
         of_parts = [largest(e) <= OUTPUT_TOLERANCES * atol + share * largest((a, b)) for a, b, e in zip(y0, y1, error)]
         return of_parts[0] & of_parts[1]
 

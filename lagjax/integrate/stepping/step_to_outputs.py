@@ -83,8 +83,7 @@ def together(ts: Float[Array, " T"], jump_ts: Float[Array, " J"]) -> Float[Array
 def between_jumps(t0, t1, jump_ts, made_jump):
     """Return the ends of the step from t0 to t1, moved off any jump, and whether it starts at one."""
     margin = _round_off(jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
-    at = lambda t: jnp.any(t == jump_ts)
-    starts, ends, room = at(t0), at(t1), t1 - t0 > 4 * margin
+    starts, ends, room = jnp.any(t0 == jump_ts), jnp.any(t1 == jump_ts), t1 - t0 > 4 * margin
     t1 = jnp.where(ends & room, t1 - margin, t1)
     return jnp.where(starts & room, t0 + margin, t0), t1, starts | made_jump
 
@@ -99,7 +98,10 @@ def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
     late = jnp.where(jnp.any(same, axis=1), ts - jump_ts[jnp.argmax(same, axis=1)], 0.0)
     before = ts - _round_off(jnp.abs(ts))
     a = jax.vmap(lambda t, q, v: equations.accelerations(t, q, v)[0])(before, q, v)
-    along = lambda x, rate: x + late.reshape(-1, *[1] * (x.ndim - 1)) * lax.stop_gradient(rate)
+
+    def along(x, rate):
+        return x + late.reshape(-1, *[1] * (x.ndim - 1)) * lax.stop_gradient(rate)
+
     return jax.tree.map(along, q, v), jax.tree.map(along, v, a)
 
 

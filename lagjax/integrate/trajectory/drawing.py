@@ -25,7 +25,6 @@ from lagjax.mechanics.generators import Generator
 from lagjax.mechanics.noether import NoetherCharge
 from lagjax.mechanics.structure import conserved_momenta, conserves_jacobi_integral
 from lagjax.system import coordinates
-from lagjax.system.hybrid import Hybrid
 from lagjax.system.user_errors import Call, check_arguments
 
 
@@ -213,8 +212,8 @@ def _of(name):
 def _check_dense(positions, t, q, v, params, points):
     """Raise if the outputs are too far apart to interpolate between them."""
     every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
-    half = lambda tree: jax.tree.map(lambda x: x[every_other], tree)
-    guessed = drawn(positions, t[skipped], hermite(t[every_other], half(q), half(v), t[skipped]), params)
+    half_q, half_v = jax.tree.map(lambda x: x[every_other], (q, v))
+    guessed = drawn(positions, t[skipped], hermite(t[every_other], half_q, half_v, t[skipped]), params)
     known = drawn(positions, t[skipped], jax.tree.map(lambda x: x[skipped], q), params)
     size = max(np.ptp(x.reshape(-1, 2), axis=0).max() for x in points.values())
     missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
@@ -279,7 +278,7 @@ def changes(trajectory, charges) -> dict[str, np.ndarray]:
 def known_charges(trajectory) -> dict[str, NoetherCharge]:
     """Return the charges that follow from the structure of the system."""
     model = trajectory.model
-    if isinstance(model.system, Hybrid):
+    if model.system.in_phases:
         raise ValueError(
             "it is not known what a motion conserves in all its phases.\n"
             'Fix: traj.plot(charges={"name": function}) with functions of (t, q, v, params), or draw one phase.'

@@ -1,6 +1,7 @@
 """A motion in phases: a trajectory that knows the phase of each output, and its switches."""
 
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -20,8 +21,6 @@ from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import Model
 from lagjax.system.signature import UnknownSystem, known_system
 
-# The phase of an output that was not reached, and the number in unused places for switches.
-NO_PHASE = -1
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
 
@@ -92,6 +91,7 @@ class HybridTrajectory(Trajectory):
 
     phase: Int[Array, " T"] = eqx.field(kw_only=True)
     switches: Switches = eqx.field(kw_only=True)
+    in_phases: ClassVar[bool] = True
 
     @property
     def system(self) -> Hybrid:  # pyright: ignore[reportIncompatibleVariableOverride]

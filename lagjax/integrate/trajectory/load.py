@@ -13,13 +13,17 @@ from lagjax.files import npz
 from lagjax.files.table import Table, check_field, fields_of
 from lagjax.files.tree_json import Reader
 from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.solve.backward_time import backward_trajectory_of
 from lagjax.integrate.solve.phases import traced_phases
+from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.error_report import Errors
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
+from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN
-from lagjax.integrate.trajectory.trajectory import Snapshot, SolveInfo, SolveOptions, Trajectory, pack
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.trees import without_init
+from lagjax.system.argument_checks import SYSTEMS
 from lagjax.system.coordinates import State
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.signature import UnknownSystem, differences, signature
@@ -68,8 +72,8 @@ def load_trajectory(
         found = {name: reader.up(node) for name, node in said["trajectory"].items()}
         known = described_system(found["system"])
         check_shapes(found)
-        trajectory = trajectory_of(found, known)
-    return trajectory if system is None else trajectory_of(found, same_system(system, known, path))
+        trajectory = trajectory_from(found, known)
+    return trajectory if system is None else trajectory_from(found, same_system(system, known, path))
 
 
 # What is counted of every motion.
@@ -148,7 +152,7 @@ def check_shapes(found: dict[str, Any]) -> None:
             raise ValueError("its phases have no names.")
 
 
-def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
+def trajectory_from(found: dict, kept: System | Hybrid | UnknownSystem) -> Trajectory:
     """The trajectory with these parts (see `save.parts`) and the system `kept`."""
     fields = {name: found[name] for name in PLAIN}
     fields |= {"end": Snapshot(**found["end"]), "result": result_of_names(found["result"])}
@@ -156,7 +160,8 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
     error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
     asked, how = made(SolveOptions, found["asked"]), made(SolveInfo, found["how"])
-    fields["arrays"], fields["static"] = pack(kept, found["params"], asked, how)
+    integrate = backward_trajectory_of if how.backward else trajectory_of
+    fields["arrays"], fields["static"] = pack((kept, found["params"], asked), how, integrate)
     if "phase" not in found:
         return Trajectory(**fields)
     return HybridTrajectory(**fields, phase=found["phase"], switches=made(Switches, found["switches"]))
@@ -164,7 +169,7 @@ def trajectory_of(found: dict, kept: System | Hybrid | UnknownSystem) -> Traject
 
 def check_is_system(system: Any) -> None:
     """Raise if what the user passes again is no system."""
-    if not isinstance(system, (System, Hybrid)):
+    if not isinstance(system, SYSTEMS):
         raise TypeError(
             f"system must be a lj.System, not {type(system).__name__}.\nFix: lj.load_trajectory(path, system=system)."
         )

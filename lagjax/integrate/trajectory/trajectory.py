@@ -2,9 +2,8 @@
 
 import os
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import ClassVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,12 +14,13 @@ from lagjax.display import plots as plot
 from lagjax.display.animation import Animation
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.trajectory import drawing, printed
+from lagjax.integrate.trajectory.dense_output import at
 from lagjax.integrate.trajectory.drawing import curves, finite, panels
 from lagjax.integrate.trajectory.error_report import Errors, angle_mask
+from lagjax.integrate.trajectory.parts import Snapshot, SolveOptions, StaticPart
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.save import save
 from lagjax.integrate.trajectory.to_xarray import dataset
-from lagjax.jaxtools.cache import HashablePart, hashable_partition
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.jaxtools.without_lapack_batches import jitted
@@ -33,57 +33,6 @@ from lagjax.system.system import System
 
 class AccuracyWarning(UserWarning):
     """A motion was computed, and its own checks show that it is less accurate than its tolerance suggests."""
-
-
-class Snapshot(NamedTuple):
-    """One instant of a motion."""
-
-    t: Float[Array, ""]
-    q: PyTree[Float[Array, "..."]]
-    v: PyTree[Float[Array, "..."]]
-    multipliers: dict[str, Array]
-
-
-class SolveInfo(NamedTuple):
-    """How a motion was stepped through.
-
-    `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
-    `steps`: chosen by the "tolerance", by it over several "legs", "fixed", or by the user's "controller"; `backward`:
-    whether time decreases.
-    """
-
-    method: str
-    order: int
-    evaluations: int | None
-    steps: str
-    backward: bool = False
-
-
-class SolveOptions(NamedTuple):
-    """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
-
-    method: diffrax.AbstractSolver | None
-    stepsize_controller: diffrax.AbstractStepSizeController | None
-    dt0: Array | None
-    max_step: Array | None
-    jump_ts: Array | None
-    drift: str
-    jumps: str = "found"
-
-
-class StaticPart(NamedTuple):
-    """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along."""
-
-    rest: HashablePart
-    how: SolveInfo
-
-    @property
-    def method(self) -> str:
-        return self.how.method
-
-
-# Functions that need the integrator, which imports this file: `integrate.py` enters them here.
-BY_INTEGRATION: dict[str, Callable] = {}
 
 
 class Trajectory(eqx.Module):
@@ -126,6 +75,7 @@ class Trajectory(eqx.Module):
     arrays: PyTree
     static: StaticPart = eqx.field(static=True)
     error: Errors | None = None
+    in_phases: ClassVar[bool] = False
 
     @property
     def system(self) -> System:
@@ -198,7 +148,7 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for a time outside of the motion, or after its end by an event or a failure; for
         outputs off the constraints (`drift="none"`), and for a controller that plans the steps of the whole motion.
         """
-        return BY_INTEGRATION["at"](self, t)
+        return at(self, t)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the motion into a file, an npz; `lj.load_trajectory(path, system)` reads it, bit for bit.
@@ -336,12 +286,6 @@ def worst_drift(model, t, q, v):
     h, scale = jacobi_and_scale(model, t, q, v)
     largest = jnp.nanmax(scale)
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
-
-
-def pack(system, params, asked: SolveOptions, how: SolveInfo) -> tuple[PyTree, StaticPart]:
-    """Split (system, params, asked) into arrays and a hashable rest."""
-    arrays, rest = hashable_partition((system, params, asked))
-    return arrays, StaticPart(rest, how)
 
 
 @compiled

@@ -8,6 +8,8 @@ import pytest
 import lagjax as lj
 from lagjax.analysis.formulations import hamiltonian as legendre
 from lagjax.integrate.jumps.find import Given, found, with_jumps_in_time
+from lagjax.system.coordinates import State
+from lagjax.system.model import model_of
 
 KNOTS, HEIGHTS = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
 free = lambda t, q, v, params: 0.5 * v**2
@@ -36,7 +38,8 @@ def jumps_of(force, params=0.3, lagrangian=free):
     """The system and its jumps."""
     system = lj.System(lagrangian, force=force)
     number = jnp.asarray(0.1)
-    return system, found(system, number, number, number, jnp.asarray(params))
+    state = State(number, number, number, jnp.asarray(params))
+    return system, found(model_of(system, *state), state)
 
 
 def given_at(system, jumps, *state):
@@ -149,5 +152,6 @@ def test_a_solver_of_ours_is_no_jump(marked, monkeypatch):
         return -100 * jnp.sqrt(slow) - 0.3 * jnp.maximum(q["r"] - 2.0, 0.0)
 
     radial, params = lj.routhian(lj.System(lagrangian), "angle"), {"params": None, "momenta": {"angle": 1.2}}
-    jumps = found(radial, jnp.asarray(0.0), {"r": jnp.asarray(1.0)}, {"r": jnp.asarray(0.0)}, params)
+    state = State(jnp.asarray(0.0), {"r": jnp.asarray(1.0)}, {"r": jnp.asarray(0.0)}, params)
+    jumps = found(model_of(radial, *state), state)
     assert jumps is not None and (len(jumps.slots) + len(jumps.missed) == 1) == marked

@@ -10,6 +10,7 @@ At the time of an output the result is that output. A solve of length zero would
 time; a step of length zero of the classical Runge-Kutta method has the first four of them.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,19 +19,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Int
+from jaxtyping import Array, ArrayLike, Int, PyTree
 
-from lagjax.integrate.solve.backward_time import in_either_direction
-from lagjax.integrate.solve.harvest import patient
-from lagjax.integrate.solve.programs import Settings
+from lagjax.integrate.solve.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
-from lagjax.integrate.trajectory.hybrid_trajectory import NO_PHASE, HybridTrajectory
+from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
-from lagjax.integrate.trajectory.trajectory import Snapshot, Trajectory
 from lagjax.jaxtools.cache import filled_up
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
 from lagjax.mechanics.accelerations import accelerations
+from lagjax.system.system import System
 
 # Controllers that can begin at any time; others plan the steps of the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController
@@ -58,7 +57,7 @@ class Instants(NamedTuple):
     phase: Int[Array, " N"] | None
 
 
-def at(trajectory: Trajectory, t: ArrayLike) -> Snapshot:
+def at(trajectory, t: ArrayLike) -> Snapshot:
     """Return the motion at times of any shape: see `Trajectory.at`."""
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
@@ -91,7 +90,7 @@ def _fill(found, rows, trajectory, phase, nodes, times):
     fill = np.minimum(np.arange(count), len(times) - 1)
     nodes, times = jax.tree.map(lambda x: x[fill], (nodes._replace(multipliers=multipliers), times))
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
-    new, result = _continue_all(*of_system, nodes, times, trajectory.static.how.backward)
+    new, result = _continue_all(*of_system, nodes, times, trajectory.static.integrate)
     new, result = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result))
     # Not `ended_well`, which would compile a comparison for each number of times.
     well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
@@ -105,7 +104,7 @@ def _fill(found, rows, trajectory, phase, nodes, times):
 
 def _known_of(trajectory) -> Instants:
     outputs = Snapshot(trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers)
-    if not isinstance(trajectory, HybridTrajectory):
+    if not trajectory.in_phases:
         return Instants(outputs, None, None)
     outputs = jax.tree.map(np.asarray, outputs)
     s, count = trajectory.switches, len(trajectory.switches)
@@ -140,7 +139,7 @@ def _before(known: Instants, t, backward: bool):
 
 def _traced(trajectory, t):
     """Return the motion at t in a traced program: NaN where there is no motion."""
-    if isinstance(trajectory, HybridTrajectory):
+    if trajectory.in_phases:
         raise TypeError(IN_PHASES)
     of_one = partial(_at_one, trajectory)
     for _ in range(t.ndim):
@@ -169,16 +168,16 @@ def _at_one(trajectory, t):
     exact = node.t == near
     aside = node.t + sign * ASIDE * lax.stop_gradient(jnp.abs(trajectory.t[-1] - first))
     of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance
-    found, _ = _continued(*of_system, node, jnp.where(exact, aside, near), trajectory.static.how.backward)
+    found, _ = _continued(*of_system, node, jnp.where(exact, aside, near), trajectory.static.integrate)
     # The requested time, even if it is a round-off beyond the end.
     there = _of_length_zero(trajectory.system, trajectory.params, node, jnp.where(exact, t, node.t))
     chosen = jax.tree.map(lambda a, b: jnp.where(inside, jnp.where(exact, a, b), jnp.nan), there, found)
     return chosen._replace(t=t)
 
 
-def _continued(system, params, asked, tolerance, node: Snapshot, t, backward):
+def _continued(system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, t, integrate: Callable):
     """Continue the motion from a node to t; return it there, and the result."""
-    found, result = _solved_from(system, params, asked, tolerance, node, t[None], backward)
+    found, result = _solved_from(system, params, asked, tolerance, node, t[None], integrate)
     return jax.tree.map(lambda x: x[-1], found)._replace(t=t), result
 
 
@@ -187,16 +186,18 @@ def in_one_solve(trajectory, t):
 
     The span stays that of the trajectory, on which some settings depend.
     """
-    if isinstance(trajectory, HybridTrajectory):
+    if trajectory.in_phases:
         raise TypeError(IN_PHASES)
     first = jax.tree.map(lambda x: x[0], _known_of(trajectory).at)
     of_system = trajectory.system, trajectory.params, trajectory.asked, trajectory.tolerance
     ts = jnp.append(t, trajectory.t[-1])
-    found, _ = _solved_from(*of_system, first, ts, trajectory.static.how.backward)
+    found, _ = _solved_from(*of_system, first, ts, trajectory.static.integrate)
     return jax.tree.map(lambda x: x[1:-1], found)
 
 
-def _solved_from(system, params, asked, tolerance, node: Snapshot, ts, backward):
+def _solved_from(
+    system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, ts, integrate: Callable
+):
     """Integrate from a node to the times ts, (N,); return the motion at the node and at these, and the result."""
     rtol, atol = tolerance
     by_size = atol.ndim == 2
@@ -220,14 +221,18 @@ def _solved_from(system, params, asked, tolerance, node: Snapshot, ts, backward)
         jumps=asked.jumps,
     )
     ts = jnp.append(node.t, ts)
-    found = in_either_direction(system, node.q, node.v, params, ts, None, settings, backward)
+    found = integrate(system, node.q, node.v, params, ts, None, settings)
     return Snapshot(ts, found.q, found.v, found.multipliers), found.result
 
 
 @partial(compiled, in_numpy=True)
-def _continue_all(system, params, asked, tolerance, nodes, times, backward):
-    of_one = lambda pair: _continued(system, params, asked, tolerance, *pair, backward)
-    return lax.map(of_one, (nodes, times), batch_size=min(LANES, len(times)))
+def _continue_all(
+    system: System, params: PyTree, asked: SolveOptions, tolerance, nodes: Snapshot, times, integrate: Callable
+):
+    of_system = system, params, asked, tolerance
+    return lax.map(
+        lambda pair: _continued(*of_system, *pair, integrate), (nodes, times), batch_size=min(LANES, len(times))
+    )
 
 
 def _of_length_zero(system, params, node: Snapshot, t):
@@ -250,13 +255,13 @@ def _of_length_zero(system, params, node: Snapshot, t):
         return Snapshot(t, q, v, {})
     _, multipliers = accelerations(system, t, q, v, params)
     # The multipliers as computed at the output, bit for bit.
-    exactly = lambda known, x: known + (x - lax.stop_gradient(x))
     known = jax.tree.map(lax.stop_gradient, node.multipliers)
-    return Snapshot(t, q, v, jax.tree.map(exactly, known, multipliers))
+    exactly = jax.tree.map(lambda known, x: known + (x - lax.stop_gradient(x)), known, multipliers)
+    return Snapshot(t, q, v, exactly)
 
 
 def _check_can_be_continued(trajectory):
-    if isinstance(trajectory, HybridTrajectory) and trajectory.t.ndim > 1:
+    if trajectory.in_phases and trajectory.t.ndim > 1:
         raise ValueError(
             f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: at(t) needs one of them.\n"
             "Fix: jax.tree.map(lambda x: x[0], traj).at(t)"

@@ -1,0 +1,59 @@
+"""How a motion is integrated: all that is asked for but the system, the state and the times."""
+
+from dataclasses import dataclass
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, Int
+
+# A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
+# in a loop. In batches of a rod or a double pendulum copies are twice as fast. A single motion's step is a fifth slower
+# in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
+# are taken without copies: the first takes two thirds of the time, each of the next ones a fifth more.
+UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
+# In a batch, whose lanes wait for each other: the number of steps after which a motion is given up, to be run alone.
+PATIENCE = jax.make_user_context(default_value=None)
+
+
+# Making an equinox module takes longer than computing a short motion.
+@jtu.register_dataclass
+@dataclass(frozen=True)
+class Settings:
+    """How to integrate: everything but the system, the state and the times."""
+
+    method: diffrax.AbstractSolver | None
+    controller: diffrax.AbstractStepSizeController | None
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint | None
+    rtol: Float[Array, " 2"]
+    atol: Float[Array, " 2"]
+    dt0: Float[Array, ""] | None
+    # Infinite if the length of steps is not limited.
+    max_step: Float[Array, ""]
+    jump_ts: Float[Array, " J"] | None
+    # Shares of the proposed first step, and of the time between outputs for the longest step: see `StepToOutputs`.
+    shares: Float[Array, " 2"]
+    # Motions of up to this many steps are integrated again for an error estimate.
+    repeated_up_to: Int[Array, ""]
+    # Whether `atol` was not given and follows the motion's own size; the value above is then a placeholder.
+    by_size: bool = eqx.field(static=True)
+    apart: bool = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)
+    drift: str = eqx.field(static=True)
+    progress: bool | None = eqx.field(static=True)
+    # The size of the record for reverse mode, in bytes; None for the usual one.
+    memory: float | None = eqx.field(static=True, default=None)
+    # False if the equations are assumed regular, until that turns out to be wrong.
+    robust: bool = eqx.field(static=True, default=True)
+    # Whether jumps of forces are found and followed.
+    jumps: str = eqx.field(static=True, default="found")
+    # A right-hand side of up to this many operations is copied to each of a method's stages.
+    unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
+
+
+def patient(max_steps: int | None) -> int | None:
+    """The number of steps that a motion may take, within `PATIENCE`."""
+    limits = [limit for limit in (max_steps, PATIENCE.value) if limit is not None]
+    return min(limits, default=None)

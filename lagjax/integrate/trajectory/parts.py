@@ -1,0 +1,69 @@
+"""The parts of a trajectory: one instant, how it was stepped through, what was asked for."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.jaxtools.cache import HashablePart, hashable_partition
+
+# The phase of an output that was not reached, and the number in unused places for switches.
+NO_PHASE = -1
+
+
+class Snapshot(NamedTuple):
+    """One instant of a motion."""
+
+    t: Float[Array, ""]
+    q: PyTree[Float[Array, "..."]]
+    v: PyTree[Float[Array, "..."]]
+    multipliers: dict[str, Array]
+
+
+class SolveInfo(NamedTuple):
+    """How a motion was stepped through.
+
+    `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
+    `steps`: chosen by the "tolerance", by it over several "legs", "fixed", or by the user's "controller"; `backward`:
+    whether time decreases.
+    """
+
+    method: str
+    order: int
+    evaluations: int | None
+    steps: str
+    backward: bool = False
+
+
+class SolveOptions(NamedTuple):
+    """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
+
+    method: diffrax.AbstractSolver | None
+    stepsize_controller: diffrax.AbstractStepSizeController | None
+    dt0: Array | None
+    max_step: Array | None
+    jump_ts: Array | None
+    drift: str
+    jumps: str = "found"
+
+
+class StaticPart(NamedTuple):
+    """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along.
+
+    `integrate`: what continues the motion, (system, q0, v0, params, ts, guards, settings) -> trajectory.
+    """
+
+    rest: HashablePart
+    how: SolveInfo
+    integrate: Callable
+
+    @property
+    def method(self) -> str:
+        return self.how.method
+
+
+def pack(problem: tuple, how: SolveInfo, integrate: Callable) -> tuple[PyTree, StaticPart]:
+    """Split `problem` = (system, params, what was asked for) into arrays and a hashable rest."""
+    arrays, rest = hashable_partition(problem)
+    return arrays, StaticPart(rest, how, integrate)
