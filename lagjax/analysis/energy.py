@@ -459,7 +459,7 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
             "Fix: lj.energy_ledger(jax.tree.map(lambda x: x[0], traj))."
         )
     accounted = trajectory.system if system is None else system
-    if isinstance(accounted, Hybrid) != isinstance(trajectory, HybridTrajectory):
+    if accounted.in_phases != isinstance(trajectory, HybridTrajectory):
         raise TypeError(
             "a motion in phases is accounted for by a lj.Hybrid, any other one by a lj.System, not "
             f"{type(accounted).__name__}.\nFix: leave system out, or give one like traj.system."

@@ -5,6 +5,7 @@ them.
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -31,6 +32,18 @@ def prepare(system: System, t, q, v, params) -> tuple[Model, State]:
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
     return model_of(traced_system(system, s), *s), s
+
+
+def checked(system: System, given: State) -> tuple[System, State]:
+    """The checked system and its state; integers in `params` become floats if the functions accept them."""
+    floats = jax.tree.map(lambda x: float(x) if type(x) is int else x, given.params)
+    if any(type(x) is int for x in jax.tree.leaves(given.params)):
+        with suppress(TypeError, ValueError, IndexError):
+            s = coordinates.state(*given[:3], floats)
+            return traced_system(system, s), s
+    # A count or an index must stay an integer.
+    s = coordinates.state(*given)
+    return traced_system(system, s), s
 
 
 def traced_system(system: System, s: State) -> System:

@@ -22,7 +22,7 @@ from lagjax.analysis.continuation.equilibrium_equations import (
 )
 from lagjax.analysis.continuation.result import Branch, Branches, Critical
 from lagjax.analysis.equilibria.balance import VELOCITY, Steady
-from lagjax.analysis.equilibria.equilibria import checked, held_at, searched, stacked, stacked_one, symmetries_of
+from lagjax.analysis.equilibria.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
 from lagjax.analysis.equilibria.result import OK, WORDS
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
@@ -30,6 +30,8 @@ from lagjax.mechanics.diagnosis import describe
 from lagjax.mechanics.structure import are_angles, is_autonomous
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
+from lagjax.system.check_functions import checked
+from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
 
 # Critical points closer than this are the same.
@@ -103,7 +105,7 @@ def continue_equilibria(
             "Fix: call it outside jit, vmap and grad; critical points carry their derivatives, "
             "branches.critical[0].derivative, and lj.equilibria works inside."
         )
-    system, s = checked(system, t, q, v, params)
+    system, s = checked(system, State(t, q, v, params))
     moving = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)]) != 0
     symmetries = symmetries_of(system, s, cyclic, hold, None if velocity is None else moving)
     model, x0 = model_of(system, *s), coordinates.vector(s.q)

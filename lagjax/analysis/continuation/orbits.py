@@ -24,7 +24,6 @@ from lagjax.analysis.continuation.orbit_equations import (  # fmt: skip
     sizes_at,
 )
 from lagjax.analysis.continuation.orbit_result import CriticalOrbit, OrbitBranch
-from lagjax.analysis.equilibria.equilibria import checked
 from lagjax.analysis.orbits.flow import flow_of
 from lagjax.analysis.orbits.monodromy import OrbitProblem, problem_of, tolerance_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
@@ -34,6 +33,8 @@ from lagjax.jaxtools.cache import hashable_partition
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_eager, is_traced
 from lagjax.system import coordinates
+from lagjax.system.check_functions import checked
+from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
 
 HALVINGS = 40
@@ -179,8 +180,8 @@ def continue_orbits(
     """
     _check(orbit)
     # Integers in the parameters become floats, so that a branch may follow them too.
-    system, s = checked(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
-    problem = problem_of(system, *s)
+    system, s = checked(orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params))
+    problem = problem_of(system, s)
     place, asked = _along(along, orbit, problem)
     frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
     first, last = float(z[-1] * frame.unit), float(to)

@@ -45,7 +45,7 @@ from lagjax.numerics.linalg import lapack
 from lagjax.numerics.newton import MOST, differentiable, least_squares_root, zero_below
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
-from lagjax.system.check_functions import traced_system
+from lagjax.system.check_functions import checked
 from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
 
@@ -88,19 +88,6 @@ def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
     return q, jax.tree.map(lambda x: numpy_of(x).zeros_like(x), q)
-
-
-def checked(system, t, q, v, params):
-    """The checked system and its state; integers in `params` become floats if the functions accept them."""
-    floats = jtu.tree_map(lambda x: float(x) if type(x) is int else x, params)
-    s = coordinates.state(t, q, v, floats)
-    if any(type(x) is int for x in jtu.tree_leaves(params)):
-        try:
-            return traced_system(system, s), s
-        except (TypeError, ValueError):
-            # A count or an index must stay an integer.
-            s = coordinates.state(t, q, v, params)
-    return traced_system(system, s), s
 
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> SteadySymmetries:
@@ -237,7 +224,7 @@ def equilibria(
     v = jax.tree.map(zeros, q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
     try:
-        system, s = checked(system, t, *first, params)
+        system, s = checked(system, State(t, *first, params))
     except (TypeError, ValueError, IndexError):
         if isinstance(starts, list) or velocities is not None or not _is_a_state(system, t, starts, params):
             raise
@@ -353,7 +340,7 @@ def _with(array, places, values):
 def _is_a_state(system, t, q, params) -> bool:
     """Whether the argument `starts` is a single start."""
     try:
-        checked(system, t, *stacked_one(q), params)
+        checked(system, State(t, *stacked_one(q), params))
     except (TypeError, ValueError, IndexError):
         return False
     return True

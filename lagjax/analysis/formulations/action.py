@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.energy import Motion
 from lagjax.integrate.trajectory.dense_output import in_one_solve
@@ -24,6 +24,7 @@ from lagjax.numerics import quadrature
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
+from lagjax.system.system import System
 
 # Points of Gauss's rule on each piece, which is exact up to degree 15.
 POINTS = 8
@@ -131,7 +132,7 @@ def _along_the_steps(system, path, params, t0, t1):
 
     def at_nodes(a, b):
         _, t, q, v, _ = motion.again(a, b)
-        return np.asarray(_lagrangians(system, t, q, v, params))[:, None]
+        return np.asarray(_lagrangians(system, params, t, q, v))[:, None]
 
     size = float(np.max(np.abs(at_nodes(knots[:-1], knots[1:]))))
     rtol = max(float(np.max(np.asarray(path.tolerance[0]))), float(np.finfo(dtype).eps))
@@ -140,7 +141,7 @@ def _along_the_steps(system, path, params, t0, t1):
 
 
 @compiled
-def _lagrangians(system, t, q, v, params):
+def _lagrangians(system: System, params: PyTree, t: Array, q: PyTree, v: PyTree) -> Array:
     return jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, params))(t, q, v)
 
 

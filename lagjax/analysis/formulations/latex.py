@@ -31,7 +31,7 @@ from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.system import constraints, coordinates
 from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
+from lagjax.system.check_functions import checked
 from lagjax.system.model import Model, model_of
 
 # Beyond these numbers of coordinates, of operations and of terms the equations are too long to read.
@@ -102,13 +102,7 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     """
     check_system(system, q, v, params)
     sympy_itself("lj.latex")
-    s = coordinates.state(t, q, v, jax.tree.map(lambda x: float(x) if type(x) is int else x, params))
-    try:
-        system = traced_system(system, s)
-    except (TypeError, IndexError):
-        # An integer that is used as a count or an index must stay an integer.
-        s = coordinates.state(t, q, v, params)
-        system = traced_system(system, s)
+    system, s = checked(system, coordinates.State(t, q, v, params))
     model = model_of(system, *s)
     if model.n > COORDINATES:
         raise ValueError(

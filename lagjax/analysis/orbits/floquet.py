@@ -26,6 +26,7 @@ from lagjax.analysis.orbits.monodromy import period_of, problem_of, refuse_singu
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.display import plots
 from lagjax.jaxtools.tracing import is_traced
+from lagjax.system.coordinates import State
 from lagjax.system.system import System
 
 # The largest extent of the axes: beyond this the circle would be too small to see.
@@ -223,7 +224,7 @@ def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=No
                 f"floquet needs {name} with a system.\n"
                 "Fix: lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit."
             )
-    problem = problem_of(system, t, q, v, params)
+    problem = problem_of(system, State(t, q, v, params))
     found, error = period_of(problem, period, rtol)
     result = _floquet_of(problem, found, error, period)
     if not is_traced(found) and not bool(found.ended):
@@ -249,7 +250,7 @@ def _of_orbit(orbit, rtol, given):
             "a periodic orbit already contains its state, parameters and period.\n"
             "Fix: lj.floquet(orbit) alone; for other parameters find their orbit first."
         )
-    problem = problem_of(orbit.system, orbit.t, orbit.q, orbit.v, orbit.params)
+    problem = problem_of(orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params))
     found, error = period_of(problem, orbit.period, rtol, orbit.nodes)
     return _floquet_of(problem, found, error, orbit.period)
 

@@ -28,6 +28,7 @@ from lagjax.display import plots as plot
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.system.argument_checks import by_name
+from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
 from lagjax.system.system import System
 
@@ -152,7 +153,7 @@ def lyapunov_exponents(
     """
     ts = numpy_of(ts).asarray(ts)
     _check(ts)
-    problem = problem_of(system, ts[0], q, v, params)
+    problem = problem_of(system, State(ts[0], q, v, params))
     s = problem.state
     model = model_of(problem.system, *s)
     most = 2 * model.n - len(all_rows(model) if problem.rows is None else problem.rows)

@@ -40,6 +40,7 @@ from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
 from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
+from lagjax.system.system import System
 
 # A direction shorter than this, relative to its possible length, is round-off.
 NO_DIRECTION = 1e-7
@@ -66,13 +67,6 @@ class Reasons(NamedTuple):
             *(f"shift of {name}" for name in shifted),
             *(f"across momenta of {name}" for name in shifted if self.momenta),
         )
-
-
-def reasons_of(model) -> Reasons:
-    """The reasons that the programs of a system show."""
-    system, known = model.system, invariance(model)
-    conserves = system.force is None and system.dissipation is None and system.is_holonomic
-    return Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
 
 
 def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
@@ -161,16 +155,19 @@ class OrbitProblem(NamedTuple):
     is_angle: tuple[bool, ...]
 
 
-def problem_of(system, t, q, v, params) -> OrbitProblem:
+def problem_of(system: System, given: State) -> OrbitProblem:
     """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
-    check_system(system, q, v, params)
-    s = coordinates.prepared(t, q, v, params)
+    check_system(system, *given[1:])
+    s = coordinates.prepared(*given)
     system = traced_system(system, s)
     state = coordinates.state(*s)
     model = model_of(system, *state)
     rows = independent_rows_of(model, state)
-    _check_freedom(model, rows)
-    return OrbitProblem(system, s, reasons_of(model), rows, tuple(are_angles(model).tolist()))
+    _check_freedom(model.n, len(all_rows(model) if rows is None else rows), rows is not None)
+    known = invariance(model)
+    conserves = system.force is None and system.dissipation is None and system.is_holonomic
+    reasons = Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
+    return OrbitProblem(system, s, reasons, rows, tuple(are_angles(model).tolist()))
 
 
 def refuse_singular(problem: OrbitProblem):
@@ -181,15 +178,14 @@ def refuse_singular(problem: OrbitProblem):
         raise ValueError(words)
 
 
-def _check_freedom(model, rows):
-    n, known = model.n, rows is not None
-    rows = all_rows(model) if rows is None else rows
-    if len(rows) < 2 * n:
+def _check_freedom(n: int, rows: int, known: bool) -> None:
+    """Raise if `rows` equations leave nothing to move; `known`: they are known to be independent."""
+    if rows < 2 * n:
         return
     cause = "constraints that fix every coordinate" if known else "constraints that depend on each other"
     fix = "leave one out" + ("" if known else ", or call this outside of jit and vmap, where dependent ones are found")
     raise ValueError(
-        f"there are {2 * n} coordinates and velocities, and {len(rows)} equations restrict them: nothing is left to "
+        f"there are {2 * n} coordinates and velocities, and {rows} equations restrict them: nothing is left to "
         f"move.\nUsual cause: {cause}.\nFix: {fix}."
     )
 

@@ -23,6 +23,7 @@ from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
 from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.diagnosis import listed
 from lagjax.system import coordinates
+from lagjax.system.coordinates import State
 from lagjax.system.system import System
 
 # A driven system may change from one period to the next by this fraction of what it does in one.
@@ -91,7 +92,7 @@ def periodic_orbit(
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
     """
     q, v = _pair(start)
-    problem = problem_of(system, t, q, v, params)
+    problem = problem_of(system, State(t, q, v, params))
     s = problem.state
     dtype, names = s.t.dtype, coordinates.names(s.q)
     asked = _asked(problem, names, hold, relative)
