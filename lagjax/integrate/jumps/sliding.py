@@ -76,7 +76,10 @@ class Sliding(eqx.Module):
             return jnp.stack([f(t, model.tree(x), model.tree(u), given) for f in self.differences])
 
         _, rates = jax.jvp(difference, (t, x, u), (jnp.ones_like(t), u, a))
-        pushes, count = [jax.jvp(partial(difference, t, x), (u,), (change,))[1] for change in changes], len(self.which)
+        pushes, count = (
+            [jax.jvp(lambda u: difference(t, x, u), (u,), (change,))[1] for change in changes],
+            len(self.which),
+        )
         active = [given.slides[i] for i in self.which]
         rows = [[jnp.where(active[i], pushes[j][i], float(i == j)) for j in range(count)] for i in range(count)]
         rows = [[jnp.where(active[j] | (i == j), x, 0.0) for j, x in enumerate(row)] for i, row in enumerate(rows)]

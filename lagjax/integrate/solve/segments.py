@@ -217,8 +217,7 @@ def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings,
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
         # A motion in the wrong phase is wrong from that phase's start on, its first output included.
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
-        unknown = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), end.multipliers)
-        end = where(invalid, Snapshot(way.t, way.q, way.v, unknown), end)
+        end = where(invalid, Snapshot(way.t, way.q, way.v, unknown(end.multipliers)), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
