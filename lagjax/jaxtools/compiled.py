@@ -7,7 +7,7 @@ fit: 3.4 s in place of 5.3). Lanes of a sweep, in arrays, run up to a quarter sl
 newer way. The XLA of jax 0.12 has one way, and no such option. `LAGJAX_PLAIN=1` leaves the option out.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, wraps
 
 import jax
@@ -30,7 +30,7 @@ def compiler_options() -> dict | None:
     return WITHOUT_EMITTERS if _are_known(WITHOUT_EMITTERS) else None
 
 
-def _are_known(options):
+def _are_known(options: dict):
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except jax.errors.JaxRuntimeError:
@@ -60,9 +60,9 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
     return program
 
 
-def _jitted(function, static):
+def _jitted(function: Callable, static):
     return jax.jit(partial(_of_arrays, function, static), compiler_options=compiler_options())
 
 
-def _of_arrays(function, static, arrays):
+def _of_arrays(function: Callable, static, arrays: Sequence):
     return one_by_one(function)(*static.combine(arrays))

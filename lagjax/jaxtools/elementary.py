@@ -17,6 +17,7 @@ Microsystems, 1993) and FreeBSD msun `k_sinf.c`, `k_cosf.c` for the coefficients
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox.internal as eqxi
@@ -85,12 +86,12 @@ ARITHMETIC = {
 }
 
 
-def _with_derivatives(pair):
+def _with_derivatives(pair: Callable):
     """Give a function (sine, cosine) derivatives in terms of itself."""
     pair = jax.custom_jvp(pair)
 
     @pair.defjvp
-    def rule(primals, tangents):
+    def rule(primals: Sequence, tangents: Sequence):
         sine, cosine = pair(*primals)
         return (sine, cosine), (cosine * tangents[0], -sine * tangents[0])
 
@@ -125,13 +126,13 @@ def sincos_in_lanes(x):
     return tuple(_sincos_p.bind(x))
 
 
-def _sincos_jvp(primals, tangents):
+def _sincos_jvp(primals: Sequence, tangents: Sequence):
     sine, cosine = _sincos_p.bind(*primals)
     (dx,) = tangents
     return (sine, cosine), (cosine * dx, -sine * dx)
 
 
-def _sincos_batched(operands, axes):
+def _sincos_batched(operands: Sequence, axes):
     batched_version = sincos if jax.default_backend() == "cpu" else _by_library
     return batched_version(*operands), axes * 2
 
@@ -168,7 +169,7 @@ def _by_arithmetic(x):
     return jnp.where(jnp.abs(x) < a.tiny, x, sine), jnp.where(((quadrant + 1) & 2) != 0, -cosine, cosine)
 
 
-def _polynomial(z, coefficients):
+def _polynomial(z: Array, coefficients):
     """Evaluate in pairs (Estrin's scheme): half the dependency chain of Horner's."""
     pairs = [c + z * after for c, after in zip(coefficients[::2], coefficients[1::2])]
     pairs += coefficients[len(pairs) * 2 :]

@@ -22,7 +22,7 @@ a result.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -32,9 +32,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.jaxpr import (
     ACCUMULATING,
@@ -114,7 +114,7 @@ def marked(result: jax.Array, marks: dict[str, str]) -> jax.Array:
     return cast(jax.Array, set_xla_metadata(result, **marks))
 
 
-def kept_as_call(results):
+def kept_as_call(results: PyTree):
     """Keep the jitted function of these `results` a call; else XLA computes it again for each use of a result."""
     if jax.default_backend() != "cpu" or is_plain():
         return results
@@ -133,7 +133,7 @@ def apart(function: Callable, *args):
 
 
 @eqx.filter_jit
-def _jitted(function, args):
+def _jitted(function: Callable, args: tuple):
     return function(*args)
 
 
@@ -173,7 +173,7 @@ def poisoned(closed: ClosedJaxpr) -> ClosedJaxpr:
     return without_checks(rewritten(closed, _poisoned)) if calls_host(closed.jaxpr) else closed
 
 
-def _poisoned(equation):
+def _poisoned(equation: JaxprEqn):
     """A call of equinox's `branched_error_if_impl(x, condition, ...)`, with NaN for x where the condition is true."""
     if equation.params.get("name") != "branched_error_if_impl" or "jaxpr" not in equation.params:
         return equation
@@ -198,7 +198,7 @@ def _poisoned(equation):
     return equation.replace(params={**equation.params, "jaxpr": program})
 
 
-def _without_check(equation):
+def _without_check(equation: JaxprEqn):
     """Replace a branch that calls the host only to raise an error by the other branch, which does not."""
     branches = equation.params.get("branches", ())
     silent = [branch for branch in branches if not calls_host(branch.jaxpr)]
@@ -212,7 +212,7 @@ def _without_check(equation):
 calls_host = anywhere(lambda equation: "callback" in equation.primitive.name)
 
 
-def _only_raises(jaxpr):
+def _only_raises(jaxpr: ClosedJaxpr):
     calls = [equation for equation in equations(jaxpr) if "callback" in equation.primitive.name]
     host_functions = [getattr(equation.params.get("callback"), "callback_func", None) for equation in calls]
     return all(getattr(function, "__module__", None) == "equinox._errors" for function in host_functions)
@@ -223,7 +223,7 @@ def without_library(closed: ClosedJaxpr) -> ClosedJaxpr:
     return rewritten(closed, _equation_without_library)
 
 
-def _equation_without_library(equation):
+def _equation_without_library(equation: JaxprEqn):
     name = equation.primitive.name
     if name == "inverse":
         return equation.replace(params={**equation.params, "eliminate": True})
@@ -235,14 +235,14 @@ def _equation_without_library(equation):
     return equation
 
 
-def _product(left, right, dimension_numbers, like):
+def _product(left: Array, right: Array, dimension_numbers, like):
     """A matrix product that XLA does not pass on to a library, as it does with sums of many multiplications.
 
     Such sums are added up in a loop over their terms.
     """
     (of_left, of_right), (left_lanes, right_lanes) = dimension_numbers
 
-    def arranged(x, contracted, lanes):
+    def arranged(x, contracted: Sequence[int], lanes):
         free = [i for i in range(x.ndim) if i not in contracted and i not in lanes]
         groups = (lanes, free, contracted)
         return x.transpose(*lanes, *free, *contracted).reshape(
@@ -255,7 +255,7 @@ def _product(left, right, dimension_numbers, like):
     if lanes * rows * columns * summed <= LARGE:
         return jnp.sum(left[:, :, None] * right[:, None], axis=-1, dtype=like.dtype).reshape(like.shape)
 
-    def added(i, total):
+    def added(i: Array, total: Array):
         entries = [lax.dynamic_index_in_dim(x, i, axis=2, keepdims=False) for x in (left, right)]
         return total + entries[0][:, :, None] * entries[1][:, None]
 
@@ -264,11 +264,11 @@ def _product(left, right, dimension_numbers, like):
     return lax.fori_loop(0, summed, added, zero, unroll=4).reshape(like.shape)
 
 
-def _unmarked(*operands, jaxpr, **params):
+def _unmarked(*operands, jaxpr: ClosedJaxpr, **params):
     return jaxpr_as_fun(jaxpr)(*operands)
 
 
-def _marked(*operands, jaxpr, **params):
+def _marked(*operands, jaxpr: ClosedJaxpr, **params):
     original, jaxpr = jaxpr, without_library(jaxpr)
     if not fits(jaxpr.jaxpr):
         return _unmarked(*operands, jaxpr=original)
@@ -284,7 +284,7 @@ def _marked(*operands, jaxpr, **params):
     return [marked(first, ONE_KERNEL), *others][: len(jaxpr.out_avals)]
 
 
-def _jvp_program(jaxpr, has_tangent, checked):
+def _jvp_program(jaxpr: ClosedJaxpr, has_tangent: Sequence[bool], checked: bool):
     """The program of values and derivatives; it takes the operands, and the tangents of those with `has_tangent`."""
 
     def values_and_derivatives(*operands):
@@ -305,7 +305,7 @@ def _jvp_program(jaxpr, has_tangent, checked):
     return without_checks(program) if checked else program
 
 
-def _jvp(primitive, primals, tangents, *, jaxpr, checked, **params):
+def _jvp(primitive: Primitive, primals: Sequence, tangents: Sequence, *, jaxpr: ClosedJaxpr, checked: bool, **params):
     has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
     moving = [t for t, k in zip(tangents, has_tangent) if k]
     program, count = _jvp_program(jaxpr, has_tangent, checked), len(jaxpr.out_avals)
@@ -325,7 +325,9 @@ def _jvp(primitive, primals, tangents, *, jaxpr, checked, **params):
     return found[:count], [next(derivatives) if moves(aval) else ad.Zero(aval) for aval in shapes]
 
 
-def _batched(operands, axes, *, jaxpr, in_blocks, points, values, checked):
+def _batched(
+    operands: Sequence, axes: Sequence, *, jaxpr: ClosedJaxpr, in_blocks: bool, points: int, values: int, checked: bool
+):
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     batched = tuple(axis is not None for axis in axes)
     lanes = next(x.shape[0] for x, b in zip(front, batched) if b)
@@ -341,14 +343,14 @@ def _batched(operands, axes, *, jaxpr, in_blocks, points, values, checked):
     return results, [0] * len(results)
 
 
-def _lanes_together(*operands, jaxpr, batched, lanes=None, **params):
+def _lanes_together(*operands, jaxpr: ClosedJaxpr, batched: Sequence[bool], lanes=None, **params):
     if isinstance(lanes, int) and lanes == 0:
         # A loop that runs until the slowest lane is done has none to ask here.
         return [jnp.zeros((0, *aval.shape), aval.dtype) for aval in jaxpr.out_avals]
     return jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched])(*operands)
 
 
-def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
+def _lanes_in_blocks(*operands, jaxpr: ClosedJaxpr, batched: Sequence[bool], lanes, **params):
     """A loop over as few blocks of lanes as fit, all of one length: copies of the last lane fill the last block."""
     together = partial(_lanes_together, jaxpr=jaxpr, batched=batched)
     if not isinstance(lanes, int):
@@ -363,7 +365,7 @@ def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
         filled = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (blocks * length - lanes, *x.shape[1:]))])
         return filled.reshape(blocks, length, *x.shape[1:])
 
-    def of_block(batched_operands):
+    def of_block(batched_operands: Sequence):
         remaining = iter(batched_operands)
         return tuple(together(*(next(remaining) if b else x for x, b in zip(operands, batched))))
 
@@ -371,7 +373,9 @@ def _lanes_in_blocks(*operands, jaxpr, batched, lanes, **params):
     return [x.reshape(blocks * length, *x.shape[2:])[:lanes] for x in found]
 
 
-def _batched_again(operands, axes, *, jaxpr, batched, lanes, checked):
+def _batched_again(
+    operands: Sequence, axes: Sequence, *, jaxpr: ClosedJaxpr, batched: Sequence[bool], lanes, checked: bool
+):
     more = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     flat = []
     for x, axis, b in zip(operands, axes, batched):
@@ -386,11 +390,11 @@ def _batched_again(operands, axes, *, jaxpr, batched, lanes, checked):
     return [x.reshape(more, lanes, *x.shape[1:]) for x in results], [0] * len(results)
 
 
-def _lane_shapes(*operands, jaxpr, lanes, **params):
+def _lane_shapes(*operands, jaxpr: ClosedJaxpr, lanes, **params):
     return [aval.update(shape=(lanes, *aval.shape)) for aval in jaxpr.out_avals]
 
 
-def _define(name, evaluate, on_cpu, shapes, batch):
+def _define(name: str, evaluate: Callable, on_cpu: Callable, shapes, batch: Callable):
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(lambda *x, **params: jax.jit(lambda *x: primitive.bind(*x, **params))(*x))

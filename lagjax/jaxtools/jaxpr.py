@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 # They work entry by entry, on numbers alone.
 ELEMENTWISE = {
@@ -71,7 +71,7 @@ T = TypeVar("T")
 LONG_CHAIN = 16
 
 
-def bodies(equation) -> list[Jaxpr]:
+def bodies(equation: JaxprEqn) -> list[Jaxpr]:
     """The programs inside a primitive: branches, loop bodies, called functions."""
     found = []
     for value in equation.params.values():
@@ -86,7 +86,7 @@ def once_per_program(find: Callable[[Jaxpr], T]) -> Callable[[Jaxpr], T]:
     known: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 
     @wraps(find)
-    def found(jaxpr):
+    def found(jaxpr: Jaxpr):
         # Two tests of one dictionary: an entry may go between them only if the program does.
         if jaxpr not in known:
             known[jaxpr] = find(jaxpr)
@@ -99,7 +99,7 @@ def anywhere(test: Callable) -> Callable[[Jaxpr], bool]:
     """Return the function that says whether `test` holds for an equation of a program, or of one inside it."""
 
     @once_per_program
-    def holds(jaxpr):
+    def holds(jaxpr: Jaxpr):
         return any(test(equation) or any(map(holds, bodies(equation))) for equation in jaxpr.eqns)
 
     return holds
@@ -119,7 +119,7 @@ def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJ
     # New objects by the id of the old one, which is kept alive lest another object get its id.
     made = {}
 
-    def once(value, make):
+    def once(value, make: Callable):
         if id(value) not in made:
             made[id(value)] = value, make()
         return made[id(value)][1]
@@ -138,19 +138,19 @@ def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJ
             return value if _same(new, value) else make(new)
         return value
 
-    def of_equation(equation):
+    def of_equation(equation: JaxprEqn):
         params = equation.params
         new = [inside(value) for value in params.values()]
         return equation if _same(new, params.values()) else equation.replace(params=dict(zip(params, new)))
 
-    def of_program(jaxpr):
+    def of_program(jaxpr: Jaxpr):
         new = [of_equation(equation) for equation in change(jaxpr).eqns]
         return jaxpr if _same(new, jaxpr.eqns) else jaxpr.replace(eqns=new)
 
     return cast(ClosedJaxpr, inside(closed))
 
 
-def _same(new, old):
+def _same(new: Sequence, old: Sequence):
     return len(new) == len(old) and all(one is other for one, other in zip(new, old))
 
 
@@ -162,7 +162,7 @@ def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
     return _rewritten(closed, _chains_as_loops)
 
 
-def _chains_as_loops(jaxpr):
+def _chains_as_loops(jaxpr: Jaxpr):
     uses = Counter(x for e in jaxpr.eqns for x in variables(e))
     uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
     # The equations of each chain so far, by the variable that it ends with.
@@ -188,7 +188,7 @@ def _alike(one, other):
     return one.primitive is other.primitive and list(map(str, bodies(one))) == list(map(str, bodies(other)))
 
 
-def _loop(jaxpr, chain):
+def _loop(jaxpr: Jaxpr, chain: Sequence[JaxprEqn]):
     (x,), last = variables(chain[0]), chain[-1]
     looped = jax.jit(
         lambda value: lax.fori_loop(0, len(chain), lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0], value)
@@ -210,7 +210,7 @@ def length(jaxpr: Jaxpr) -> int:
     return sum(1 for _ in equations(jaxpr))
 
 
-def variables(equation) -> list:
+def variables(equation: JaxprEqn) -> list:
     """The distinct operands of an equation that are not literals."""
     return list(dict.fromkeys(x for x in equation.invars if not isinstance(x, Literal)))
 
@@ -222,7 +222,7 @@ def written(literal: Literal) -> np.ndarray:
     return np.asarray(literal.val, literal.aval.dtype)
 
 
-def evaluate(jaxpr: Jaxpr, equation, values) -> list:
+def evaluate(jaxpr: Jaxpr, equation: JaxprEqn, values) -> list:
     """The results of one equation of a program, whatever its primitive; `values` by variable."""
     if not bodies(equation):
         operands = [x.val if isinstance(x, Literal) else values[x] for x in equation.invars]
@@ -233,7 +233,7 @@ def evaluate(jaxpr: Jaxpr, equation, values) -> list:
     return jaxpr_as_fun(ClosedJaxpr(alone, ()))(*(values[x] for x in operands))
 
 
-def applied(jaxpr: Jaxpr, equation, operands) -> list:
+def applied(jaxpr: Jaxpr, equation: JaxprEqn, operands: Sequence) -> list:
     """The same as `evaluate`, given the operands in order."""
     return evaluate(
         jaxpr, equation, {x: value for x, value in zip(equation.invars, operands) if not isinstance(x, Literal)}
@@ -265,7 +265,7 @@ def interpreted(
     return [read(x) for x in jaxpr.outvars]
 
 
-def stands_for(equation) -> ClosedJaxpr | None:
+def stands_for(equation: JaxprEqn) -> ClosedJaxpr | None:
     """The program that a call stands for; None for others: a reduction, too, holds one, for pairs of entries."""
     inner = [p for p in equation.params.values() if isinstance(p, (ClosedJaxpr, Jaxpr))]
     if equation.primitive.name not in CALLS | CALLS_WITH_RULES or len(inner) != 1:
@@ -334,7 +334,7 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
             values.update(zip(equation.outvars, evaluate(jaxpr, equation, values)))
         return [values[x] for x in crossing] + [1 / values[x] for x in divisors]
 
-    def afterwards(prepared, *given):
+    def afterwards(prepared: Sequence, *given):
         values = dict(zip(crossing, prepared)) | {jaxpr.invars[i]: x for i, x in zip(then, given)}
         inverse = dict(zip(divisors, prepared[len(crossing) :]))
         for equation in after:

@@ -9,7 +9,7 @@ alone: `rules_of` adds what its rule computes.
 import dataclasses
 import hashlib
 import types
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 from lagjax.jaxtools.jaxpr import equations, evaluate, once_per_program
 
@@ -85,7 +85,7 @@ def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
     return tuple(found)
 
 
-def _pulled_back(function):
+def _pulled_back(function: Callable):
     def slopes(*args):
         floats, rest = _floats_and_rest(args)
         values, back = jax.vjp(lambda *floats: [x for x in jtu.tree_leaves(function(*rest(floats))) if _is_float(x)],
@@ -95,7 +95,7 @@ def _pulled_back(function):
     return slopes
 
 
-def _floats_and_rest(args):
+def _floats_and_rest(args: tuple):
     leaves, structure = jtu.tree_flatten(args)
     places = [i for i, x in enumerate(leaves) if _is_float(x)]
 
@@ -119,11 +119,11 @@ def with_own_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
     return jax.make_jaxpr(lambda *args: _in_line(closed.jaxpr, closed.consts, args))(*closed.in_avals)
 
 
-def _holds_constants(equation):
+def _holds_constants(equation: JaxprEqn):
     return any(getattr(x, "consts", ()) for x in equation.params.values() if isinstance(x, ClosedJaxpr))
 
 
-def _in_line(jaxpr, constants, args):
+def _in_line(jaxpr, constants: Sequence, args: tuple):
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *args)))
 
     def read(x: Any) -> Any:
@@ -196,7 +196,7 @@ class _CalledLater:
     What these objects contain is read when the function is called, and need not be compared.
     """
 
-    def __init__(self, function):
+    def __init__(self, function: Callable):
         self.function = function
 
     def __hash__(self):

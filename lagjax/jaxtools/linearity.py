@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import JaxprEqn
+from jax.typing import DTypeLike
 
 from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, ClosedJaxpr, Literal, stands_for
 
@@ -23,7 +25,7 @@ SIZES, STATES = (1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0, 1e3, 1e6), 3
 SAME = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-4}
 
 
-def is_linear(function: Callable, count: int, dtype, rest) -> bool:
+def is_linear(function: Callable, count: int, dtype: DTypeLike, rest) -> bool:
     """Whether `function(numbers, rest)` -> (n,) is linear in `numbers` (count,); `rest`: arrays, known or traced."""
     zero = np.zeros(count, dtype)
     closed = jax.make_jaxpr(function)(zero, rest)
@@ -48,7 +50,7 @@ def _kinds(closed: ClosedJaxpr, given: list[int]) -> list[int]:
     return [read(x) for x in jaxpr.outvars]
 
 
-def _of_equation(equation, given: list[int]) -> list[int]:
+def _of_equation(equation: JaxprEqn, given: list[int]) -> list[int]:
     name, largest = equation.primitive.name, max(given, default=CONSTANT)
     if largest == CONSTANT:
         found = CONSTANT
@@ -75,7 +77,7 @@ def _of_equation(equation, given: list[int]) -> list[int]:
     return [found] * len(equation.outvars)
 
 
-def _of_scan(equation, given):
+def _of_scan(equation: JaxprEqn, given):
     """A loop of known length: what it carries is of the last kind that its body makes of it."""
     consts, carried = equation.params["num_consts"], equation.params["num_carry"]
     kinds = list(given)
@@ -91,7 +93,7 @@ def _all_floating(equation):
     return all(jnp.issubdtype(x.aval.dtype, jnp.floating) for x in equation.outvars)
 
 
-def _holds(function, zero, rest) -> bool:
+def _holds(function: Callable, zero, rest) -> bool:
     """Whether f(λ) = f(0) + B λ wherever it is finite, and there is such a place."""
     random, same, seen = np.random.default_rng(0), SAME[np.dtype(zero.dtype)], False
     for _ in range(STATES):
@@ -113,7 +115,7 @@ def _holds(function, zero, rest) -> bool:
     return seen
 
 
-def _made_up(x, random):
+def _made_up(x, random: np.random.Generator):
     """Numbers for an array of which only the shape is used; whole numbers that are known stay."""
     if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
         return np.ones(np.shape(x), jnp.result_type(x)) if isinstance(x, Tracer) else x

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jaxtyping import PyTree
 
 from lagjax.jaxtools.jaxpr import bodies, equations, evaluate, needed, stands_for, written
 
@@ -68,7 +69,7 @@ def bounds_of_number(x) -> Bounds:
     return float(x.min()), float(x.max())
 
 
-def bounds_of_result(equation, operands: Sequence[Bounds]) -> Bounds:
+def bounds_of_result(equation: JaxprEqn, operands: Sequence[Bounds]) -> Bounds:
     """The bounds of the first result of a primitive, from those of its operands."""
     name = equation.primitive.name
     if name in OF_RESULT:
@@ -223,7 +224,7 @@ class JumpOpening:
         # Held by the table's key: another object cannot get its address.
         return KnownValue(value, self.table.number("constant", _Held(value)), frozenset())
 
-    def _results(self, jaxpr, equation, operands):
+    def _results(self, jaxpr: Jaxpr, equation: JaxprEqn, operands: Sequence):
         name, depends = equation.primitive.name, frozenset().union(*(x.depends for x in operands))
         # What depends on outcomes alone changes only with them.
         if depends - {OUTCOME, IN_TIME}:
@@ -259,7 +260,7 @@ class JumpOpening:
         at = {x: k.value for x, k in zip(equation.invars, operands) if not isinstance(x, Literal)}
         return self._known(equation, operands, depends, evaluate(jaxpr, equation, at))
 
-    def _known(self, equation, operands, depends, results):
+    def _known(self, equation: JaxprEqn, operands: Sequence, depends, results: PyTree):
         name = equation.primitive.name
         if name == "convert_element_type" and jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
             # The same number in another dtype.
@@ -278,7 +279,7 @@ class JumpOpening:
 
     # What each primitive does for given modes.
 
-    def _taken(self, equation, operands, depends):
+    def _taken(self, equation, operands: Sequence, depends):
         name = equation.primitive.name
         if not all(_is_float(x.aval) for x in equation.invars):
             return None
@@ -353,7 +354,7 @@ class JumpOpening:
             return zero, negative[first]
         return (negative[second], zero) if first == zero and second in negative else (first, second)
 
-    def _level(self, rule, x, operands, depends, kind):
+    def _level(self, rule, x, operands: Sequence, depends, kind):
         """The whole number that belongs to x, by the mode."""
         key = ("level", rule, *(k.number for k in operands))
         actual = {"floor": jnp.floor, "ceil": jnp.ceil, "round": jnp.round, "trunc": jnp.trunc}[rule](x)
@@ -374,7 +375,7 @@ class JumpOpening:
         self.inside.setdefault(key, Inside((x - low) * (high - x), beyond, actual, x))
         return mode
 
-    def _searched(self, equation, operands, depends):
+    def _searched(self, equation, operands: Sequence, depends):
         """The place of a number in a sorted table, by the mode."""
         arrays = [x for x in operands if jnp.ndim(x.value) == 1]
         numbers = [x for x in operands if jnp.ndim(x.value) == 0]
@@ -426,13 +427,13 @@ class _Held:
         return isinstance(other, _Held) and self.value is other.value
 
 
-def _named_bodies(equation):
+def _named_bodies(equation: JaxprEqn):
     for key, value in equation.params.items():
         yield from ((key, getattr(x, "jaxpr", x)) for x in (value if isinstance(value, tuple) else (value,))
                     if isinstance(x, ClosedJaxpr | Jaxpr))  # fmt: skip
 
 
-def _called(equation):
+def _called(equation: JaxprEqn):
     inner = stands_for(equation)
     names = [str(equation.params.get("name", ""))]
     if inner is not None:
@@ -440,12 +441,12 @@ def _called(equation):
     return next((name for name in names if name in WITH_KINKS), "")
 
 
-def _is_only_a_scale(jaxpr):
+def _is_only_a_scale(jaxpr: Jaxpr):
     # As in `logsumexp`, which subtracts the largest of its numbers and adds it again.
     return any(e.primitive.name == "stop_gradient" for e in jaxpr.eqns)
 
 
-def _to_whole(equation):
+def _to_whole(equation: JaxprEqn):
     x, dtype = equation.invars[0].aval, equation.params["new_dtype"]
     return _is_float(x) and jnp.issubdtype(dtype, jnp.integer)
 
@@ -454,7 +455,7 @@ def _is_float(x):
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def _in_words(name):
+def _in_words(name: str):
     words = {
         "scan": "a loop (scan)", "while": "a loop (while)", "cond": "lax.cond", "gt": "a comparison",
         "ge": "a comparison", "lt": "a comparison", "le": "a comparison", "reduce_max": "the largest of an array",

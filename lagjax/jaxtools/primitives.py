@@ -65,7 +65,7 @@ def linear_map_primitive(
     def evaluate(*operands, **params):
         return list(along(*split(operands, count(params)), **params))
 
-    def transposed(cotangents, *operands, **params):
+    def transposed(cotangents: Sequence, *operands, **params):
         points, directions = split(operands, count(params))
         wanted = tuple(ad.is_undefined_primal(x) for x in directions)
         like = [x.aval if w else x for x, w in zip(directions, wanted)]

@@ -20,7 +20,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import Jaxpr, JaxprEqn
+from jax.typing import DTypeLike
 
 from lagjax.jaxtools.elementary import sincos_in_lanes
 from lagjax.jaxtools.jaxpr import CALLS, ELEMENTWISE, IN_NUMPY, ClosedJaxpr, Literal, applied, equations, interpreted
@@ -52,7 +54,7 @@ def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
 def asks_for_nan(closed: ClosedJaxpr) -> bool:
     """Whether a program asks of a number whether it is NaN or infinite."""
 
-    def asks(equation):
+    def asks(equation: JaxprEqn):
         name, operands = equation.primitive.name, equation.invars
         if name not in ("eq", "ne"):
             return name == "is_finite"
@@ -66,10 +68,10 @@ class _Ledger:
     """The sines and cosines computed so far by their argument, how many operations are still allowed, and whether
     products with known zeros are dropped."""
 
-    def __init__(self, most, drops_zeros=True):
+    def __init__(self, most, drops_zeros: bool = True):
         self.pairs, self.left, self.drops_zeros = {}, most, drops_zeros
 
-    def count(self, entries):
+    def count(self, entries: Sequence):
         """Count the entries that are not known numbers."""
         self.left -= sum(not isinstance(x, np.generic) for x in entries)
         if self.left < 0:
@@ -83,7 +85,7 @@ class _Value:
         self.array, self.aval = array, jax.typeof(array)
 
 
-def _small(aval):
+def _small(aval: ShapedArray):
     return hasattr(aval, "shape") and aval.size <= LARGE and not jnp.issubdtype(aval.dtype, jax.dtypes.extended)
 
 
@@ -102,14 +104,14 @@ def _known(array):
     return _filled(array.shape, list(array.reshape(-1)))
 
 
-def _filled(shape, entries):
+def _filled(shape: tuple[int, ...], entries: Sequence):
     result = np.empty(len(entries), object)
     for i, entry in enumerate(entries):
         result[i] = entry
     return result.reshape(shape)
 
 
-def _joined(value, aval):
+def _joined(value, aval: ShapedArray):
     """A whole array, from a `_Value` or an array of numbers."""
     if not isinstance(value, np.ndarray):
         return value.array
@@ -119,17 +121,17 @@ def _joined(value, aval):
     return jnp.stack(entries).reshape(aval.shape) if entries else jnp.zeros(aval.shape, aval.dtype)
 
 
-def _constant(x, aval):
+def _constant(x, aval: ShapedArray):
     if not _small(aval):
         return _Value(x)
     return _split(_Value(x)) if isinstance(x, Tracer) else _known(np.asarray(x, aval.dtype))
 
 
-def _is_plain_call(equation):
+def _is_plain_call(equation: JaxprEqn):
     return equation.primitive.name in CALLS
 
 
-def _apply(jaxpr, ledger, equation, operands):
+def _apply(jaxpr: Jaxpr, ledger, equation: JaxprEqn, operands: Sequence):
     name, params = equation.primitive.name, equation.params
     splittable = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
     if splittable and name in ELEMENTWISE:
@@ -151,7 +153,7 @@ def _pair(x, pairs):
     return pairs[id(x)][1:]
 
 
-def _elementwise(equation, operands, ledger):
+def _elementwise(equation, operands: Sequence, ledger):
     (variable,) = equation.outvars
     shape, dtype = variable.aval.shape, variable.aval.dtype
     rows = [np.broadcast_to(x, shape).reshape(-1) for x in operands]
@@ -164,7 +166,7 @@ def _is_known(x, number):
     return isinstance(x, np.generic) and x == number
 
 
-def _simplified(equation, dtype, ledger, *x):
+def _simplified(equation: JaxprEqn, dtype: DTypeLike, ledger, *x):
     """The result of a primitive for one number, simplified if operands are known."""
     name = equation.primitive.name
     if name in ("add", "add_any"):
@@ -209,7 +211,7 @@ def _add(x, y):
     return jax.lax.add(*_arrays(x, y))
 
 
-def _multiply(x, y, drops_zeros):
+def _multiply(x, y, drops_zeros: bool):
     for a, b in ((x, y), (y, x)):
         # A known factor may be infinite: the product is computed below.
         if _is_known(a, 0) and drops_zeros and not isinstance(b, np.generic):
@@ -232,25 +234,25 @@ def _arrays(x, y):
     return tuple(np.asarray(z, dtype) if isinstance(z, np.generic) else z for z in (x, y))
 
 
-def _converted(entries, dtype):
+def _converted(entries, dtype: DTypeLike):
     def one(x: Any) -> Any:
         return x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
 
     return _filled(entries.shape, [x if x.dtype == dtype else one(x) for x in entries.reshape(-1)])
 
 
-def _total(entries, zero):
+def _total(entries: Sequence, zero):
     total = zero
     for entry in entries:
         total = _add(total, entry)
     return total
 
 
-def _zero(variables):
+def _zero(variables: Sequence):
     return np.zeros((), variables[0].aval.dtype)[()]
 
 
-def _broadcast(params, variables, x):
+def _broadcast(params: dict, variables: Sequence, x):
     shape, places = params["shape"], params["broadcast_dimensions"]
     widened = [1] * len(shape)
     for place, size in zip(places, x.shape):
@@ -258,12 +260,12 @@ def _broadcast(params, variables, x):
     return [np.broadcast_to(x.reshape(widened), shape)]
 
 
-def _sliced(params, variables, x):
+def _sliced(params: dict, variables: Sequence, x):
     strides = params["strides"] or [1] * x.ndim
     return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]]
 
 
-def _dynamic_slice(params, variables, x, *starts):
+def _dynamic_slice(params: dict, variables: Sequence, x, *starts):
     if not all(isinstance(s[()], np.generic) for s in starts):
         return None
     sizes = params["slice_sizes"]
@@ -271,7 +273,7 @@ def _dynamic_slice(params, variables, x, *starts):
     return [x[tuple(slice(s, s + size) for s, size in zip(starts, sizes))]]
 
 
-def _padded(params, variables, x, filling):
+def _padded(params: dict, variables: Sequence, x, filling):
     if any(inner or low < 0 or high < 0 for low, high, inner in params["padding_config"]):
         return None
     result = _filled(variables[0].aval.shape, [filling[()]] * variables[0].aval.size)
@@ -280,7 +282,7 @@ def _padded(params, variables, x, filling):
     return [result]
 
 
-def _sum(params, variables, x):
+def _sum(params: dict, variables: Sequence, x):
     axes = params["axes"]
     kept = [i for i in range(x.ndim) if i not in axes]
     rows = x.transpose([*kept, *axes]).reshape([x.shape[i] for i in kept] + [-1])
@@ -289,7 +291,7 @@ def _sum(params, variables, x):
     return [_filled(shape, [_total(row, _zero(variables)) for row in rows])]
 
 
-def _cumulative_sum(params, variables, x):
+def _cumulative_sum(params: dict, variables: Sequence, x):
     axis, result = params["axis"], x.copy()
     if params["reverse"]:
         return None
@@ -300,7 +302,7 @@ def _cumulative_sum(params, variables, x):
     return [np.moveaxis(result, 0, axis)]
 
 
-def _product(params, variables, x, y, drops_zeros):
+def _product(params: dict, variables: Sequence, x, y, drops_zeros: bool):
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
@@ -323,17 +325,17 @@ def _product(params, variables, x, y, drops_zeros):
     return [_filled(variables[0].aval.shape, entries)]
 
 
-def _unstacked(params, variables, x):
+def _unstacked(params: dict, variables: Sequence, x):
     return [
         _filled(v.aval.shape, list(part.reshape(-1))) for v, part in zip(variables, np.moveaxis(x, params["axis"], 0))
     ]
 
 
-def _split_up(params, variables, x):
+def _split_up(params: dict, variables: Sequence, x):
     return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
 
 
-def _counted(params, variables):
+def _counted(params: dict, variables: Sequence):
     aval, axis = variables[0].aval, params["dimension"]
     shape = [-1 if i == axis else 1 for i in range(len(aval.shape))]
     return [_known(np.broadcast_to(np.arange(aval.shape[axis], dtype=aval.dtype).reshape(shape), aval.shape))]

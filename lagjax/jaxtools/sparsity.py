@@ -9,7 +9,7 @@ every state: it may be too full, never too empty, since no values but those of c
 The package asdex finds the same patterns, just as fast; it needs numba, and stops at a primitive that it does not know.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import JaxprEqn
 from jaxtyping import Array, Bool
 
 from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
@@ -57,23 +58,23 @@ def pattern(function: Callable, vector, *rest) -> Bool[np.ndarray, "m n"]:
     return _as_booleans(found.sets, n)
 
 
-def _as_booleans(sets, count):
+def _as_booleans(sets: np.ndarray, count):
     """One row per set."""
     width = count // 8 + 1
     rows = np.frombuffer(b"".join(int(s).to_bytes(width, "little") for s in sets), np.uint8).reshape(-1, width)
     return np.unpackbits(rows, axis=1, bitorder="little")[:, :count].astype(bool)
 
 
-def _constant(x, aval):
+def _constant(x, aval: ShapedArray):
     known = None if isinstance(x, Tracer) else np.asarray(x)
     return SparseValue(_empty(np.shape(x)), known)
 
 
-def _empty(shape):
+def _empty(shape: tuple[int, ...]):
     return np.full(shape, 0, object)
 
 
-def _apply(equation, operands):
+def _apply(equation, operands: Sequence):
     name, params = equation.primitive.name, equation.params
     shapes = [x.aval.shape for x in equation.outvars]
     results = None
@@ -88,7 +89,7 @@ def _apply(equation, operands):
     return results
 
 
-def _union(sets, axis=None):
+def _union(sets: np.ndarray, axis: int | None = None):
     """The union over some axes, or over all."""
     if axis is None:
         return np.bitwise_or.reduce(np.ravel(sets), initial=0)
@@ -97,7 +98,7 @@ def _union(sets, axis=None):
     return np.asarray(sets, object)
 
 
-def _united(name, operands, shape):
+def _united(name: str, operands: Sequence, shape: tuple[int, ...]):
     sets = _empty(shape)
     for i, operand in enumerate(operands):
         part = operand.sets
@@ -111,7 +112,7 @@ def _united(name, operands, shape):
     return np.asarray(sets, object).reshape(shape)
 
 
-def _evaluated(name, equation, operands):
+def _evaluated(name: str, equation, operands: Sequence):
     """The entries of a result made of constants alone, as indices are."""
     known = [x.known for x in operands]
     if any(x is None for x in known):
@@ -124,7 +125,7 @@ def _evaluated(name, equation, operands):
 def _moving(move):
     """The rule of a primitive that moves entries, given the same move of NumPy arrays."""
 
-    def rule(operands, params, equation):
+    def rule(operands: Sequence, params: dict, equation: JaxprEqn):
         # The second operand of a padding is a number.
         known = [x.known for x in operands]
         moved = None if any(x is None for x in known) else move(known, params)
@@ -136,27 +137,27 @@ def _moving(move):
     return rule
 
 
-def _broadcast(arrays, params):
+def _broadcast(arrays: Sequence, params: dict):
     shape = [1] * len(params["shape"])
     for size, axis in zip(np.shape(arrays[0]), params["broadcast_dimensions"]):
         shape[axis] = size
     return np.broadcast_to(np.reshape(arrays[0], shape), params["shape"])
 
 
-def _reshape(arrays, params):
+def _reshape(arrays: Sequence, params: dict):
     return np.reshape(arrays[0], params["new_sizes"])
 
 
-def _slice(arrays, params):
+def _slice(arrays: Sequence, params: dict):
     strides = params["strides"] or [1] * np.ndim(arrays[0])
     return arrays[0][tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
 
 
-def _split(arrays, params):
+def _split(arrays: Sequence, params: dict):
     return list(np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"]))
 
 
-def _pad(arrays, params):
+def _pad(arrays: Sequence, params: dict):
     x, fill = arrays
     for axis, (low, high, interior) in enumerate(params["padding_config"]):
         size = x.shape[axis] + max(x.shape[axis] - 1, 0) * interior
@@ -172,15 +173,15 @@ def _pad(arrays, params):
     return x
 
 
-def _concatenate(arrays, params):
+def _concatenate(arrays: Sequence, params: dict):
     return np.concatenate(arrays, params["dimension"])
 
 
-def _gather(operands, params, equation):
+def _gather(operands: Sequence, params: dict, equation: JaxprEqn):
     return _by_positions(partial(equation.primitive.bind, **params), operands[0], operands[1:], equation)
 
 
-def _by_positions(move, source, indices, equation):
+def _by_positions(move, source, indices, equation: JaxprEqn):
     """Find where constant indices take entries from: apply the primitive itself to the entries' positions."""
     if any(x.known is None for x in indices):
         return [None]
@@ -192,7 +193,7 @@ def _by_positions(move, source, indices, equation):
     return [SparseValue(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
 
 
-def _scatter(operands, params, equation):
+def _scatter(operands: Sequence, params: dict, equation: JaxprEqn):
     """The operand's entries united with those written there, also where the latter replace the former."""
     onto, indices, updates = operands
     if indices.known is None:
@@ -211,7 +212,7 @@ def _scatter(operands, params, equation):
     return [SparseValue(sets[1:].reshape(onto.sets.shape))]
 
 
-def _dynamic_slice(operands, params, equation):
+def _dynamic_slice(operands: Sequence, params: dict, equation: JaxprEqn):
     starts = [x.known for x in operands[1:]]
     if any(x is None for x in starts):
         return [None]
@@ -221,7 +222,7 @@ def _dynamic_slice(operands, params, equation):
     return [SparseValue(source[tuple(slice(i, i + k) for i, k in zip(first, sizes))])]
 
 
-def _dot_general(operands, params, equation):
+def _dot_general(operands: Sequence, params: dict, equation):
     (contract, batch), shape = params["dimension_numbers"], equation.outvars[0].aval.shape
     sides = []
     for x, c, b in zip(operands, contract, batch):
@@ -240,18 +241,18 @@ def _dot_general(operands, params, equation):
     return [SparseValue(found.reshape(shape))]
 
 
-def _reduce(operands, params, equation):
+def _reduce(operands: Sequence, params: dict, equation: JaxprEqn):
     return [SparseValue(_union(operands[0].sets, params["axes"]))]
 
 
-def _accumulate(operands, params, equation):
+def _accumulate(operands: Sequence, params: dict, equation: JaxprEqn):
     def flip(x: np.ndarray) -> np.ndarray:
         return np.flip(x, params["axis"]) if params["reverse"] else x
 
     return [SparseValue(flip(np.bitwise_or.accumulate(flip(operands[0].sets), axis=params["axis"])))]
 
 
-def _iota(operands, params, equation):
+def _iota(operands: Sequence, params: dict, equation):
     aval = equation.outvars[0].aval
     along = np.arange(aval.shape[params["dimension"]], dtype=aval.dtype)
     along = along.reshape([-1 if i == params["dimension"] else 1 for i in range(len(aval.shape))])

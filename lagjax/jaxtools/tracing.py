@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
+from jaxtyping import PyTree
 
 # A new thread traces nothing, also where this module is imported inside a program.
 with ThreadPoolExecutor(1) as _thread:
@@ -32,11 +33,11 @@ def is_eager() -> bool:
     return get_opaque_trace_state() == _EAGER
 
 
-def numpy_of(tree):
+def numpy_of(tree: PyTree):
     """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
     return jnp if is_traced(tree) else np
 
 
-def is_traced(tree) -> bool:
+def is_traced(tree: PyTree) -> bool:
     """Whether JAX is tracing through `tree`, so that its values are not known."""
     return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import PyTree
 
 
-def stop_gradient(tree):
+def stop_gradient(tree: PyTree):
     """The tree without derivatives.
 
     >>> print(jax.grad(lambda x: x * stop_gradient({"x": x})["x"])(3.0))

@@ -12,7 +12,7 @@ a batch later, in a `vmap` or a derivative outside.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, wraps
 
 import equinox as eqx
@@ -22,7 +22,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from lagjax.jaxtools.jaxpr import HOLDS_A_SOLVER, LAPACK, anywhere, applied, bodies, rewritten
@@ -48,7 +48,7 @@ def one_by_one(function: Callable) -> Callable:
         arrays, static = eqx.partition(args, eqx.is_array)
         rest = []
 
-        def of_arrays(arrays):
+        def of_arrays(arrays: Sequence):
             found, others = eqx.partition(function(*eqx.combine(arrays, static), **params), eqx.is_array)
             rest.append(others)
             return found
@@ -70,7 +70,7 @@ def without_batches(program: ClosedJaxpr) -> ClosedJaxpr:
     return rewritten(program, _one_by_one) if _may_call_library(program.jaxpr) else program
 
 
-def _one_by_one(equation):
+def _one_by_one(equation: JaxprEqn):
     name, params = equation.primitive.name, equation.params
     while name == "vprim":  # One of equinox's primitives, batched, perhaps several times.
         name, params = params["prim"].name, dict(params["params"])
@@ -89,7 +89,7 @@ _may_call_library = anywhere(
 )
 
 
-def _is_rewritten(jaxpr):
+def _is_rewritten(jaxpr: Jaxpr):
     return [equation.params.get("name") for equation in jaxpr.eqns] == [WITH_WAY_BACK]
 
 
@@ -139,22 +139,22 @@ def _shapes(*operands, of):
     return jax.make_jaxpr(of)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands)).out_avals
 
 
-def _batched(operands, axes, *, of):
+def _batched(operands: Sequence, axes: Sequence, *, of):
     found = one_by_one(jax.vmap(of, axes))(*operands)
     return found, [0] * len(found)
 
 
-def _jvp(primals, tangents, *, of):
+def _jvp(primals: Sequence, tangents: Sequence, *, of):
     found, derivatives = _pushed(of, primals, [None if isinstance(t, ad.Zero) else t for t in tangents])
     pairs = zip(found, derivatives)
     return found, [ad.Zero(jax.typeof(x).to_tangent_aval()) if d.dtype == jax.dtypes.float0 else d for x, d in pairs]
 
 
-def _pushed(function, primals, tangents):
+def _pushed(function: Callable, primals: Sequence, tangents: Sequence):
     """Values and derivatives of a function along some tangents, None for those that are zero."""
     moved = [i for i, t in enumerate(tangents) if t is not None]
 
-    def along(primals, moving):
+    def along(primals: Sequence, moving):
         def of_moved(*chosen):
             operands = list(primals)
             for i, x in zip(moved, chosen):
@@ -166,11 +166,11 @@ def _pushed(function, primals, tangents):
     return one_by_one(along)(list(primals), [tangents[i] for i in moved])
 
 
-def _transposed(cotangents, *operands, of):
+def _transposed(cotangents: Sequence, *operands, of):
     wanted = [ad.is_undefined_primal(x) for x in operands]
     like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x, w in zip(operands, wanted) if w]
 
-    def back(known, cotangents):
+    def back(known, cotangents: Sequence):
         def of_wanted(*given):
             given, rest = iter(given), iter(known)
             found = of(*(next(given) if w else next(rest) for w in wanted))
@@ -192,7 +192,7 @@ def _with_rewritten_derivative(equation):
     function = jax.custom_jvp(lambda *operands: jaxpr_as_fun(without_batches(program))(*operands))
 
     @partial(function.defjvp, symbolic_zeros=True)
-    def _(primals, tangents):
+    def _(primals: Sequence, tangents: Sequence):
         moving = [None if isinstance(t, SymbolicZero) else t for t in tangents]
         return _pushed(lambda *operands: applied(program.jaxpr, equation, operands), primals, moving)
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.compiled import compiled
@@ -18,10 +19,14 @@ from lagjax.mechanics.sparse_saddle_point import Banded
 from lagjax.system import constraints, coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import prepare, traced_system
+from lagjax.system.coordinates import State
 from lagjax.system.model import Model, model_of
+from lagjax.system.system import System
 
 
-def accelerations(system, t, q, v, params) -> tuple[PyTree[Array], dict[str, Array]]:
+def accelerations(
+    system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree
+) -> tuple[PyTree[Array], dict[str, Array]]:
     """Solve Lagrange's equations for the accelerations and the multipliers.
 
     >>> import jax.numpy as jnp
@@ -74,7 +79,7 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
     return solution
 
 
-def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
+def constraint_force(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> dict[str, PyTree[Array]]:
     """Return the generalized force `Aᵀ λ` of each constraint.
 
     >>> import lagjax as lj
@@ -97,7 +102,9 @@ def constraint_force(system, t, q, v, params) -> dict[str, PyTree[Array]]:
     return _constraint_force(model, s, accelerations_at(model, s)[1])
 
 
-def constraint_residual(system, t, q, v, params, level: str = "constraint") -> dict[str, Array]:
+def constraint_residual(
+    system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree, level: str = "constraint"
+) -> dict[str, Array]:
     """Return how far a state is off each constraint.
 
     >>> import lagjax as lj
@@ -122,14 +129,14 @@ def constraint_residual(system, t, q, v, params, level: str = "constraint") -> d
 
 
 @compiled
-def _constraint_force(model, s, multipliers):
+def _constraint_force(model: Model, s: State, multipliers: Array):
     x, u = model.vectors(s.q, s.v)
     rows, stacked = constraints.jacobian(model, s.t, x, u), model.stacked(multipliers)
     return {name: model.tree(jnp.where(model.belongs_to(name), stacked, 0.0) @ rows) for name in multipliers}
 
 
 @compiled
-def _constraint_residual(model, s, level):
+def _constraint_residual(model: Model, s: State, level: int):
     if level == "velocity":
         return model.split(constraints.velocity_residual(model, s.t, *model.vectors(s.q, s.v)))
     return {name: constraint.residual(*s) for name, constraint in model.system.constraints.items()}

@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jax.typing import ArrayLike
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced
@@ -37,6 +38,9 @@ from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
 from lagjax.numerics.newton import largest, last_step, newton
 from lagjax.system import constraints, coordinates
 from lagjax.system.check_functions import prepare
+from lagjax.system.coordinates import State
+from lagjax.system.model import Model
+from lagjax.system.system import System
 
 TO_REACH = 40
 STAGES, PER_STAGE = 16, 3
@@ -45,11 +49,11 @@ FRACTIONS = np.array([1.0, 0.5, 0.2, 0.05])
 
 
 def consistent_state(
-    system,
-    t,
-    q,
-    v,
-    params,
+    system: System,
+    t: ArrayLike,
+    q: PyTree,
+    v: PyTree,
+    params: PyTree,
     hold: str | Iterable[str] = (),
     *,
     hold_position: str | Iterable[str] = (),
@@ -101,7 +105,7 @@ def consistent_state(
     return q, v
 
 
-def free_coordinates(q, hold, argument: str = "hold") -> np.ndarray:
+def free_coordinates(q: PyTree, hold, argument: str = "hold") -> np.ndarray:
     """Return which coordinates may move, (n,) booleans."""
     names = coordinates.names(q)
     if isinstance(hold, Mapping):
@@ -117,7 +121,7 @@ def free_coordinates(q, hold, argument: str = "hold") -> np.ndarray:
     return ~held
 
 
-def _unreachable(model, s, q, v, free, free_velocity):
+def _unreachable(model: Model, s: State, q: PyTree, v: PyTree, free: Array, free_velocity: Array):
     best = coordinates.State(s.t, q, v, s.params)
     tolerance, names = _round_off(s.t), np.asarray(model.names)
     both = ~free & ~free_velocity
@@ -135,12 +139,12 @@ def _unreachable(model, s, q, v, free, free_velocity):
     )
 
 
-def _round_off(t):
+def _round_off(t: Array):
     return 1e3 * float(jnp.finfo(t.dtype).eps)
 
 
 @compiled
-def _consistent_state(model, s, free, free_velocity):
+def _consistent_state(model: Model, s: State, free: Array, free_velocity: Array):
     t, (x0, u0) = s.t, model.vectors(s.q, s.v)
     metric = mass_and_forcing(model, t, x0, u0).mass
     x, live = x0, (model, t)
@@ -151,13 +155,13 @@ def _consistent_state(model, s, free, free_velocity):
     return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
 
 
-def _nearest(residual: Callable, problem, y0, metric, free):
+def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free: Array):
     """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
     metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
     n, fixed, fixed_metric, start = y0.size, stop_gradient(problem), *stop_gradient((metric, y0))
     residual = _two_or_more(residual)
 
-    def rows_at(problem, y):
+    def rows_at(problem: PyTree, y: Array):
         rows = jax.jacfwd(lambda y: residual(problem, y))(y)
         left = jnp.where(free[None, :], rows, 0.0)
 
@@ -166,14 +170,14 @@ def _nearest(residual: Callable, problem, y0, metric, free):
 
         return jnp.where((size(left) > DEPENDENT_BELOW[np.dtype(y0.dtype)] * size(rows))[:, None], left, 0.0)
 
-    def usable_rows(rows, dependent_below=None):
+    def usable_rows(rows: Array, dependent_below: float | None = None):
         return independent_rows(rows, dependent_below) & jnp.any(rows != 0, axis=1)
 
-    def to_displacement(y, dependent_below=None):
+    def to_displacement(y: Array, dependent_below: float | None = None):
         rows = rows_at(fixed, y)
         return displacement_map(fixed_metric, rows, usable_rows(rows, dependent_below))
 
-    def shortest_step(y, r, i):
+    def shortest_step(y: Array, r: Array, i):
         # Off the manifold dependent rows disagree by about the distance to it, which is unknown at first.
         dependent_below = jnp.maximum(0.1 * 0.25**i, DEPENDENT_BELOW[np.dtype(y0.dtype)]).astype(y0.dtype)
         return to_displacement(y, dependent_below) @ r
@@ -183,7 +187,7 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     slope = jnp.where(slope > 0, slope, 1.0)
     reached = newton(of_y, shortest_step, start, TO_REACH, size=lambda r: largest(r / slope), fractions=FRACTIONS)
 
-    def newton_matrix(y, multipliers):
+    def newton_matrix(y: Array, multipliers: Array):
         curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
         curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
         rows = rows_at(fixed, y)
@@ -192,14 +196,14 @@ def _nearest(residual: Callable, problem, y0, metric, free):
         rows = jnp.where(independent[:, None], rows, 0.0)
         return jnp.block([[fixed_metric + curvature, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
 
-    def equations(problem, metric, target, y, multipliers):
+    def equations(problem: PyTree, metric: Array, target: Array, y: Array, multipliers: Array):
         force = metric @ (y - target) + multipliers @ rows_at(problem, y)
         return jnp.concatenate([force, residual(problem, y)])
 
-    def follow(state, share):
+    def follow(state: PyTree, share: Array):
         target = reached + share * (start - reached)
 
-        def step(state, left, i):
+        def step(state: PyTree, left: Array, i):
             y, multipliers = state[:n], state[n:]
             independent = usable_rows(rows_at(fixed, y))
             left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
@@ -233,10 +237,10 @@ def _nearest(residual: Callable, problem, y0, metric, free):
     return jnp.where(kept, nearest, near)
 
 
-def _two_or_more(residual):
+def _two_or_more(residual: Callable):
     """Pad a single equation with one that restricts nothing: a single equation would never be left out."""
 
-    def padded(problem, y):
+    def padded(problem: PyTree, y: Array):
         found = residual(problem, y)
         return found if found.size > 1 else jnp.concatenate([found, jnp.zeros(2 - found.size, found.dtype)])
 

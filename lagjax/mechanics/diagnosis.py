@@ -3,11 +3,16 @@
 Everything here looks at values, and so runs outside compiled programs.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 from lagjax.system import constraints, coordinates
+from lagjax.system.coordinates import State
+from lagjax.system.model import Model
 
 # A row counts as part of a combination if it makes up more than this share of it.
 SHARE = 1e-6
@@ -15,7 +20,7 @@ SHARE = 1e-6
 OFF_ABOVE = 1e-6
 
 
-def explain_failure(model, s: coordinates.State) -> str | None:
+def explain_failure(model: Model, s: coordinates.State) -> str | None:
     """Say in the user's names why the equations fail at a state; None where they do not."""
     found = examined(model, s)
     linear, rows, lagrangian = found.linear, found.rows, found.lagrangian
@@ -52,7 +57,7 @@ def explain_failure(model, s: coordinates.State) -> str | None:
     )
 
 
-def _explain_paradox(found: Examined, s):
+def _explain_paradox(found: Examined, s: State):
     if found.unique:
         return None
     return (
@@ -65,7 +70,7 @@ def _explain_paradox(found: Examined, s):
     )
 
 
-def describe(tree) -> str:
+def describe(tree: PyTree) -> str:
     """A pytree of numbers on one line, six digits each."""
     values = coordinates.flatten(tree)[0]
     pairs = [f"{name} = {float(x):.6g}" for name, x in zip(coordinates.names(tree), values)]
@@ -73,7 +78,7 @@ def describe(tree) -> str:
     return "(" + ", ".join(shown) + ")"
 
 
-def explain_singular(matrix, model, s: coordinates.State) -> str | None:
+def explain_singular(matrix: Array, model: Model, s: coordinates.State) -> str | None:
     """Name the coordinate or constraint in which a saddle-point matrix is singular; None if it is not."""
     for i in np.flatnonzero(~np.any(matrix, axis=1)):
         return _singular_message(i, model, s)
@@ -83,7 +88,7 @@ def explain_singular(matrix, model, s: coordinates.State) -> str | None:
     return _singular_message(int(np.argmax(np.abs(right[-1]))), model, s)
 
 
-def explain_contradiction(found: Examined, model, s: coordinates.State) -> str | None:
+def explain_contradiction(found: Examined, model: Model, s: coordinates.State) -> str | None:
     """Name dependent constraints that ask for different accelerations; None where there are none."""
     contradicting = np.flatnonzero(found.contradictory)
     if not contradicting.size:
@@ -108,7 +113,7 @@ def explain_contradiction(found: Examined, model, s: coordinates.State) -> str |
     )
 
 
-def _violated_by_velocities(model, s, names):
+def _violated_by_velocities(model: Model, s: State, names: Sequence[str]):
     """Which of the named equations the velocities violate, with their residuals."""
     x, u = model.vectors(s.q, s.v)
     residual = np.asarray(constraints.velocity_residual(model, s.t, x, u))
@@ -122,7 +127,7 @@ def _violated_by_velocities(model, s, names):
     )
 
 
-def dependencies(jacobian, independent, names) -> list[tuple[str, ...]]:
+def dependencies(jacobian: Array, independent: Array, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Each dependent constraint equation, followed by those that it is a combination of, by name."""
     size = np.linalg.norm(jacobian, axis=1)
     share = np.abs(combinations(jacobian, independent)) * size[None, :]
@@ -133,7 +138,7 @@ def dependencies(jacobian, independent, names) -> list[tuple[str, ...]]:
     return groups
 
 
-def listed(names) -> str:
+def listed(names: Sequence[str]) -> str:
     """Names in quotes, joined by commas and "and"."""
     quoted = [f"'{name}'" for name in names]
     if not quoted:
@@ -141,7 +146,7 @@ def listed(names) -> str:
     return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + f" and {quoted[-1]}"
 
 
-def _equilibrate(matrix):
+def _equilibrate(matrix: Array):
     """Scale rows and columns alike until each row's largest entry is near one (Ruiz)."""
     scaled = matrix.copy()
     for _ in range(20):
@@ -150,7 +155,7 @@ def _equilibrate(matrix):
     return scaled
 
 
-def _singular_message(i, model, s):
+def _singular_message(i, model: Model, s: State):
     names, equations = model.names, model.equation_names
     n, place = len(names), where(s)
     if i < n:

@@ -56,15 +56,15 @@ class Equations(eqx.Module):
         """Whether the equations are assumed regular: the result is NaN, unexplained, where the fast way fails."""
         return self.written is not None and self.written.may_fail and not self.fallback
 
-    def inside(self, y):
+    def inside(self, y: Array):
         """Convert the user's position or velocity to the form that these equations take."""
         return y if self.users is None else coordinates.numbers(y)
 
-    def outside(self, y):
+    def outside(self, y: Array):
         """Convert a position, velocity or acceleration back to the user's structure."""
         return y if self.users is None else self.users.tree(jnp.stack(y))
 
-    def rates(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
+    def rates(self, t: Array, q: PyTree, v: PyTree) -> tuple[PyTree[Array], dict[str, Array]]:
         """The accelerations, and the multipliers by name."""
         if self.written is None:
             return self.accelerations(t, q, v)
@@ -75,13 +75,13 @@ class Equations(eqx.Module):
         # `unvmap_all` keeps it a branch in a batch, taken for all lanes or for none.
         return lax.cond(eqxi.unvmap_all(all_finite(fast)), lambda: fast, lambda: self.accelerations(t, q, v))
 
-    def multipliers(self, t, q, v) -> dict[str, Array]:
+    def multipliers(self, t: Array, q: PyTree, v: PyTree) -> dict[str, Array]:
         """The multipliers by name, solved the same way for all states of a batch: derivatives flow through them."""
         if not self.model.m:
             return {}
         return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
 
-    def solution_or_nan(self, t, q, v) -> tuple[PyTree[Array], dict[str, Array]]:
+    def solution_or_nan(self, t: Array, q: PyTree, v: PyTree) -> tuple[PyTree[Array], dict[str, Array]]:
         """Accelerations and multipliers, NaN where they are not valid."""
         if self.written is None:
             return _solution_or_nan(self.form, self.model, t, q, v)
@@ -93,7 +93,7 @@ class Equations(eqx.Module):
             eqxi.unvmap_all(all_finite(a)), lambda: fast, lambda: _solution_or_nan(self.form, self.model, t, q, v)
         )
 
-    def verdict(self, t, q, v) -> Verdict:
+    def verdict(self, t: Array, q: PyTree, v: PyTree) -> Verdict:
         """Solve the equations at one state, and say whether the solution is valid."""
         if not self.are_taken_for_regular:
             return _verdict(self.form, self.model, t, q, v)
@@ -105,32 +105,36 @@ class Equations(eqx.Module):
         regular, mass = is_regular(self.model, t, x, u)
         return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
 
-    def fast(self, t, q, v):
+    def fast(self, t: Array, q: PyTree, v: PyTree):
         """The accelerations, and the multipliers in one vector, by the written-out equations."""
         assert self.written is not None
         return kept_as_call(self.written.equations.at(self.prepared[0], t, q, v))
 
-    def projected(self, t, q, v):
+    def projected(self, t: Array, q: PyTree, v: PyTree):
         """The state returned to the constraints, by the written-out equations; NaN where it is not near them."""
         assert self.written is not None and self.written.project is not None
         return kept_as_call(self.written.project.at(self.prepared[1], t, q, v))
 
-    def accelerations(self, t, q, v, baumgarte_rate=None, independent=None):
+    def accelerations(
+        self, t: Array, q: PyTree, v: PyTree, baumgarte_rate: Array | None = None, independent: Array | None = None
+    ):
         """The accelerations, and the multipliers by name, the robust way.
 
         `independent` (m,) says which constraint equations to solve with; chosen at this state if None.
         """
         return _accelerations(self.form, self.model, t, q, v, baumgarte_rate, independent)
 
-    def independent(self, t, q, v, dependent_below=None) -> Bool[Array, " m"] | None:
+    def independent(
+        self, t: Array, q: PyTree, v: PyTree, dependent_below: float | None = None
+    ) -> Bool[Array, " m"] | None:
         """Which constraint equations to solve with near a state; None where fewer than two leave no choice."""
         return None if self.model.m < 2 else _independent(self.form, self.model, t, q, v, dependent_below)
 
-    def displacement(self, t, q, v):
+    def displacement(self, t: Array, q: PyTree, v: PyTree):
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         return self.form.displacement(self.model, t, *self.model.vectors(q, v))
 
-    def row_sizes(self, t, q, v) -> Float[Array, " m"]:
+    def row_sizes(self, t: Array, q: PyTree, v: PyTree) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation."""
         return self.form.row_sizes(self.model, t, *self.model.vectors(q, v))
 
@@ -161,34 +165,34 @@ def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> 
 
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.
 @once
-def _written(structure, leaves, watched) -> WrittenOut | None:
+def _written(structure, leaves: tuple, watched: bool) -> WrittenOut | None:
     return write_out(jtu.tree_unflatten(structure, leaves))
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.
 @jitted
-def _accelerations(form, model, t, q, v, baumgarte_rate, independent):
+def _accelerations(form, model: Model, t: Array, q: PyTree, v: PyTree, baumgarte_rate: Array, independent: Array):
     a, multipliers = form.accelerations(model, t, *model.vectors(q, v), baumgarte_rate, independent)
     return model.tree(a), model.split(multipliers)
 
 
 @jitted
-def _independent(form, model, t, q, v, dependent_below):
+def _independent(form, model: Model, t: Array, q: PyTree, v: PyTree, dependent_below: float):
     return form.independent(model, t, *model.vectors(q, v), dependent_below)
 
 
 @compiled
-def _verdict(form, model, t, q, v) -> Verdict:
+def _verdict(form, model: Model, t: Array, q: PyTree, v: PyTree) -> Verdict:
     found = form.verdict(model, t, *model.vectors(q, v))
     return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
 
 
-def _solution_or_nan(form, model, t, q, v):
+def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):
     a, multipliers = form.solution_or_nan(model, t, *model.vectors(q, v))
     return model.tree(a), model.split(multipliers)
 
 
-def all_finite(tree) -> Bool[Array, ""]:
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
     """Whether nothing in a tree of floats is NaN or infinite."""
     # One sum instead of a reduction per leaf: zero times NaN or infinity is NaN.
     return jnp.asarray(sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0)

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.cache import shape_of
 from lagjax.jaxtools.tracing import is_traced
@@ -37,7 +37,7 @@ class CartesianPoint(NamedTuple):
     places: tuple[int | None, int | None, int | None]
 
 
-def points(q) -> list[CartesianPoint]:
+def points(q: PyTree) -> list[CartesianPoint]:
     """The points among the coordinates.
 
     >>> points({"x": 0.0, "y": 0.0, "angle": 0.0})
@@ -66,7 +66,7 @@ def points(q) -> list[CartesianPoint]:
     return [found[0]._replace(label="")] if len(found) == 1 else found
 
 
-def leaf_names(q) -> list[str]:
+def leaf_names(q: PyTree) -> list[str]:
     """The name of each leaf of q, as the user would write it."""
     paths = [path for path, _ in jtu.tree_flatten_with_path(q)[0]]
     # A scalar in place of each leaf: the names of the coordinates then have no indices.
@@ -127,7 +127,7 @@ class Generator(eqx.Module):
         self.gauge = gauge
         self.name = name or getattr(delta, "__name__", None) or "charge"
 
-    def at(self, t, q, params):
+    def at(self, t: Array, q: PyTree, params: PyTree):
         """ξ (like q), τ and F at one time and position, in the dtype of the coordinates."""
 
         def like(x: Array, y: Any) -> Array:
@@ -224,7 +224,7 @@ def as_generator(given) -> Generator:
     return Generator(given)
 
 
-def added(terms, digits: str = ".6g") -> str:
+def added(terms: Sequence, digits: str = ".6g") -> str:
     """Write a sum of (coefficient, name) terms as text."""
     words = ""
     for coefficient, name in terms:
@@ -240,7 +240,7 @@ def added(terms, digits: str = ".6g") -> str:
 class _Constant(eqx.Module):
     value: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         return self.value
 
 
@@ -248,7 +248,7 @@ class _Shift(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     amounts: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         x, unflatten = coordinates.flatten(q)
         known, moved = coordinates.names(q), jnp.zeros_like(x)
         for name, amount in zip(self.names, self.amounts):
@@ -259,7 +259,7 @@ class _Shift(eqx.Module):
 class _Translation(eqx.Module):
     direction: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         x, unflatten = coordinates.flatten(q)
         moved = jnp.zeros_like(x)
         for point in _points(q):
@@ -272,7 +272,7 @@ class _Rotation(eqx.Module):
     axis: np.ndarray
     about: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         x, unflatten = coordinates.flatten(q)
         moved = jnp.zeros_like(x)
         for point in _points(q):
@@ -286,7 +286,7 @@ class _Rotation(eqx.Module):
 class _Boost(eqx.Module):
     translation: Callable
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         return jtu.tree_map(lambda x: t * x, self.translation(t, q, params))
 
 
@@ -297,12 +297,12 @@ class _Sum(eqx.Module):
     weights: tuple
     place: int = eqx.field(static=True)
 
-    def __call__(self, t, q, params):
+    def __call__(self, t: Array, q: PyTree, params: PyTree):
         found = [generator.at(t, q, params)[self.place] for generator in self.generators]
         return jtu.tree_map(lambda *x: sum(w * y for w, y in zip(self.weights, x)), *found)
 
 
-def _combined(first, second, name):
+def _combined(first, second, name: str):
     weights, generators = zip(*(pair for pair in (first, second) if pair is not None))
     weights = tuple(float(w) if isinstance(w, numbers.Real) else w for w in weights)
     moved = []
@@ -312,7 +312,7 @@ def _combined(first, second, name):
     return Generator(*moved, name=name)
 
 
-def places_of(name, q, known=None) -> list[int]:
+def places_of(name: str, q: PyTree, known=None) -> list[int]:
     """The places of the named coordinate in the vector of all; a leaf's name stands for all its entries."""
     known = coordinates.names(q) if known is None else known
     found = [i for i, other in enumerate(known) if other == name]
@@ -325,7 +325,7 @@ def places_of(name, q, known=None) -> list[int]:
     return found
 
 
-def _points(q):
+def _points(q: PyTree):
     found = points(q)
     if not found:
         raise ValueError(
@@ -346,7 +346,7 @@ def _vector(axis) -> np.ndarray:
     return _array((*axis, 0.0)[:3])
 
 
-def _charge_name(letter, axis):
+def _charge_name(letter: str, axis):
     return f"{letter}_{axis}" if isinstance(axis, str) else f"{letter}·({', '.join(f'{x:g}' for x in axis)})"
 
 
@@ -354,7 +354,7 @@ def _array(values: Sequence | Mapping):
     return np.asarray([float(x) for x in values])
 
 
-def _check_displacement(call, value, q):
+def _check_displacement(call: Call, value, q: PyTree):
     names = leaf_names(q)
     structure, expected = jtu.tree_structure(value), jtu.tree_structure(q)
     if structure != expected:

@@ -15,11 +15,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools.compiled import compiled
 from lagjax.mechanics.multiplier_forces import response
 from lagjax.system.check_functions import prepare
+from lagjax.system.coordinates import State
+from lagjax.system.model import Model
+from lagjax.system.system import System
 
 
 class LinearEquation(NamedTuple):
@@ -33,7 +37,7 @@ class LinearEquation(NamedTuple):
     response: Float[Array, "n m"] | None
 
 
-def mass_and_forcing(model, t, x, u) -> LinearEquation:
+def mass_and_forcing(model: Model, t: Array, x: Array, u: Array) -> LinearEquation:
     """M and F at the state with position vector `x` and velocity vector `u`."""
     forcing, inertia = forcing_and_inertia(model, t, x, u)
     if x.size == 1:
@@ -44,10 +48,10 @@ def mass_and_forcing(model, t, x, u) -> LinearEquation:
     return LinearEquation(mass.astype(x.dtype), forcing, response(model, t, x, u) if model.reacts else None)
 
 
-def forcing_and_inertia(model, t, x, u):
+def forcing_and_inertia(model: Model, t: Array, x: Array, u: Array):
     """F at a state without the part of the multipliers, and the function that multiplies an acceleration by M."""
 
-    def momentum_and_gradient(t, x, u):
+    def momentum_and_gradient(t: Array, x: Array, u: Array):
         gradient, p = jax.grad(model.lagrangian, argnums=(1, 2))(t, x, u)
         return p, gradient
 
@@ -58,7 +62,7 @@ def forcing_and_inertia(model, t, x, u):
     return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
 
 
-def applied_force(model, t, x, u, multipliers=None) -> Float[Array, " n"]:
+def applied_force(model: Model, t: Array, x: Array, u: Array, multipliers: Array | None = None) -> Float[Array, " n"]:
     """`Q - ∂R/∂v`; without `multipliers` for those of zero."""
     force = jnp.zeros_like(x)
     if model.system.force is not None:
@@ -68,7 +72,7 @@ def applied_force(model, t, x, u, multipliers=None) -> Float[Array, " n"]:
     return force
 
 
-def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
+def momentum(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> PyTree[Float[Array, "..."]]:
     """Return the canonical momentum `p = ∂L/∂v`.
 
     >>> import lagjax as lj
@@ -88,7 +92,7 @@ def momentum(system, t, q, v, params) -> PyTree[Float[Array, "..."]]:
     return _momentum(model, s)
 
 
-def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
+def mass_matrix(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, "n n"]:
     """Return the mass matrix `M = ∂²L/∂v∂v`.
 
     >>> import lagjax as lj
@@ -109,7 +113,7 @@ def mass_matrix(system, t, q, v, params) -> Float[Array, "n n"]:
     return _mass_matrix(model, s)
 
 
-def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
+def jacobi_integral(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
     """Return the Jacobi integral `h = v·p - L`.
 
     It is constant where L does not depend on time, no force or dissipation acts and no constraint moves;
@@ -133,17 +137,17 @@ def jacobi_integral(system, t, q, v, params) -> Float[Array, ""]:
 
 
 @compiled
-def _momentum(model, s):
+def _momentum(model: Model, s: State):
     return model.tree(jax.grad(model.lagrangian, argnums=2)(s.t, *model.vectors(s.q, s.v)))
 
 
 @compiled
-def _mass_matrix(model, s):
+def _mass_matrix(model: Model, s: State):
     return mass_and_forcing(model, s.t, *model.vectors(s.q, s.v)).mass
 
 
 @compiled
-def _jacobi_integral(model, s):
+def _jacobi_integral(model: Model, s: State):
     x, u = model.vectors(s.q, s.v)
     value, p = jax.value_and_grad(model.lagrangian, argnums=2)(s.t, x, u)
     return u @ p - value

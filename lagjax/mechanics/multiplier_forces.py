@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax.numerics.linalg.dense import solve_without_exchanges
+from lagjax.system.model import Model
 
 # The pivots of I - R must be above this; without friction they are one.
 PIVOT_ABOVE = 1e-10
@@ -36,19 +37,19 @@ class Reactions(NamedTuple):
     unique: Bool[Array, ""]
 
 
-def force_with_ones(model) -> Callable:
+def force_with_ones(model: Model) -> Callable:
     """The force with all multipliers one: a function of the state alone that depends on the same arguments."""
     return lambda t, q, v, params: model.of(params).force_at(t, q, v, jnp.ones(model.m, jnp.result_type(t)))
 
 
-def response(model, t, x, u) -> Float[Array, "n m"] | None:
+def response(model: Model, t: Array, x: Array, u: Array) -> Float[Array, "n m"] | None:
     """B, the change of the force with each multiplier; None if it does not depend on them."""
     if not model.reacts:
         return None
     return jax.jacfwd(lambda multipliers: model.force(t, x, u, multipliers))(jnp.zeros(model.m, x.dtype))
 
 
-def with_reactions(solve: Callable, forcing, gamma, response) -> Reactions:
+def with_reactions(solve: Callable, forcing: Array, gamma: Array, response) -> Reactions:
     """Solve the equations with the force B λ, given `solve(forcing, gamma)` -> (a, λ) for those without it."""
     a, multipliers = solve(forcing, gamma)
     if response is None:

@@ -31,7 +31,8 @@ from lagjax.mechanics.lagrangian import applied_force
 from lagjax.system import constraints, coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
-from lagjax.system.model import model_of
+from lagjax.system.coordinates import State
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 
@@ -44,16 +45,16 @@ class NoetherCharge(eqx.Module):
     system: System
     generator: Generator
 
-    def __call__(self, t, q, v, params) -> Float[Array, ""]:
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
         """The charge at one state."""
         return _charge(*self._checked(t, q, v, params))
 
-    def rate(self, t, q, v, params) -> Float[Array, ""]:
+    def rate(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
         """How fast the charge changes at one state, `[L]`: ρ + f·(ξ - τ v)."""
         generator, model, s = self._checked(t, q, v, params)
         return _rate(generator, model, s, accelerations_at(model, s)[1] if model.m else {})
 
-    def size(self, t, q, v, params) -> Float[Array, ""]:
+    def size(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
         """The size of the terms that the charge is a sum of, to compare a change of it with."""
         return _size(*self._checked(t, q, v, params))
 
@@ -109,7 +110,7 @@ class GeneratorFlow(NamedTuple):
     gauge_rate: Float[Array, ""]
 
 
-def flow(generator: Generator, t, q, v, params) -> GeneratorFlow:
+def flow(generator: Generator, t: Array, q: PyTree, v: PyTree, params: PyTree) -> GeneratorFlow:
     """A generator and its total derivatives at one state."""
     (xi, tau, gauge), (xi_rate, tau_rate, gauge_rate) = jax.jvp(
         lambda t, q: generator.at(t, q, params), (t, q), (jnp.ones_like(t), v)
@@ -121,7 +122,7 @@ def flow(generator: Generator, t, q, v, params) -> GeneratorFlow:
     return GeneratorFlow(vector(xi), tau, gauge, vector(xi_rate), tau_rate, gauge_rate)
 
 
-def _terms(generator, model, s):
+def _terms(generator, model: Model, s: State):
     x, u = model.vectors(s.q, s.v)
     value, p = jax.value_and_grad(model.lagrangian, argnums=2)(s.t, x, u)
     xi, tau, gauge = generator.at(s.t, s.q, s.params)
@@ -129,18 +130,18 @@ def _terms(generator, model, s):
 
 
 @compiled
-def _charge(generator, model, s):
+def _charge(generator, model: Model, s: State):
     moved, power, value, gauge = _terms(generator, model, s)
     return jnp.sum(moved - power) + value - gauge
 
 
 @compiled
-def _size(generator, model, s):
+def _size(generator, model: Model, s: State):
     return sum(jnp.sum(jnp.abs(term)) for term in _terms(generator, model, s))
 
 
 @compiled
-def _rate(generator, model, s, multipliers):
+def _rate(generator, model: Model, s: State, multipliers: Array):
     x, u = model.vectors(s.q, s.v)
     moved = flow(generator, *s)
     change = (moved.tau, moved.xi, moved.xi_rate - u * moved.tau_rate)

@@ -26,6 +26,7 @@ from lagjax.jaxtools.trees import stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.numerics.newton import largest, last_step, newton
 from lagjax.system import constraints, coordinates
+from lagjax.system.model import Model
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
 # below 1e-8 of the size of the state; a crude fixed step of 0.1 takes eight.
@@ -41,7 +42,7 @@ class Projected(NamedTuple):
     holds: Bool[Array, ""]
 
 
-def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
+def returned(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array) -> Projected:
     """Return the state moved onto the constraints; NaN if equations assumed regular turn out singular."""
     if equations.are_taken_for_regular:
         return Projected(*equations.projected(t, q, v), jnp.asarray(True))
@@ -49,7 +50,7 @@ def returned(equations: Equations, t, q, v, rtol, atol) -> Projected:
 
 
 @compiled
-def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
+def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array) -> Projected:
     """Return the nearest state that satisfies all constraints, for a state near it: Newton with a fixed matrix.
 
     `holds` is true if a displacement of `atol + rtol |y|` accounts for what is left of each residual, including those
@@ -80,11 +81,11 @@ def to_manifold(equations: Equations, t, q, v, rtol, atol) -> Projected:
     return Projected(model.tree(x), model.tree(u), lax.stop_gradient(holds))
 
 
-def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
+def _newton(residual: Callable, problem: PyTree, y: Array, displacement: Callable, slope: Array):
     """Iterate `y - displacement(r(problem, y))`; differentiate only the last iteration, enough where r vanishes."""
     fixed, start = stop_gradient((problem, y))
 
-    def size(r):
+    def size(r: Array):
         return largest(r / jnp.where(slope > 0, slope, 1.0))
 
     near = newton(
@@ -94,7 +95,7 @@ def _newton(residual: Callable, problem: PyTree, y, displacement, slope):
     return last_step(near, y, lambda y: displacement(residual(problem, y)))
 
 
-def velocity_change(model, t, q, v, change):
+def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array):
     """Return the least change of v, in the metric of M, that changes the residuals of all constraints by `change`.
 
     `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
@@ -102,7 +103,7 @@ def velocity_change(model, t, q, v, change):
     return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
 
 
-def worst_residual(model, t, q, v):
+def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree):
     """Return the largest relative residual along a trajectory, of positions and velocities.
 
     A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
@@ -114,24 +115,24 @@ def worst_residual(model, t, q, v):
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
 
 
-def level_size(size):
+def level_size(size: Array):
     """Return the largest coordinate and the largest velocity; a single coordinate may be zero and sets no scale."""
     return jnp.max(size.reshape(2, -1), axis=1)
 
 
-def within(equations: Equations, t, q, v, rtol, atol) -> Bool[Array, ""]:
+def within(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array) -> Bool[Array, ""]:
     """Whether a displacement of `atol + rtol |y|` accounts for every residual, of positions and velocities."""
     residual, slope, size = residuals_and_slopes(equations, t, q, v)
     return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
 
 
-def _allowed(size, rtol, atol):
+def _allowed(size: Array, rtol: Array, atol: Array):
     """Return the displacements of coordinates and of velocities that count as zero, for a state of these sizes."""
     return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
 
 
 @compiled
-def residuals_and_slopes(equations: Equations, t, q, v):
+def residuals_and_slopes(equations: Equations, t: Array, q: PyTree, v: PyTree):
     """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     model, (x, u) = equations.model, equations.model.vectors(q, v)
     position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
@@ -142,7 +143,7 @@ def residuals_and_slopes(equations: Equations, t, q, v):
     return jnp.concatenate([position, velocity]), jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
 
 
-def departures(model, s: coordinates.State, rtol, atol) -> str:
+def departures(model: Model, s: coordinates.State, rtol: Array, atol: Array) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
     residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(model), *s[:3]))
     allowed = np.asarray(_allowed(size, rtol, atol))

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools.compiled import compiled
@@ -43,6 +44,7 @@ from lagjax.numerics.linalg import dense
 from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 from lagjax.system import constraints
 from lagjax.system.coordinates import State
+from lagjax.system.model import Model
 
 # A constraint whose derivative is this much smaller than nearby has none: it is written as a square.
 VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
@@ -62,18 +64,18 @@ class Verdict(NamedTuple):
     mass: Float[Array, " n"]
 
 
-def slightly_off(y):
+def slightly_off(y: Array):
     """Shift a position or velocity by a thousandth of its size, differently in each coordinate."""
     size = jnp.max(jnp.abs(y))
     return y + 1e-3 * jnp.cos(jnp.arange(y.size, dtype=y.dtype)) * jnp.where(size > 0, size, 1.0)
 
 
-def vanishing(size, nearby):
+def vanishing(size: Array, nearby: Array):
     """Which rows of A are round-off: their `size` is far below that at a nearby state."""
     return size <= VANISHES_BELOW[np.dtype(size.dtype)] * jnp.nan_to_num(nearby, posinf=0.0)
 
 
-def acceleration_round_off(inertia, forces, x, u):
+def acceleration_round_off(inertia, forces, x: Array, u: Array):
     """The round-off of an acceleration in equilibrium or uniform motion, where all its terms nearly cancel."""
     by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
     extent = jnp.max(jnp.abs(x))
@@ -94,7 +96,15 @@ class Dense(NamedTuple):
     unknowns: int
     diagonal: bool = False
 
-    def accelerations(self, model, t, x, u, baumgarte_rate=None, independent=None):
+    def accelerations(
+        self,
+        model: Model,
+        t: Array,
+        x: Array,
+        u: Array,
+        baumgarte_rate: Array | None = None,
+        independent: Array | None = None,
+    ):
         """The accelerations and the stacked multipliers, as vectors; `independent` (m,): which equations to solve with.
 
         If None, they are chosen at this state.
@@ -111,7 +121,9 @@ class Dense(NamedTuple):
         independent = independent_rows(jacobian) if independent is None else independent
         return _solved(linear, jacobian, gamma, independent)[:2]
 
-    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(
+        self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
+    ) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
         return independent_rows(constraints.jacobian(model, t, x, u), dependent_below)
 
@@ -146,7 +158,7 @@ class Dense(NamedTuple):
         return f"{self.unknowns} equations by {by}"
 
 
-def saddle_point(mass, jacobian, forcing, gamma, independent):
+def saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array):
     """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
     n = mass.shape[0]
     known = jnp.concatenate([forcing, _pick(gamma, independent, n)])
@@ -155,7 +167,7 @@ def saddle_point(mass, jacobian, forcing, gamma, independent):
     return solution[:n], minimum_norm(jacobian, multipliers, independent)
 
 
-def _solved(linear: LinearEquation, jacobian, gamma, independent) -> Reactions:
+def _solved(linear: LinearEquation, jacobian: Array, gamma: Array, independent: Array) -> Reactions:
     """The solution where the force may depend on the multipliers."""
     return with_reactions(
         lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent),
@@ -165,7 +177,7 @@ def _solved(linear: LinearEquation, jacobian, gamma, independent) -> Reactions:
     )
 
 
-def saddle_point_matrix(mass, jacobian, independent):
+def saddle_point_matrix(mass: Array, jacobian: Array, independent: Array):
     """`[[M, Aᵀ], [A, 0]]` with the independent rows of A, and rows of the unit matrix in place of the others."""
     m, n = jacobian.shape
     rows = _pick(jacobian, independent, n)
@@ -173,7 +185,7 @@ def saddle_point_matrix(mass, jacobian, independent):
     return jnp.block([[mass, rows.T], [rows, jnp.diag(1 - filled)]])
 
 
-def _scaled_matrix(mass, jacobian, independent):
+def _scaled_matrix(mass: Array, jacobian: Array, independent: Array):
     """The saddle-point matrix with M and A each divided by its largest entry, to judge whether it is singular."""
 
     def scaled(x: Array) -> Array:
@@ -182,14 +194,14 @@ def _scaled_matrix(mass, jacobian, independent):
     return saddle_point_matrix(scaled(mass), scaled(jacobian), independent)
 
 
-def displacement_map(mass, jacobian, independent):
+def displacement_map(mass: Array, jacobian: Array, independent: Array):
     """The shortest displacement in the metric of M that changes the residuals by a given amount, (n, m)."""
     n = mass.shape[0]
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
     return _spread(inverted[:n, n:], independent)
 
 
-def _pick(x, independent, n):
+def _pick(x: Array, independent: Array, n: int):
     """The entries of x (m, ...) that belong to independent equations: min(m, n) rows, zero where there are fewer.
 
     No more than n can be independent: with many redundant ones the system is smaller than it was written.
@@ -200,7 +212,7 @@ def _pick(x, independent, n):
     return x if m < 2 else jnp.where(independent.reshape(-1, *[1] * (x.ndim - 1)), x, 0.0)
 
 
-def _spread(x, independent):
+def _spread(x: Array, independent: Array):
     """Undo `_pick` along the last axis of x: zeros where an equation was left out."""
     m, picked = independent.size, x.shape[-1]
     if m > picked:
@@ -208,13 +220,13 @@ def _spread(x, independent):
     return x if m < 2 else jnp.where(independent if x.ndim == 1 else independent[None], x, 0.0)
 
 
-def _places(independent, n, dtype):
+def _places(independent: Array, n: int, dtype: DTypeLike):
     """The matrix of zeros and ones that puts the independent equations first, (n, m)."""
     place = jnp.cumsum(independent) - 1
     return (independent[None, :] & (place[None, :] == np.arange(n)[:, None])).astype(dtype)
 
 
-def minimum_norm(jacobian, multipliers, independent):
+def minimum_norm(jacobian: Array, multipliers: Array, independent: Array):
     """The shortest multipliers that exert the force of `multipliers`, which are zero on dependent rows."""
     if jacobian.shape[0] < 2:
         return multipliers
@@ -253,7 +265,7 @@ def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
     return regular & unique, _largest_of_rows(mass)
 
 
-def _largest_of_rows(mass):
+def _largest_of_rows(mass: Array):
     return jnp.max(jnp.abs(mass), axis=1)
 
 
@@ -276,13 +288,13 @@ class Examined(NamedTuple):
 
 
 @compiled
-def examined(model, s: State) -> Examined:
+def examined(model: Model, s: State) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
     found = _examined(model, s.t, *model.vectors(s.q, s.v))
     return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
 
 
-def _examined(model, t, x, u) -> Examined:
+def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:
     """The same in vector form."""
     linear = mass_and_forcing(model, t, x, u)
     rows = _without_vanishing(model, t, x, u)
@@ -301,7 +313,7 @@ def _examined(model, t, x, u) -> Examined:
     )
 
 
-def _without_vanishing(model, t, x, u):
+def _without_vanishing(model: Model, t: Array, x: Array, u: Array):
     """The rows of all constraints; those that are round-off, being far larger at a nearby state, are set to zero."""
     rows = constraints.acceleration_rows(model, t, x, u)
     if not rows.gamma.size:
@@ -315,7 +327,7 @@ def _without_vanishing(model, t, x, u):
     return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))
 
 
-def _contradictory(linear, rows, independent, a, multipliers, x, u):
+def _contradictory(linear, rows: Array, independent: Array, a, multipliers: Array, x: Array, u: Array):
     """Which dependent equations ask for another acceleration than those that they depend on."""
     jacobian, gamma = rows
     disagreement = jnp.abs(jacobian @ a - gamma)

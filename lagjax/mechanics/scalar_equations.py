@@ -21,7 +21,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.plain import is_plain
 from lagjax.jaxtools.scalarize import TooLong
@@ -81,7 +81,7 @@ def write_out(model: Model) -> WrittenOut | None:
     return WrittenOut(equations, Numbers(_projected, model) if model.m else None, may_fail=not diagonal)
 
 
-def _equations(diagonal, model: Model, t, q, v):
+def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     linear = mass_and_forcing(model, t, x, u)
     if model.n == 1 and not model.m:
@@ -93,7 +93,7 @@ def _equations(diagonal, model: Model, t, q, v):
     return model.tree(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
 
 
-def _projected(model: Model, t, q, v):
+def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
     # The residual vanishes at the solution, so that the derivative of the matrix does not count.
@@ -113,7 +113,7 @@ def _projected(model: Model, t, q, v):
     return model.tree(jnp.where(near, x, jnp.nan)), model.tree(u)
 
 
-def _tiny(correction, y) -> Array:
+def _tiny(correction, y: Array) -> Array:
     def norm(z: Array) -> Array:
         return jnp.sum(jnp.abs(z))
 

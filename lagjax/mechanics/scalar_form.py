@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.cache import varies
 from lagjax.jaxtools.fuse_cpu import calls_host, poisoned
@@ -39,7 +40,7 @@ class InNumbers(eqx.Module):
     def takes(self):
         return takes_of(self.function)
 
-    def __call__(self, t, *states_and_params):
+    def __call__(self, t: Array, *states_and_params):
         *states, params = states_and_params
         # Multipliers come by name, and pass unchanged.
         states = [self.form.tree(jnp.stack(state)) if isinstance(state, tuple) else state for state in states]
@@ -97,11 +98,11 @@ class Numbers:
         """What does not depend on the state; None if there is nothing, since equinox mishandles `()`."""
         return tuple(self._early(*jtu.tree_leaves(eqx.filter(model, varies)))) or None
 
-    def at(self, prepared, t, q, v):
+    def at(self, prepared, t: Array, q: PyTree, v: PyTree):
         """The function's result at a state."""
         return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
 
-    def __call__(self, model: Model, t, q, v):
+    def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""
         return self.at(self.prepare(model), t, q, v)
 

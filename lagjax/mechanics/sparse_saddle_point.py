@@ -36,6 +36,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.jaxtools.cache import once
@@ -86,7 +87,7 @@ def plan(model: Model) -> Plan | None:
 
 # The equations are traced at several places of one program.
 @once
-def _plan(structure, leaves) -> Plan | None:
+def _plan(structure, leaves: tuple) -> Plan | None:
     model = jtu.tree_unflatten(structure, leaves)
     t, u = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
     given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t, u
@@ -96,11 +97,11 @@ def _plan(structure, leaves) -> Plan | None:
         filled = [leaf if x is None else x for x, leaf in zip(arrays, leaves)]
         return jtu.tree_unflatten(structure, filled), t, x
 
-    def momentum(u, given):
+    def momentum(u: Array, given):
         model, t, x = at(given)
         return jax.grad(model.lagrangian, argnums=2)(t, x, u)
 
-    def residual(u, given):
+    def residual(u: Array, given):
         return constraints.velocity_residual(*at(given), u)
 
     of_mass = pattern(momentum, u, given)
@@ -150,7 +151,7 @@ class Banded(NamedTuple):
 
     plan: Plan
 
-    def accelerations(self, model, t, x, u, baumgarte_rate=None, kept=None):
+    def accelerations(self, model: Model, t: Array, x: Array, u: Array, baumgarte_rate: Array | None = None, kept=None):
         """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
         plan = self.plan
         forcing, inertia = forcing_and_inertia(model, t, x, u)
@@ -166,12 +167,14 @@ class Banded(NamedTuple):
         shortest = partial(_shortest, plan, push, pull)
         return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
 
-    def independent(self, model, t, x, u, dependent_below=None) -> Bool[Array, " m"]:
+    def independent(
+        self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
+    ) -> Bool[Array, " m"]:
         """Which constraint equations to solve with; see `numerics.banded.independent`."""
         push, pull, _ = _rows(model, t, x, u)
         return _independent(self.plan, push, pull, x.dtype, dependent_below)
 
-    def displacement(self, model, t, x, u) -> Callable:
+    def displacement(self, model: Model, t: Array, x: Array, u: Array) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         plan = self.plan
         _, inertia = forcing_and_inertia(model, t, x, u)
@@ -180,21 +183,21 @@ class Banded(NamedTuple):
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         schur, invert = _schur(plan, operators, x.dtype)
 
-        def of_residuals(which, r):
+        def of_residuals(which: str, r: Array):
             r = jnp.where(kept, jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r), 0.0)
             multipliers = lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)
             return operators.mass_inverse(pull(multipliers))
 
         return of_residuals
 
-    def row_sizes(self, model, t, x, u, norm=jnp.sum) -> Float[Array, " m"]:
+    def row_sizes(self, model: Model, t: Array, x: Array, u: Array, norm=jnp.sum) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
         if self.plan.band is None:
             return jnp.zeros(0, x.dtype)
         push, _, _ = _rows(model, t, x, u)
         return norm(jnp.abs(banded.compressed(push, self.plan.of_rows, x.dtype)), axis=0)
 
-    def verdict(self, model, t, x, u) -> Verdict:
+    def verdict(self, model: Model, t: Array, x: Array, u: Array) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
         plan, state = self.plan, (model, t, x, u)
         a, multipliers = self.accelerations(*state)
@@ -233,27 +236,27 @@ class Banded(NamedTuple):
         return str(self.plan)
 
 
-def _undetermined(plan, operators, dtype):
+def _undetermined(plan: Plan, operators: Operators, dtype: DTypeLike):
     """Whether the constraints leave a massless direction free: what was added to M would decide there."""
     probe = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
     moved, _ = _eliminated(plan, operators, dtype)(operators.added * probe, jnp.zeros(operators.kept.size, dtype))
     return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
 
 
-def _by_colours(push, coloured, y):
+def _by_colours(push: Callable, coloured, y: Array):
     """The product of the absolute values of y and of the matrix that `push` multiplies with."""
     seeds = np.arange(coloured.count)[:, None] == coloured.of_column[None, :]
     return jnp.sum(jnp.abs(jax.vmap(push)(jnp.where(seeds, y[None], 0.0))), axis=0)
 
 
-def _largest_inertia(plan, inertia, x):
+def _largest_inertia(plan: Plan, inertia: Callable, x: Array):
     return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
 
 
-def _rows(model, t, x, u):
+def _rows(model: Model, t: Array, x: Array, u: Array):
     """The products with A and Aᵀ, and d/dt of the velocity residual at constant velocity: -gamma."""
 
-    def residual(t, x, u):
+    def residual(t: Array, x: Array, u: Array):
         return constraints.velocity_residual(model, t, x, u)
 
     _, rate = jax.jvp(lambda t, x: residual(t, x, u), (t, x), (jnp.ones_like(t), u))
@@ -262,7 +265,7 @@ def _rows(model, t, x, u):
     return push, lambda multipliers: transposed(multipliers)[0], rate
 
 
-def _mass_inverse(plan, inertia, x):
+def _mass_inverse(plan: Plan, inertia: Callable, x: Array):
     """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for that."""
     n, size = x.size, plan.members.shape[1]
     products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
@@ -284,7 +287,7 @@ def _mass_inverse(plan, inertia, x):
     return apply, added.reshape(-1)[plan.place]
 
 
-def _schur(plan, operators, dtype):
+def _schur(plan, operators: Operators, dtype: DTypeLike):
     """The products with S and with its inverse; rows that are not kept are those of the unit matrix."""
     _, mass_inverse, _, push, pull, kept = operators
     rows = plan.band.order.rows
@@ -295,18 +298,18 @@ def _schur(plan, operators, dtype):
 
     invert = banded.solver(banded.keep(banded.entries(product, plan.band, dtype), kept[rows]))
 
-    def of_kept(multipliers):
+    def of_kept(multipliers: Array):
         return jnp.where(kept, product(jnp.where(kept, multipliers, 0.0)), multipliers)
 
     return of_kept, lambda r: invert(r[rows])[back]
 
 
-def _eliminated(plan, operators, dtype) -> Callable:
+def _eliminated(plan: Plan, operators: Operators, dtype: DTypeLike) -> Callable:
     """The function (F, gamma) -> (a, λ) that eliminates a, without refinement; it has no derivative by the state."""
     _, mass_inverse, _, push, pull, kept = operators
     _, invert = _schur(plan, operators, dtype)
 
-    def solve(forcing, gamma):
+    def solve(forcing: Array, gamma: Array):
         free = mass_inverse(forcing)
         multipliers = invert(jnp.where(kept, gamma - push(free), 0.0))
         return free + mass_inverse(pull(multipliers)), multipliers
@@ -314,7 +317,7 @@ def _eliminated(plan, operators, dtype) -> Callable:
     return solve
 
 
-def _solve(plan, operators, forcing, gamma):
+def _solve(plan: Plan, operators: Operators, forcing: Array, gamma: Array):
     """a and λ with the rows that are kept, refined; differentiated by the implicit function theorem."""
     inertia, mass_inverse, _, push, pull, kept = operators
 
@@ -338,10 +341,10 @@ def _solve(plan, operators, forcing, gamma):
     return a, -minus
 
 
-def _unconstrained(plan, inertia, forcing):
+def _unconstrained(plan: Plan, inertia: Callable, forcing: Array):
     """a without constraints, refined; a vanishing mass makes it infinite or NaN."""
 
-    def refined(_, forcing):
+    def refined(_, forcing: Array):
         mass_inverse, added = _mass_inverse(plan, inertia, forcing)
         a = jnp.where(added == 0, mass_inverse(forcing), jnp.nan)
         return a + mass_inverse(forcing - inertia(a))
@@ -349,18 +352,18 @@ def _unconstrained(plan, inertia, forcing):
     return lax.custom_linear_solve(inertia, forcing, refined, symmetric=True)
 
 
-def _gram(plan, push, pull, dtype):
+def _gram(plan: Plan, push: Callable, pull: Callable, dtype: DTypeLike):
     return banded.entries(lambda multipliers: push(pull(multipliers)), plan.band, dtype)
 
 
-def _independent(plan, push, pull, dtype, dependent_below=None):
+def _independent(plan, push: Callable, pull: Callable, dtype: DTypeLike, dependent_below: float | None = None):
     rows = plan.band.order.rows
     least = DEPENDENT_BELOW[np.dtype(dtype)]
     least = least if dependent_below is None else max(least, dependent_below)
     return banded.independent(_gram(plan, push, pull, dtype), least)[np.argsort(rows)]
 
 
-def _shortest(plan, push, pull, multipliers):
+def _shortest(plan, push: Callable, pull: Callable, multipliers: Array):
     """The shortest multipliers that exert the force of these: their part outside the null space of Aᵀ."""
     rows = plan.band.order.rows
     back, dtype = np.argsort(rows), multipliers.dtype
@@ -368,12 +371,12 @@ def _shortest(plan, push, pull, multipliers):
     shift = NULL_SHIFT[np.dtype(dtype)] * jnp.max(gram[:, 0])
     invert = banded.solver(gram.at[:, 0].add(shift))
 
-    def smaller(x, _):
+    def smaller(x: Array, _):
         return lax.custom_linear_solve(
             lambda y: push(pull(y)) + shift * y, shift * x, lambda _, r: invert(r[rows])[back], symmetric=True
         ), None
 
-    def outside(x, _):
+    def outside(x: Array, _):
         in_null_space, _ = lax.scan(smaller, x, length=NULL_POWER)
         return x - in_null_space, None
 

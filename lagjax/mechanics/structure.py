@@ -77,7 +77,7 @@ def structure(model: Model) -> Structure | None:
         return None
 
 
-def _structure(model: Model, names):
+def _structure(model: Model, names: Sequence[str]):
     system, n = model.system, model.n
     mass = _numbers(_mass, model)
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
@@ -94,7 +94,7 @@ def _structure(model: Model, names):
     )
 
 
-def _of(function):
+def _of(function: Callable):
     """One of the user's functions as a function of the model and the state."""
     return lambda model, *state: function(*state, model.params)
 
@@ -169,26 +169,26 @@ def _sees_velocities(model: Model) -> bool:
     return _dependence(equations, model, lambda args: jtu.tree_leaves(args[2])) != Depends.NOT
 
 
-def is_zero(x) -> bool:
+def is_zero(x: Array) -> bool:
     """Whether a result of a written-out program is a literal zero."""
     return isinstance(x, Literal) and x.val == 0
 
 
-def _numbers(function, model):
+def _numbers(function: Callable, model: Model):
     return Numbers(function, model, most=WRITTEN)
 
 
-def _mass(model, t, q, v):
+def _mass(model: Model, t: Array, q: PyTree, v: PyTree):
     mass = mass_and_forcing(model, t, *model.vectors(q, v)).mass
     return [mass[i, j] for i in range(model.n) for j in range(model.n)]
 
 
-def _momentum_at_rest(model, t, q, v):
+def _momentum_at_rest(model: Model, t: Array, q: PyTree, v: PyTree):
     at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
     return jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
 
 
-def _depends_on(numbers, names):
+def _depends_on(numbers, names: Sequence[str]):
     """The names on which any result depends: "t", coordinates, "velocities"."""
     jaxpr, n = numbers.program.jaxpr, len(names)
     t, *state = numbers.state_variables
@@ -196,7 +196,7 @@ def _depends_on(numbers, names):
     return tuple([*found, "velocities"] if depends(jaxpr, state[n:]) else found)
 
 
-def _constraint_structure(constraint, model, names):
+def _constraint_structure(constraint, model: Model, names: Sequence[str]):
     by = 1 if constraint.of_positions else 2
     value = _numbers(_of(constraint.residual), model)
     slope = _numbers(_of(lambda *state: jax.jacfwd(constraint.residual, argnums=by)(*state)), model)
@@ -244,7 +244,7 @@ def conserved_momenta(model: Model) -> list[str]:
     return [name for name in names if not any(name in found for found in occurring)]
 
 
-def what_changes_momentum(model: Model, name) -> Iterator[str]:
+def what_changes_momentum(model: Model, name: str) -> Iterator[str]:
     """What may change the momentum of a coordinate, in words."""
     system = model.system
     if not _contains(system.lagrangian, name, model, argument=2):
@@ -264,7 +264,7 @@ def what_changes_momentum(model: Model, name) -> Iterator[str]:
             yield words
 
 
-def forced_by(model: Model, name) -> Iterator[str]:
+def forced_by(model: Model, name: str) -> Iterator[str]:
     """Which forces on other coordinates depend on this one, in words."""
     if model.system.force is not None and _contains(force_with_ones(model), name, model):
         yield "the force contains it"
@@ -272,7 +272,7 @@ def forced_by(model: Model, name) -> Iterator[str]:
         yield "dissipation contains it"
 
 
-def _pushes(model: Model, name) -> bool:
+def _pushes(model: Model, name: str) -> bool:
     """Whether the force on a coordinate is not a literal zero; also True if that is not known."""
     try:
         force = _numbers(_of(force_with_ones(in_numbers(model))), in_numbers(model))
@@ -281,7 +281,7 @@ def _pushes(model: Model, name) -> bool:
     return not is_zero(force.program.jaxpr.outvars[model.names.index(name)])
 
 
-def _contains(function, name, model: Model, argument=1) -> bool:
+def _contains(function: Callable, name: str, model: Model, argument=1) -> bool:
     """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also True if not known."""
     sizes, known = [int(np.prod(shape)) for shape in model.form.shapes], model.names
     leaf = int(np.searchsorted(np.cumsum(sizes), known.index(name), side="right"))
@@ -320,7 +320,7 @@ def what_changes_jacobi_integral(model: Model) -> Iterator[str]:
             yield f"constraint '{name}' depends on t"
 
 
-def sees_time(function, model: Model) -> bool:
+def sees_time(function: Callable, model: Model) -> bool:
     """Whether a function of (t, q, v, params) depends on t."""
     return _dependence(function, model, lambda args: args[:1]) != Depends.NOT
 
@@ -345,7 +345,7 @@ def _dependence(function: Callable, model: Model, leaves_of: Callable) -> Depend
     """How the outputs of a function of (t, q, v, params) depend on any of some leaves of these."""
     arrays, static = eqx.partition((*model.form.example, model.params), varies)
 
-    def of_arrays(arrays):
+    def of_arrays(arrays: Sequence):
         return eqx.filter(function(*eqx.combine(arrays, static)), eqx.is_array)
 
     program = jax.make_jaxpr(of_arrays)(arrays)

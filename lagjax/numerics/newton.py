@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.numerics.linalg import lapack
@@ -149,7 +150,7 @@ def newton_in_python(
     None where `step(y)` is None, or where a step after `free` ones is above `noise` and above `shrinks` times the one
     before. A length is the largest entry of a step, relative to that of y if this is above 1.
     """
-    lengths = [np.inf]
+    lengths, change = [np.inf], np.zeros_like(y)
     for i in range(most):
         change = step(y)
         if change is None:
@@ -185,7 +186,7 @@ class Damping(NamedTuple):
     tries_left: Int[Array, ""]
 
 
-def zero_below(dtype) -> float:
+def zero_below(dtype: DTypeLike) -> float:
     """Singular values up to this part of the largest are round-off."""
     return ZERO_BELOW * float(jnp.finfo(dtype).eps)
 
@@ -203,10 +204,10 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
     eps, tiny = jnp.finfo(y0.dtype).eps, jnp.finfo(y0.dtype).tiny
     linear = np.zeros(y0.size, bool) if linear is None else linear
 
-    def positive(x):
+    def positive(x: Array):
         return jnp.where(x > 0, x, 1.0)
 
-    def size(r, rows):
+    def size(r: Array, rows):
         squared = jnp.sum((r / rows) ** 2)
         return jnp.where(jnp.isfinite(squared), squared, jnp.inf)
 
@@ -258,7 +259,7 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
     return Root(found.y, *found.at, found.memory.rows, found.steps)
 
 
-def with_value(residual: Callable, y):
+def with_value(residual: Callable, y: PyTree):
     """A residual and its Jacobian, by one linearisation."""
     r, push = jax.linearize(residual, y)
     return r, jax.vmap(push, out_axes=1)(jnp.eye(y.size, dtype=y.dtype))
@@ -281,7 +282,7 @@ def differentiable(residual: Callable, root: Root) -> Float[Array, " n"]:
     inverted = inverted / columns[:, None] / rows[None, :]
     free = jnp.eye(y.size, dtype=y.dtype) - inverted @ jacobian
 
-    def linear_solve(function, known):
+    def linear_solve(function: Callable, known: Array):
         matrix = jax.jacfwd(function)(jnp.zeros_like(known))
         return jnp.linalg.solve(matrix + free, known)
 

@@ -144,7 +144,7 @@ def eliminate(a: Slopes, rhs: WindowedEquations, damping: Unknowns) -> Factors:
     p = a.shared.shape[1]
     width = k + p + 1
 
-    def one_window(carried, x):
+    def one_window(carried, x: Array):
         a, r, seam, damped = x
         blocks = [
             [carried[:, :k], jnp.zeros((width, k)), carried[:, k:]],
@@ -174,7 +174,7 @@ def eliminate(a: Slopes, rhs: WindowedEquations, damping: Unknowns) -> Factors:
     )
 
 
-def _triangle(matrix):
+def _triangle(matrix: Array):
     """The square triangular factor; rows of zeros are added if there are fewer rows than columns."""
     rows, columns = matrix.shape
     short = max(columns - rows, 0)
@@ -185,7 +185,7 @@ def solution(f: Factors) -> Unknowns:
     """The least-squares solution."""
     shared = _upper(f.shared, f.shared_rhs)
 
-    def back(following, x):
+    def back(following: Array, x: Array):
         local, by_next, by_shared, rhs = x
         found = _upper(local, rhs - by_next @ following - by_shared @ shared)
         return found, found
@@ -210,7 +210,7 @@ def covariance(f: Factors, inverse: Float[Array, "p p"]) -> Covariance:
     """
     k, of_shared = f.local.shape[-1], inverse @ inverse.T
 
-    def back(joint, x):
+    def back(joint, x: Array):
         local, by_next, by_shared = x
         inverse = _upper(local, jnp.eye(k, dtype=local.dtype))
         # s_w = R⁻¹ (noise - [next, P] (s_{w+1}, p)).
@@ -225,7 +225,7 @@ def covariance(f: Factors, inverse: Float[Array, "p p"]) -> Covariance:
     return Covariance(of_shared, local, local_shared)
 
 
-def _upper(triangle, rhs):
+def _upper(triangle, rhs: Array):
     if triangle.shape[-1] == 0:
         return rhs
     return jax.scipy.linalg.solve_triangular(triangle, rhs)

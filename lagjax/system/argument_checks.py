@@ -66,7 +66,7 @@ def _remedy(system, others):
 def by_name(call: str, *required: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Let a function explain a call without its `required` keyword arguments; `call`: a correct call."""
 
-    def decorate(function):
+    def decorate(function: Callable):
         parameters = signature(function).parameters
         most_positional = sum(x.kind is Parameter.POSITIONAL_OR_KEYWORD for x in parameters.values())
         needed = frozenset(required)
@@ -84,7 +84,7 @@ def by_name(call: str, *required: str) -> Callable[[Callable[P, R]], Callable[P,
     return decorate
 
 
-def _wrong_call(name, excess, missing, call):
+def _wrong_call(name: str, excess, missing, call):
     words = [f"without {', '.join(f'{x}=' for x in missing)}"] if missing else []
     words += [f"with {excess} positional argument{'s' * (excess > 1)} too many"] if excess > 0 else []
     which = " and ".join(missing) or "further arguments"

@@ -12,6 +12,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.cache import kinds, remembered
 from lagjax.jaxtools.linearity import is_linear
@@ -27,7 +29,7 @@ from lagjax.system.user_errors import Call, check_arguments, in_words
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
 
 
-def prepare(system: System, t, q, v, params) -> tuple[Model, State]:
+def prepare(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> tuple[Model, State]:
     """The model of a system and a state of it, all checked: what a front door does first."""
     check_system(system, t, q, v, params)
     s = coordinates.state(t, q, v, params)
@@ -90,7 +92,7 @@ def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cau
     return traced(call.function, args, make)
 
 
-def _check_energy(call, value):
+def _check_energy(call: Call, value):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if isinstance(value, float) or shape == () and jnp.issubdtype(dtype, jnp.floating):
         return
@@ -109,11 +111,11 @@ def _check_energy(call, value):
     raise ValueError(f"{call} must return one real number, and returned {got}.\nUsual cause: {cause}.\nFix: {fix}.")
 
 
-def _is_complex(dtype):
+def _is_complex(dtype: DTypeLike):
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 
-def _check_force(call, force, q):
+def _check_force(call: Call, force: Callable, q: PyTree):
     expected = jax.tree.map(jnp.shape, q)
     if force is None:
         raise ValueError(
@@ -134,7 +136,7 @@ def _check_linear(model: Model, s: State):
     """Raise where the force is not linear in the multipliers."""
     arrays, static = eqx.partition((model, s), eqx.is_array_like)
 
-    def force(multipliers, arrays):
+    def force(multipliers: Array, arrays: Sequence):
         model, s = eqx.combine(arrays, static)
         return model.vector(model.force_at(s.t, s.q, s.v, multipliers))
 
@@ -147,7 +149,7 @@ def _check_linear(model: Model, s: State):
         )
 
 
-def _check_constraint(call, value):
+def _check_constraint(call: Call, value):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is None or len(shape) > 1:
         got = f"an array of shape {shape}" if shape is not None else f"a {type(value).__name__}"

@@ -12,13 +12,14 @@ the motion are Jacobian-vector products along `(1, v)`; no second-derivative arr
 Source: Goldstein, *Classical Mechanics*, §1.3 and §2.4; Hairer & Wanner, *Solving ODEs II*, §VII.1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE
 
@@ -49,15 +50,15 @@ class Holonomic(eqx.Module):
     def function(self) -> Callable:
         return self.g
 
-    def residual(self, t, q, v, params):
+    def residual(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         """`g` at a state, as the user wrote it."""
         return self.g(t, q, params)
 
-    def velocity_residual(self, model, t, x, u):
+    def velocity_residual(self, model, t: Array, x: Array, u: Array):
         """`dg/dt`, in vector form."""
         return jax.jvp(lambda t, x: self.g(t, model.tree(x), model.params), (t, x), (jnp.ones_like(t), u))[1]
 
-    def feedback(self, model, t, x, u, rate):
+    def feedback(self, model, t: Array, x: Array, u: Array, rate: Array):
         """The term in gamma with which g'' + 2 rate g' + rate² g = 0."""
         position = jnp.atleast_1d(self.g(t, model.tree(x), model.params))
         return -2 * rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u)) - rate**2 * position
@@ -91,15 +92,15 @@ class Nonholonomic(eqx.Module):
     def function(self) -> Callable:
         return self.phi
 
-    def residual(self, t, q, v, params):
+    def residual(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         """`phi` at a state, as the user wrote it."""
         return self.phi(t, q, v, params)
 
-    def velocity_residual(self, model, t, x, u):
+    def velocity_residual(self, model, t: Array, x: Array, u: Array):
         """`phi`, in vector form."""
         return self.phi(t, model.tree(x), model.tree(u), model.params)
 
-    def feedback(self, model, t, x, u, rate):
+    def feedback(self, model, t: Array, x: Array, u: Array, rate: Array):
         """The term in gamma with which phi' + rate phi = 0."""
         return -rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u))
 
@@ -114,7 +115,7 @@ class ConstraintRows(NamedTuple):
     gamma: Float[Array, " m"]
 
 
-def _check_callable(function, kind, signature):
+def _check_callable(function: Callable, kind, signature: str):
     if not callable(function):
         raise TypeError(
             f"{kind} needs a function {signature}, not {type(function).__name__}.\n"
@@ -122,29 +123,29 @@ def _check_callable(function, kind, signature):
         )
 
 
-def position_residual(model, t, x) -> Float[Array, " mh"]:
+def position_residual(model, t: Array, x: Array) -> Float[Array, " mh"]:
     """`g(t, q)` of the holonomic constraints, stacked."""
     q, of_positions = model.tree(x), [c for c in model.system.constraints.values() if c.of_positions]
     return _stack([c.g(t, q, model.params) for c in of_positions], x.dtype)
 
 
-def velocity_residual(model, t, x, u) -> Float[Array, " m"]:
+def velocity_residual(model, t: Array, x: Array, u: Array) -> Float[Array, " m"]:
     """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
     return _stack([c.velocity_residual(model, t, x, u) for c in model.system.constraints.values()], x.dtype)
 
 
-def jacobian(model, t, x, u) -> Float[Array, "m n"]:
+def jacobian(model, t: Array, x: Array, u: Array) -> Float[Array, "m n"]:
     """`A` of all constraints."""
     return jax.jacfwd(lambda u: velocity_residual(model, t, x, u))(u)
 
 
-def acceleration_rows(model, t, x, u) -> ConstraintRows:
+def acceleration_rows(model, t: Array, x: Array, u: Array) -> ConstraintRows:
     """`A` and `gamma` of all constraints."""
     _, rate = jax.jvp(lambda t, x: velocity_residual(model, t, x, u), (t, x), (jnp.ones_like(t), u))
     return ConstraintRows(jacobian(model, t, x, u), -rate)
 
 
-def baumgarte_feedback(model, t, x, u, rate):
+def baumgarte_feedback(model, t: Array, x: Array, u: Array, rate: Array):
     """Baumgarte's term in gamma, with which g'' + 2 rate g' + rate² g = 0, or phi' + rate phi = 0.
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
@@ -152,7 +153,7 @@ def baumgarte_feedback(model, t, x, u, rate):
     return _stack([c.feedback(model, t, x, u, rate) for c in model.system.constraints.values()], x.dtype)
 
 
-def _stack(parts, dtype):
+def _stack(parts: Sequence, dtype: DTypeLike):
     if not parts:
         return jnp.zeros((0,), dtype)
     return jnp.concatenate([jnp.atleast_1d(part).astype(dtype) for part in parts])

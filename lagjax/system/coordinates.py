@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.display.printable import printable
@@ -40,7 +41,7 @@ class PrecisionWarning(UserWarning):
     """
 
 
-def warn_of_float32(dtype, given) -> None:
+def warn_of_float32(dtype: DTypeLike, given) -> None:
     """Warn once per process if JAX is left in single precision and no array in `given` is NumPy float32."""
     if _settled or dtype != SINGLE or jax.dtypes.canonicalize_dtype(np.float64) != SINGLE:
         return
@@ -72,18 +73,18 @@ class State(NamedTuple):
     params: PyTree
 
 
-def flatten(tree):
+def flatten(tree: PyTree):
     """The vector of all coordinates in `tree`, and the function that puts a vector back."""
     return ravel_pytree(tree)
 
 
-def vector(tree):
+def vector(tree: PyTree):
     """The vector alone; a NumPy array where the values are known, so that nothing is compiled."""
     xp = numpy_of(tree)
     return xp.concatenate([xp.ravel(xp.asarray(x)) for x in jtu.tree_leaves(tree)])
 
 
-def like(tree, x):
+def like(tree: PyTree, x):
     """Give a vector x (..., n) the structure and shapes of `tree`; a NumPy vector becomes NumPy arrays."""
     leaves, structure = jtu.tree_flatten(tree)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
@@ -91,13 +92,13 @@ def like(tree, x):
     return jtu.tree_unflatten(structure, parts)
 
 
-def numbers(tree) -> tuple:
+def numbers(tree: PyTree) -> tuple:
     """The coordinates one by one, in the order of `flatten(tree)[0]`."""
     vector, _ = flatten(tree)
     return tuple(vector[i] for i in range(vector.size))
 
 
-def names(tree) -> list[str]:
+def names(tree: PyTree) -> list[str]:
     """The name of each entry of `flatten(tree)[0]`, as the user would write it.
 
     >>> names({"theta": 0.0, "r": [1.0, 2.0]})
@@ -111,7 +112,7 @@ def names(tree) -> list[str]:
     return found
 
 
-def _path_name(path):
+def _path_name(path: tuple):
     return "".join(_key_name(key, first=i == 0) for i, key in enumerate(path)) or "q"
 
 
@@ -122,7 +123,7 @@ def _key_name(key, first):
     return printable(name) if first else f".{printable(name)}"
 
 
-def state(t, q, v, params) -> State:
+def state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     """Check a state's shapes and dtypes and make arrays of it.
 
     Whole numbers among the coordinates become floats. Python floats become arrays of the state's dtype, in `params`
@@ -134,7 +135,7 @@ def state(t, q, v, params) -> State:
     return _as_jax_arrays(given_state(t, q, v, params))
 
 
-def given_state(t, q, v, params) -> State:
+def given_state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     """The same as `state`, but NumPy arrays stay: a compiled program takes them in a tenth of the time."""
     t, given = _time(t), jtu.tree_leaves((q, v))
     q_arrays, v_arrays = _numbers(q, "q"), _numbers(v, "v")
@@ -162,12 +163,12 @@ def _dtype_of(given):
     return jnp.result_type(*floats) if floats else jax.dtypes.canonicalize_dtype(FLOAT64)
 
 
-def prepared(t, q, v, params) -> State:
+def prepared(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     """A state for a compiled program, in NumPy arrays where JAX is not tracing."""
     return (given_state if is_eager() else state)(t, q, v, params)
 
 
-def as_arrays(tree, dtype):
+def as_arrays(tree: PyTree, dtype: DTypeLike):
     """Make arrays of the Python floats and NumPy arrays in `tree`; leave the rest as it is.
 
     An array that JAX made from a Python float, as `jnp.array(9.81)`, has a weak type and counts as a Python float.
@@ -175,11 +176,11 @@ def as_arrays(tree, dtype):
     return _as_jax_arrays(given_params(tree, dtype))
 
 
-def _as_jax_arrays(tree):
+def _as_jax_arrays(tree: PyTree):
     return jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
 
 
-def given_params(params, dtype):
+def given_params(params: PyTree, dtype: DTypeLike):
     """The same as `as_arrays`, but NumPy arrays stay."""
 
     def convert(x):
@@ -199,7 +200,7 @@ def given_params(params, dtype):
     return converted
 
 
-def _check_hashable(params):
+def _check_hashable(params: PyTree):
     """Raise for an entry of params that is not a number and not hashable: programs are kept by such values."""
     if not any(map(_unhashable, jtu.tree_leaves(params))):
         return
@@ -233,12 +234,12 @@ def _as_array(x):
     return x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
 
 
-def _cast(x, dtype):
+def _cast(x, dtype: DTypeLike):
     has_dtype = x.dtype == dtype and not getattr(x, "weak_type", False)
     return x if has_dtype else x.astype(dtype)
 
 
-def as_floats(tree):
+def as_floats(tree: PyTree):
     """Convert the whole numbers in `tree` to floats of the default size; leave the rest as it is."""
 
     def convert(x):
@@ -250,7 +251,7 @@ def as_floats(tree):
     return jtu.tree_map(convert, tree)
 
 
-def _time(t):
+def _time(t: Array):
     """A time as an array of one number."""
     if type(t) is float:
         return np.asarray(t)
@@ -264,7 +265,7 @@ def _time(t):
     )
 
 
-def _numbers(tree, which):
+def _numbers(tree: PyTree, which: str):
     """The coordinates as arrays, whole numbers not yet converted; raises if one is not a real number."""
     try:
         found = jtu.tree_map(_as_number, tree)
@@ -281,11 +282,11 @@ def _as_number(x):
     return _as_array(float(x) if type(x) is int else x)
 
 
-def _is_real(dtype):
+def _is_real(dtype: DTypeLike):
     return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
 
 
-def _check_real(tree, which):
+def _check_real(tree: PyTree, which: str):
     for path, leaf in jtu.tree_leaves_with_path(tree):
         dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
         if _is_real(dtype):
@@ -308,7 +309,7 @@ def _check_real(tree, which):
         )
 
 
-def _check_alike(q, v, params):
+def _check_alike(q: PyTree, v: PyTree, params: PyTree):
     q_structure, v_structure = jtu.tree_structure(q), jtu.tree_structure(v)
     if q_structure != v_structure:
         has = ["no names" if jtu.treedef_is_leaf(jtu.tree_structure(x)) else ", ".join(names(x)) for x in (q, v)]

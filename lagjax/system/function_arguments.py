@@ -20,7 +20,7 @@ def takes_of(function: Callable) -> tuple[str, ...]:
     return WITH_MULTIPLIERS if with_multipliers else OF_STATE
 
 
-def _binds(function, arguments):
+def _binds(function: Callable, arguments):
     try:
         inspect.signature(function).bind(*arguments)
     except TypeError:

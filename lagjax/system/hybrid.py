@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Int
+from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.display.printable import by_line
 from lagjax.jaxtools.cache import kinds, same
@@ -97,7 +97,7 @@ class Switch(eqx.Module):
     def __eq__(self, other):
         return isinstance(other, Switch) and same(self, other)
 
-    def __reduce_ex__(self, protocol):
+    def __reduce_ex__(self, protocol: int):
         functions = {"when": self.when, "reset": self.reset}
         check_functions({f"{role} of the switch {self.in_words()}": f for role, f in functions.items()})
         return super().__reduce_ex__(protocol)
@@ -106,7 +106,7 @@ class Switch(eqx.Module):
         """The same switch with other functions, unchecked."""
         return without_init(Switch, vars(self) | {"when": when, "reset": reset})
 
-    def value(self, t, q, v, multipliers, params):
+    def value(self, t: Array, q: PyTree, v: PyTree, multipliers: Array, params: PyTree):
         """The value of the guard at one state."""
         given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
         return self.when(*(given[name] for name in takes_of(self.when)))
@@ -268,7 +268,7 @@ class Hybrid(eqx.Module):
         return by_line("\n".join([f"Hybrid: {', '.join(counts)}, at most {self.most_switches} in a motion", *rows]))
 
 
-def _count(n, word, plural):
+def _count(n: int, word: str, plural: str):
     return f"{n} {word}" if n == 1 else f"{n} {word}{plural}"
 
 

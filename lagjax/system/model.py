@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools.cache import shape_of
 from lagjax.jaxtools.trees import without_init
 from lagjax.system import coordinates
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
+from lagjax.system.system import System
 from lagjax.system.traced_functions import Traced
 
 
@@ -103,15 +105,15 @@ class Model(eqx.Module):
             return (self,)
         return tuple(model_of(phase, *self.form.example, self.params) for phase in self.system.phases)
 
-    def tree(self, x):
+    def tree(self, x: Array):
         """A vector (..., n) in the user's structure."""
         return self.form.tree(x)
 
-    def vector(self, tree) -> Float[Array, " n"]:
+    def vector(self, tree: PyTree) -> Float[Array, " n"]:
         """A position, velocity or force in the user's structure as a vector."""
         return coordinates.flatten(tree)[0]
 
-    def vectors(self, q, v) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    def vectors(self, q: PyTree, v: PyTree) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """A position and a velocity as vectors."""
         return coordinates.flatten(q)[0], coordinates.flatten(v)[0]
 
@@ -136,19 +138,19 @@ class Model(eqx.Module):
         """Which of the stacked constraint equations belong to a constraint, (m,) booleans."""
         return np.array([residual.name == name for residual in self.form.residuals for _ in range(residual.size)], bool)
 
-    def lagrangian(self, t, x, u) -> Float[Array, ""]:
+    def lagrangian(self, t: Array, x: Array, u: Array) -> Float[Array, ""]:
         """L."""
         return self.system.lagrangian(t, self.tree(x), self.tree(u), self.params)
 
-    def dissipation(self, t, x, u) -> Float[Array, ""]:
+    def dissipation(self, t: Array, x: Array, u: Array) -> Float[Array, ""]:
         """Rayleigh's function R."""
         return self.system.dissipation(t, self.tree(x), self.tree(u), self.params)
 
-    def force(self, t, x, u, multipliers: Float[Array, " m"] | None = None) -> Float[Array, " n"]:
+    def force(self, t: Array, x: Array, u: Array, multipliers: Float[Array, " m"] | None = None) -> Float[Array, " n"]:
         """The generalized force Q that L does not contain; without `multipliers`, for those of zero."""
         return self.vector(self.force_at(t, self.tree(x), self.tree(u), multipliers)).astype(x.dtype)
 
-    def force_at(self, t, q, v, multipliers: Float[Array, " m"] | None = None):
+    def force_at(self, t: Array, q: PyTree, v: PyTree, multipliers: Float[Array, " m"] | None = None):
         """The same in the user's structure."""
         force = self.system.force
         if takes_of(force) != WITH_MULTIPLIERS:
@@ -162,7 +164,7 @@ class Model(eqx.Module):
         force = self.system.force
         return force is not None and bool(self.m) and takes_of(force) == WITH_MULTIPLIERS
 
-    def of(self, params) -> "Model":
+    def of(self, params: PyTree) -> "Model":
         """The same system with other parameters."""
         return unchecked(self.system, params, self.form)
 
@@ -177,7 +179,7 @@ class Model(eqx.Module):
         return unchecked(self.system.map(change), self.params, self.form)
 
 
-def model_of(system, t, q, v, params) -> Model:
+def model_of(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> Model:
     """The model of a system for states like this one; nothing is checked, and no value is looked at."""
     leaves, structure = jtu.tree_flatten(q)
     residuals = () if system.in_phases else tuple(
@@ -194,6 +196,6 @@ def _shape_of(constraint, *state):
     return tuple(jnp.shape(value))
 
 
-def unchecked(system, params, form) -> Model:
+def unchecked(system: System, params: PyTree, form) -> Model:
     """A model of these parts: to make a module the usual way takes long."""
     return without_init(Model, {"system": system, "params": params, "form": form, "n": form.n, "m": form.m})

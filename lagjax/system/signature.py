@@ -4,6 +4,7 @@ A signature holds the values and slopes of L, of R and of each constraint, and t
 whose signatures agree at a state in the middle of a motion count as the same.
 """
 
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from typing import Any, NoReturn
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.compiled import compiled
@@ -47,7 +49,7 @@ class UnknownSystem(eqx.Module):
     def __repr__(self):
         return f"{self.words.splitlines()[0]}, not given"
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str):
         if name in SYSTEM_FIELDS:
             _raise_unknown(self)
         raise AttributeError(name)
@@ -88,13 +90,13 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 
 @partial(compiled, in_numpy=True)
-def _signature(system, t, q, v, params):
+def _signature(system, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree):
     s, found = State(t, q, v, params), {}
 
-    def flat(*trees: PyTree) -> Array:
+    def flat(*trees) -> Array:
         return jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
 
-    def values_and_slopes(function, *args, slopes):
+    def values_and_slopes(function: Callable, *args, slopes):
         return flat(function(*args), jax.jacfwd(function, argnums=slopes)(*args))
 
     found["the Lagrangian"] = values_and_slopes(system.lagrangian, *s, slopes=(1, 2))
@@ -110,7 +112,7 @@ def _signature(system, t, q, v, params):
     return found
 
 
-def middle_state(t, q, v, params) -> State:
+def middle_state(t: Array, q: PyTree, v: PyTree, params: PyTree) -> State:
     """A state in the middle of a motion, among the finite ones; for a batch, of the first lane."""
     first = (0,) * (np.ndim(t) - 1)
 

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
+from jaxtyping import PyTree
 
 from lagjax.display.printable import by_line
 from lagjax.jaxtools.cache import kinds, same
@@ -41,14 +42,14 @@ def check_functions(functions: Mapping[str, Callable | None]) -> None:
             )
 
 
-def _is_found(function):
+def _is_found(function: Callable):
     found = sys.modules.get(function.__module__)
     for name in function.__qualname__.split("."):
         found = getattr(found, name, None)
     return found is function
 
 
-def _why(function):
+def _why(function: Callable):
     if function.__name__ == "<lambda>":
         return "it is a lambda"
     if "<locals>" in function.__qualname__:
@@ -203,7 +204,7 @@ class System(eqx.Module):
         # A trajectory has its system as it was traced.
         return isinstance(other, System) and same(untraced(self), untraced(other))
 
-    def __reduce_ex__(self, protocol):
+    def __reduce_ex__(self, protocol: int):
         check_functions(self.functions())
         return super().__reduce_ex__(protocol)
 
@@ -218,7 +219,7 @@ class System(eqx.Module):
         return by_line(f"System({'; '.join(parts)})")
 
 
-def untraced(tree):
+def untraced(tree: PyTree):
     """A system with the user's functions in place of their jaxprs."""
 
     def traced(x: Any) -> bool:
@@ -227,10 +228,10 @@ def untraced(tree):
     return jax.tree.map(lambda x: x.function if traced(x) else x, tree, is_leaf=traced)
 
 
-def unchecked(lagrangian, constraints: dict, force, dissipation) -> System:
+def unchecked(lagrangian: Callable, constraints: dict, force: Callable, dissipation) -> System:
     """A system of these functions, which have been checked: to make a module the usual way takes long."""
     return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation))))
 
 
-def _name(function):
+def _name(function: Callable):
     return getattr(function, "__name__", type(function).__name__)

@@ -12,7 +12,7 @@ import dataclasses
 import dis
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer, eval_jaxpr
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.cache import FACTS, is_array, once
 from lagjax.jaxtools.jaxpr_identity import Itself, Meaning, meaning_of, rules_of, with_own_constants
@@ -55,7 +55,7 @@ class TracedProgram:
         own, self._rest = eqx.partition(function, is_array)
         returned, structures = [], []
 
-        def of_arrays(own, arrays):
+        def of_arrays(own, arrays: Sequence):
             found = eqx.combine(own, self._rest)(*_with_arrays(args, arrays))
             returned.append(_shaped(found))
             structures.append(jtu.tree_structure(found))
@@ -78,7 +78,7 @@ class TracedProgram:
     def __eq__(self, other):
         return self is other or isinstance(other, TracedProgram) and self._meaning == other._meaning
 
-    def __call__(self, arrays, args):
+    def __call__(self, arrays: Sequence, args: tuple):
         """The function's result, given the arrays that it reads."""
         given = iter(arrays)
         constants = [next(given) if x is None else x for x in self._fixed]
@@ -88,7 +88,7 @@ class TracedProgram:
         results = eval_jaxpr(self.jaxpr, constants, *own, *_arrays(args))
         return jtu.tree_unflatten(self._structure, results)
 
-    def function_with(self, arrays) -> Callable:
+    def function_with(self, arrays: Sequence) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
         structure = jtu.tree_structure(eqx.filter(self.function, is_array))
         own = arrays[len(arrays) - structure.num_leaves :]
@@ -121,7 +121,7 @@ class Traced(eqx.Module):
         return _traced_again, (self.function, self.takes, self.program.like)
 
 
-def _traced_again(function, takes, like):
+def _traced_again(function: Callable, takes: tuple[str, ...], like):
     return _of_program(TracedProgram(function, takes, like))
 
 
@@ -157,7 +157,7 @@ class Signature:
     def __eq__(self, other):
         return self.kind == other.kind
 
-    def is_plain(self, args) -> bool:
+    def is_plain(self, args: tuple) -> bool:
         """Whether arguments of this kind bring along no code of the user's."""
         return FACTS.made((_is_plain, self.kind), lambda: all(_is_plain(x) for x in args))
 
@@ -168,31 +168,31 @@ def signature_of(args: tuple) -> Signature:
     return Signature((structure, *((x.shape, x.dtype) if is_array(x) else _kind(x) for x in leaves)))
 
 
-def _kind(x):
+def _kind(x: Array):
     if isinstance(x, LIKE_ARRAYS):
         return np.shape(x), jax.dtypes.canonicalize_dtype(getattr(x, "dtype", np.float64))
     return type(x), x
 
 
-def _shaped(tree):
+def _shaped(tree: PyTree):
     return jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if is_array(x) else x, tree)
 
 
-def _varies(x):
+def _varies(x: Array):
     return is_array(x) or isinstance(x, LIKE_ARRAYS)
 
 
-def _arrays(args):
+def _arrays(args: tuple):
     return [x for x in jtu.tree_leaves(args) if _varies(x)]
 
 
-def _with_arrays(args, arrays):
+def _with_arrays(args: tuple, arrays):
     leaves, structure = jtu.tree_flatten(args)
     arrays = iter(arrays)
     return jtu.tree_unflatten(structure, [next(arrays) if _varies(x) else x for x in leaves])
 
 
-def _is_small(x):
+def _is_small(x: Array):
     if isinstance(x, Tracer) or jnp.issubdtype(x.dtype, jax.dtypes.extended):
         return False
     return np.size(x) <= (SMALL if jnp.issubdtype(x.dtype, jnp.inexact) else SMALL_INDICES)
@@ -207,7 +207,7 @@ def names_outside(function: Callable) -> tuple | None:
     return tuple(found) if _finds_names(function, found) else None
 
 
-def _finds_names(function, found) -> bool:
+def _finds_names(function: Callable, found) -> bool:
     if type(function) is not types.FunctionType:
         return False
     if any(x is function for x in found):
@@ -225,7 +225,7 @@ def _finds_names(function, found) -> bool:
 
 
 @once
-def _names_of(code) -> tuple[tuple[str, ...], bool]:
+def _names_of(code: types.CodeType) -> tuple[tuple[str, ...], bool]:
     """The names in a function's code, those of attributes included, and whether it may reach what has no name there."""
     names, opens = set(code.co_names), bool(OPENS_OUTSIDE.intersection(code.co_code[::2]))
     for constant in code.co_consts:
@@ -236,7 +236,7 @@ def _names_of(code) -> tuple[tuple[str, ...], bool]:
     return tuple(sorted(names)), opens or not CHANGING.isdisjoint(names)
 
 
-def _is_of_library(x) -> bool:
+def _is_of_library(x: Array) -> bool:
     if isinstance(x, types.ModuleType):
         return _is_library(x.__name__) and sys.modules.get(x.__name__) is x
     module = getattr(x, "__module__", None) or ""
@@ -249,7 +249,7 @@ def _is_library(name: str) -> bool:
     return name.partition(".")[0] in LIBRARIES
 
 
-def _is_plain(x) -> bool:
+def _is_plain(x: Array) -> bool:
     """Whether an argument is numbers and text in dictionaries, lists, tuples and modules of the libraries."""
     if type(x) in CONTAINERS:
         return all(map(_is_plain, x.values() if isinstance(x, dict) else x or ()))

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree
 
 Words = tuple[str, str, str]
 
@@ -187,7 +188,7 @@ def _no_number(f: Failure) -> Words | None:
     )
 
 
-def _leaves_not_numbers(tree) -> Iterator[tuple[str, str]]:
+def _leaves_not_numbers(tree: PyTree) -> Iterator[tuple[str, str]]:
     """The leaves that are None or text, by name, with a pattern for what an error says of such a leaf."""
     for path, x in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: x is None):
         if path and (x is None or isinstance(x, str)):
@@ -243,7 +244,7 @@ def _unpacked(f: Failure) -> Words | None:
     return None
 
 
-def _length(x):
+def _length(x: Array):
     return what_is(x) if not isinstance(x, list | tuple) else f"{what_is(x)} of {len(x)}"
 
 
@@ -344,7 +345,7 @@ def in_words(call: Call, given: Mapping[str, Any]) -> Iterator[None]:
         raise TypeError(message) from error
 
 
-def _missing_key_message(call, given, error):
+def _missing_key_message(call, given, error: BaseException):
     """The message for a missing key: where it was looked up, which keys exist, and which one may have been meant."""
     key, line = error.args[0], _line(call, error)
     existing = {name: list(x) for name, x in given.items() if isinstance(x, Mapping) and name in call.takes}
@@ -372,7 +373,7 @@ def _missing_key_message(call, given, error):
     )
 
 
-def _message(call, given, error):
+def _message(call, given, error: BaseException):
     """The explanation of an error; None if it is not recognised."""
     if "\nFix: " in str(error):
         return None  # It is explained already.
@@ -386,7 +387,7 @@ def _message(call, given, error):
     return None
 
 
-def _indexed_arguments(call, line):
+def _indexed_arguments(call, line: str):
     """The arguments that the line indexes in brackets, by key: {"theta": ["q", "v"]}."""
     ours = dict(zip(_parameters(call), call.takes))
     found = {}
@@ -404,12 +405,12 @@ def _parameters(call):
         return []
 
 
-def _line(call, error):
+def _line(call, error: BaseException):
     """The line of the user's file where the error happened, or ""."""
     code = getattr(inspect.unwrap(call.function), "__code__", None)
     frames = [f for f in traceback.extract_tb(error.__traceback__) if code and f.filename == code.co_filename]
     return (frames[-1].line or "") if frames else ""
 
 
-def _quoted(line):
+def _quoted(line: str):
     return f"\n    {line.strip()}" if line else ""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import is_eager
 from tests.counting import compiles
 from tests.systems import HORIZONTAL, PARAMS, TS, cartesian_lagrangian, pendulum, rod, rod_pendulum
@@ -99,7 +100,7 @@ def test_another_function_is_looked_at():
 def test_equations_are_taken_for_regular_first():
     """A rod is regular; a rod given twice is not, and the robust solve finds the same motion."""
     once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
-    irregular = lambda: sum(getattr(program, "regular", True) is None for program in kept._programs.values())
+    irregular = lambda: sum(getattr(program, "regular", True) is None for program in PROGRAMS.values())
     before = irregular()
     twice = lj.System(cartesian_lagrangian, {name: lj.Holonomic(rod) for name in ("rod", "spare")})
     both, again = (lj.integrate(twice, *HORIZONTAL, PARAMS, ts=TS) for _ in range(2))

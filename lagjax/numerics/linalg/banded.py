@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.numerics.linalg import dense
 
@@ -60,7 +61,7 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
     return Order(rows, int(np.max(np.abs(place[i] - place[j]), initial=0)))
 
 
-def _outwards(start, neighbours, degree):
+def _outwards(start: PyTree, neighbours, degree):
     """All rows connected to `start`, by distance; rows with few neighbours first."""
     found, seen = [start], {start}
     for row in found:
@@ -98,7 +99,7 @@ def colours(pattern: Bool[np.ndarray, "m n"]) -> Colours:
     return Colours(np.array(of_column, int), max(of_column, default=-1) + 1)
 
 
-def compressed(push: Callable, coloured: Colours, dtype) -> Float[Array, "colours m"]:
+def compressed(push: Callable, coloured: Colours, dtype: DTypeLike) -> Float[Array, "colours m"]:
     """The products of a matrix, known as the function `push`, with the sum of each colour's unit vectors."""
     seeds = np.arange(coloured.count)[:, None] == coloured.of_column[None, :]
     return jax.vmap(push)(jnp.asarray(seeds, dtype))
@@ -143,7 +144,7 @@ def band(pattern: Bool[np.ndarray, "m m"]) -> Band:
     )
 
 
-def entries(push: Callable, where: Band, dtype) -> Float[Array, "m b1"]:
+def entries(push: Callable, where: Band, dtype: DTypeLike) -> Float[Array, "m b1"]:
     """The band of a symmetric matrix known as a function: `K[i, i - d]` at (i, d), rows in the band's order."""
     products = compressed(push, where.colours, dtype)
     return jnp.where(where.present, products.reshape(-1)[where.entries], 0.0)
@@ -173,7 +174,7 @@ def solver(band: Float[Array, "m b1"]) -> Callable[[Float[Array, " m"]], Float[A
     return _tridiagonal(band) if band.shape[1] == 2 else _by_rows(band)
 
 
-def _tridiagonal(band):
+def _tridiagonal(band: Array):
     diagonal, below = band[:, 0], band[:, 1]
     above = jnp.concatenate([below[1:], jnp.zeros(1, band.dtype)])
     if band.shape[0] < 3:
@@ -182,17 +183,17 @@ def _tridiagonal(band):
     return lambda r: lax.linalg.tridiagonal_solve(below, diagonal, above, r[:, None])[:, 0]
 
 
-def _by_rows(band):
+def _by_rows(band: Array):
     m, width = band.shape
     factors = _eliminate(band, lambda pivot: jnp.ones((), bool))
 
-    def solve(r):
-        def forward(pending, row):
+    def solve(r: Array):
+        def forward(pending, row: Array):
             pivot, column, r = row
             scaled = (r - pending[0]) / pivot
             return jnp.append(pending[1:], 0.0) + column * scaled, scaled
 
-        def backward(following, row):
+        def backward(following: Array, row: Array):
             (pivot, column), scaled = row
             x = scaled - column @ following / pivot
             return jnp.concatenate([x[None], following[:-1]]), x
@@ -204,13 +205,13 @@ def _by_rows(band):
     return solve
 
 
-def _eliminate(band, keeps):
+def _eliminate(band: Array, keeps: Array):
     """The pivot of each row, and the column below it at its elimination, (m, b); zeros below rows not kept."""
     m, width = band.shape
     # Unit rows are appended, so that the last rows are eliminated too.
     padding = jnp.zeros((width - 1, width), band.dtype).at[:, 0].set(1.0)
 
-    def take(window, row):
+    def take(window, row: Array):
         # Add the new row as the last of the window, then eliminate the oldest.
         window = jnp.concatenate([jnp.concatenate([window, row[None, :-1]]), row[:, None]], axis=1)
         pivot, kept = window[0, 0], keeps(window[0, 0])

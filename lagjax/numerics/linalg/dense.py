@@ -13,6 +13,7 @@ than LAPACK, whose call costs 1-1.6 microseconds, up to n = 6.
 Differentiation never passes through the pivoting: `dx = K^-1 (db - dK x)`, transposed by JAX.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -46,7 +47,7 @@ def solve(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, 
     return _solution(matrix, rhs)[0]
 
 
-def _solution(matrix, rhs):
+def _solution(matrix: Array, rhs: Array):
     """x, and the map from a right-hand side to its solution without refinement."""
     if rhs.shape[0] == 1:
         return rhs / matrix[0], lambda b: b / matrix[0]
@@ -57,13 +58,13 @@ def _solution(matrix, rhs):
 # x comes from the same code with and without a derivative: JAX's batching of custom rules under `jit` requires that
 # both have their batch axis in the same position.
 @solve.defjvp
-def _solve_jvp(primals, tangents):
+def _solve_jvp(primals: Sequence, tangents: Sequence):
     (matrix, rhs), (d_matrix, d_rhs) = primals, tangents
     x, solve_for = _solution(matrix, rhs)
     return x, solve_for(d_rhs - d_matrix @ x)
 
 
-def refined(inverted, matrix, rhs):
+def refined(inverted: Array, matrix: Array, rhs: Array):
     """`matrix^-1 @ rhs` by an approximate inverse and one step of iterative refinement."""
     x = inverted @ rhs
     return x + inverted @ (rhs - matrix @ x)
@@ -87,13 +88,13 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return _inverse_p.bind(matrix, eliminate=n <= ELIMINATE_UP_TO)
 
 
-def _eliminated(matrix):
+def _eliminated(matrix: Array):
     n = matrix.shape[0]
     scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
     work = jnp.concatenate([matrix * scale[:, None], jnp.diag(scale)], axis=1)
     row = np.arange(n)
 
-    def eliminate(k, work):
+    def eliminate(k: Array, work: Array):
         candidates = jnp.where(row >= k, jnp.abs(work[:, k]), -1.0)
         pivot = jnp.argmax(candidates)
         top, best = work[k], work[pivot]
@@ -105,16 +106,16 @@ def _eliminated(matrix):
     return lax.fori_loop(0, n, eliminate, work)[:, n:]
 
 
-def _inverse(matrix, eliminate):
+def _inverse(matrix: Array, eliminate: bool):
     return _eliminated(matrix) if eliminate else jnp.linalg.inv(matrix)
 
 
-def _inverse_jvp(primals, tangents, **params):
+def _inverse_jvp(primals: Sequence, tangents: Sequence, **params):
     inverted = _inverse_p.bind(*primals, **params)
     return inverted, -inverted @ tangents[0] @ inverted
 
 
-def _inverse_batched(operands, axes, **params):
+def _inverse_batched(operands: Sequence, axes: Sequence, **params):
     return one_by_one(jax.vmap(partial(_inverse, **params)))(jnp.moveaxis(operands[0], axes[0], 0)), 0
 
 
@@ -138,7 +139,7 @@ def reciprocal_condition(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     if matrix.shape[0] == 1:
         return jnp.where(jnp.isfinite(matrix[0, 0]) & (matrix[0, 0] != 0), 1.0, 0.0)
 
-    def rescaled(_, matrix):
+    def rescaled(_, matrix: Array):
         largest = jnp.max(jnp.abs(matrix), axis=1)
         scale = 1 / jnp.sqrt(jnp.where(largest > 0, largest, 1.0))
         return scale[:, None] * matrix * scale[None, :]
@@ -230,7 +231,7 @@ class Saddle:
 
         return stack(x[: self.n]), stack([-y for y in x[self.n :]])
 
-    def _substituted(self, known):
+    def _substituted(self, known: Array):
         y = list(known)
         for i, row in enumerate(self.lower):
             for j, factor in enumerate(row):

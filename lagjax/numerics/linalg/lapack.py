@@ -20,8 +20,8 @@ def one_by_one(function: Callable) -> Callable:
     looped = custom_vmap(function)
 
     @looped.def_vmap
-    def _(size, batched, *args):
-        def at(i):
+    def _(size: Array, batched, *args):
+        def at(i: Array):
             one_matrix = jax.tree.map(lambda x, is_batched: x[i] if is_batched else x, args, tuple(batched))
             return looped(*one_matrix)
 
@@ -36,19 +36,19 @@ def one_by_one(function: Callable) -> Callable:
 
 
 @one_by_one
-def singular_values(matrix):
+def singular_values(matrix: Array):
     """All singular values, descending."""
     return jnp.linalg.svd(matrix, compute_uv=False)
 
 
 @one_by_one
-def complement(columns):
+def complement(columns: Array):
     """Orthonormal columns (n, n - r) perpendicular to r independent columns (n, r)."""
     return jnp.linalg.qr(columns, mode="complete")[0][:, columns.shape[1] :]
 
 
 @one_by_one
-def symmetric_definite(stiffness, mass):
+def symmetric_definite(stiffness: Array, mass: Array):
     """s and X of `K x = s M x` with `Xᵀ M X` = 1; NaN where M is not positive definite."""
     lower = jnp.linalg.cholesky(mass)
     inner = lax.linalg.triangular_solve(lower, stiffness, left_side=True, lower=True)
@@ -58,14 +58,14 @@ def symmetric_definite(stiffness, mass):
 
 
 @one_by_one
-def eigen(matrix, inertia):
+def eigen(matrix: Array, inertia: Array):
     """λ and X of `A x = λ E x`, and Z with `Z E X` = 1."""
     values, vectors = lax.linalg.eig(jnp.linalg.solve(inertia, matrix), compute_left_eigenvectors=False)
     return values, vectors, jnp.linalg.inv(inertia.astype(vectors.dtype) @ vectors)
 
 
 @one_by_one
-def eigen_without_null_space(matrix, inertia, zero_below):
+def eigen_without_null_space(matrix: Array, inertia: Array, zero_below: float):
     """Like `eigen`, but small roots near a zero root of A keep their digits; also says which roots are zeros of A.
 
     The null space N of A is projected out: P S P with S = E⁻¹ A and P = 1 - N Nᵀ has the roots and the left vectors of
@@ -96,12 +96,12 @@ def eigen_without_null_space(matrix, inertia, zero_below):
 
 
 @one_by_one
-def solve(matrix, rhs):
+def solve(matrix: Array, rhs: Array):
     """`matrix⁻¹ rhs`."""
     return jnp.linalg.solve(matrix, rhs)
 
 
 @one_by_one
-def decomposed(matrix):
+def decomposed(matrix: Array):
     """The reduced singular value decomposition U, σ, Vᵀ of any matrix."""
     return jnp.linalg.svd(matrix, full_matrices=False)

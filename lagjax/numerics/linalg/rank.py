@@ -19,7 +19,7 @@ DEPENDENT_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 UNROLL_UP_TO = 8
 
 
-def independent_rows(rows: Float[Array, "m n"], dependent_below=None) -> Bool[Array, " m"]:
+def independent_rows(rows: Float[Array, "m n"], dependent_below: float | None = None) -> Bool[Array, " m"]:
     """Choose a largest set of independent rows, as well conditioned as pivoting finds.
 
     >>> import jax.numpy as jnp

@@ -62,23 +62,32 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
         """The dense output."""
         return Quintic
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm):
         """The order of the accepted solution."""
         return self.highest
 
-    def error_order(self, terms):
+    def error_order(self, terms: diffrax.AbstractTerm):
         """One more than the order of the embedded method."""
         return self.embedded + 1
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: diffrax.AbstractTerm, t0: Array, y0: PyTree, args: PyTree):
         """The vector field."""
         return terms.vf(t0, y0, args)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree):
         """The acceleration at the start: the last stage of a step is the first of the next."""
         return terms.vf(t0, y0, args)[1]
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Array,
+    ):
         """One step, its error and the data for the dense output."""
         tableau, h = self.tableau, terms.contr(t0, t1)
         first = solver_state if made_jump is False else None
@@ -100,12 +109,12 @@ class Nystrom(diffrax.AbstractAdaptiveSolver):
         return (q1, v1), error, dense, last, diffrax.RESULTS.successful
 
 
-def _position(y0, h, c, combined):
+def _position(y0: PyTree, h: Array, c, combined: Callable):
     """`q + c h v + h² (sum a k)`."""
     return jtu.tree_map(lambda q, v, k: q + h * (c * v + h * k), *y0, combined)
 
 
-def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
+def _one_by_one(tableau, acceleration: Callable, t0: Array, t1: Array, h: Array, y0: PyTree, first: PyTree):
     """The first and last stage, and a function for weighted sums of all stages; zero weights cost nothing."""
     found = [acceleration(t0, y0[0]) if first is None else first]
 
@@ -119,7 +128,7 @@ def _one_by_one(tableau, acceleration, t0, t1, h, y0, first):
     return found[0], found[-1], combined
 
 
-def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
+def _in_a_loop(tableau, acceleration: Callable, t0: Array, t1: Array, h: Array, y0: PyTree, first: PyTree):
     """Like `_one_by_one`, with the acceleration compiled once."""
     count = len(tableau.c)
     rows = np.zeros((count, count))
@@ -131,7 +140,7 @@ def _in_a_loop(tableau, acceleration, t0, t1, h, y0, first):
 
     rows, nodes = jnp.asarray(rows), jnp.asarray(tableau.c, jnp.result_type(t0))
 
-    def stage(i, found):
+    def stage(i: Array, found: PyTree):
         t = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
         q = _position(y0, h, nodes[i], weighted(rows[i], found))
         return jtu.tree_map(lambda ks, k: ks.at[i].set(k), found, acceleration(t, q))
@@ -154,13 +163,13 @@ class Quintic(Interpolation):
     a0: PyTree
     a1: PyTree
 
-    def at(self, t):
+    def at(self, t: Array):
         """(q, v) at t."""
         h = self.t1 - self.t0
         step = jnp.where(h == 0, 1.0, h)
         s = (t - self.t0) / step
 
-        def coefficients(q0, v0, a0, q1, v1, a1):
+        def coefficients(q0: Array, v0: Array, a0: Array, q1: Array, v1: Array, a1: Array):
             of_q = q1 - q0 - h * v0 - h * h * a0 / 2
             of_v, of_a = h * (v1 - v0) - h * h * a0, h * h * (a1 - a0)
             rest = (10 * of_q - 4 * of_v + of_a / 2, -15 * of_q + 7 * of_v - of_a, 6 * of_q - 3 * of_v + of_a / 2)
@@ -168,10 +177,10 @@ class Quintic(Interpolation):
 
         ends = (*self.y0, self.a0, *self.y1, self.a1)
 
-        def position(*ends: Array) -> Array:
+        def position(*ends: Array) -> Any:
             return sum(c * s**k for k, c in enumerate(coefficients(*ends)))
 
-        def slope(*ends: Array) -> Array:
+        def slope(*ends: Array) -> Any:
             return sum(k * c * s ** (k - 1) for k, c in enumerate(coefficients(*ends)) if k) / step
 
         return jtu.tree_map(position, *ends), jtu.tree_map(slope, *ends)

@@ -36,7 +36,7 @@ Source: Hairer & Wanner, *Solving ODEs II*, §IV.8, (8.9)-(8.11).
 """
 
 import copyreg
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -124,12 +124,16 @@ class SimplifiedNewton(optx.AbstractRootFinder):
     kappa: float | None = None
     slow: float = eqx.field(static=True, default=0.3)
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
+    def init(
+        self, fn: Callable, y: PyTree, args: PyTree, options, f_struct: PyTree, aux_struct, tags: frozenset
+    ) -> Iteration:
         if "init_state" in options:
             return options["init_state"]
         return Iteration.first(_inverse_at(fn, y, args, options), y, here=True)
 
-    def step(self, fn, y, args, options, state, tags) -> tuple[PyTree, Iteration, Any]:
+    def step(
+        self, fn: Callable, y: PyTree, args: PyTree, options, state, tags: frozenset
+    ) -> tuple[PyTree, Iteration, Any]:
         # A branch also under `vmap`: no Jacobian is computed unless a lane needs it.
         inverse = lax.cond(
             eqxi.unvmap_any(state.stale),
@@ -184,7 +188,9 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         known = jnp.isfinite(state.previous)
         return ~self._converged(state) & ((known & ~(state.rate() <= self.slow)) | ~jnp.isfinite(state.size))
 
-    def terminate(self, fn, y, args, options, state, tags) -> tuple[Array, optx.RESULTS]:
+    def terminate(
+        self, fn: Callable, y: PyTree, args: PyTree, options: dict | None, state, tags: frozenset
+    ) -> tuple[Array, optx.RESULTS]:
         converged = self._converged(state)
         # An old Jacobian is recomputed first. Growth after that leads to another root as often as back.
         grows = (jnp.isfinite(state.previous) & ~(state.rate() < 1)) | ~jnp.isfinite(state.size)
@@ -193,12 +199,14 @@ class SimplifiedNewton(optx.AbstractRootFinder):
         failure = optx.RESULTS.where(diverged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
         return converged | diverged, failure
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+    def postprocess(
+        self, fn: Callable, y: PyTree, aux, args: PyTree, options: dict | None, state, tags: frozenset, result
+    ):
         # A failed step is discarded by multiplying its derivative by zero, so it must be finite.
         return jtu.tree_map(lambda x: jnp.where(jnp.isfinite(x), x, 0), y), aux, {}
 
 
-def _inverse_at(fn, y, args, options):
+def _inverse_at(fn: Callable, y: PyTree, args: PyTree, options):
     if "inverse_at" in options:
         return options["inverse_at"](y)
     vector, unravel = ravel_pytree(y)
@@ -214,7 +222,9 @@ def tolerance_of_the_controller():
 copyreg.pickle(type(tolerance_of_the_controller()), lambda _: (tolerance_of_the_controller, ()))
 
 
-def with_tolerances(solver: diffrax.AbstractSolver, rtol, atol, norm=optx.max_norm) -> diffrax.AbstractSolver:
+def with_tolerances(
+    solver: diffrax.AbstractSolver, rtol, atol, norm: Callable = optx.max_norm
+) -> diffrax.AbstractSolver:
     """Give a solver's root finder tolerances, if it would take them from an adaptive step-size controller.
 
     With constant steps there is no such controller, and diffrax raises an error. Other solvers are returned unchanged.
@@ -250,7 +260,7 @@ A = np.array(
 A_INVERSE = np.linalg.inv(A)
 
 
-def _real_and_complex(matrix):
+def _real_and_complex(matrix: Array):
     """(eigenvalue, right, left eigenvector) of a real 3 x 3 matrix: of the real one, and of one of the complex pair."""
     values, right = np.linalg.eig(matrix)
     left = np.linalg.inv(right)
@@ -311,20 +321,29 @@ class Radau5(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     def interpolation_cls(self) -> Callable:
         return Collocation
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm):
         return 5
 
-    def error_order(self, terms):
+    def error_order(self, terms: diffrax.AbstractTerm):
         return 4
 
-    def init(self, terms, t0, t1, y0, args) -> "LastStep":
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree) -> "LastStep":
         vector, _ = ravel_pytree(y0)
         return LastStep(jnp.zeros((3, *vector.shape), vector.dtype), t0, jnp.ones_like(t1 - t0), jnp.asarray(False))
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: diffrax.AbstractTerm, t0: Array, y0: PyTree, args: PyTree):
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Array,
+    ):
         # After a jump the last polynomial is a poor initial guess, but for a short step it tends to z = 0.
         del made_jump
         control = terms.contr(t0, t1)
@@ -350,7 +369,7 @@ class Radau5(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         dense_info = {"y0": y0, "stages": jax.vmap(unravel)(z)}
         return y1, error, dense_info, LastStep(_frozen(z), *_frozen((t0, t1 - t0)), jnp.asarray(True)), result
 
-    def _powers_of_step(self, y):
+    def _powers_of_step(self, y: PyTree):
         leaves = jtu.tree_map(
             lambda power, y: jtu.tree_map(lambda x: np.full(np.shape(x), power), y), self.step_powers, y
         )
@@ -377,7 +396,7 @@ class Stages(eqx.Module):
     args: PyTree
     unravel: Callable
 
-    def increment(self, t, y) -> Float[Array, " n"]:
+    def increment(self, t: Array, y: PyTree) -> Float[Array, " n"]:
         """h f(t, y)."""
         return ravel_pytree(self.field(t, self.unravel(y), self.args, self.control))[0]
 
@@ -385,7 +404,7 @@ class Stages(eqx.Module):
         """h f at the stages."""
         return jax.vmap(self.increment)(self._times(), self.y0[None] + z)
 
-    def _jacobians(self, z):
+    def _jacobians(self, z: Array):
         return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._times(), self.y0[None] + z)
 
     def matrix(self, z: Float[Array, "3 n"]) -> Float[Array, "3n 3n"]:
@@ -437,7 +456,7 @@ class Collocation(Interpolation):
     y0: PyTree
     stages: PyTree
 
-    def at(self, t):
+    def at(self, t: Array):
         """The state at t."""
         length = self.t1 - self.t0
         s = jnp.where(length == 0, 0.0, (t - self.t0) / jnp.where(length == 0, 1.0, length))
@@ -445,22 +464,22 @@ class Collocation(Interpolation):
         return jtu.tree_map(lambda y, z: y + jnp.tensordot(weights.astype(z.dtype), z, 1), self.y0, self.stages)
 
 
-def _powers(s):
+def _powers(s: Array):
     return jnp.stack([s, s**2, s**3], axis=-1)
 
 
-def _initial_guess(last, t0, dt):
+def _initial_guess(last, t0: Array, dt: Array):
     """z of a step from t0 by the polynomial of the last step, extrapolated or evaluated inside it."""
     begin = (t0 - last.t0) / last.dt
     weights = (_powers(begin + C * (dt / last.dt)) - _powers(begin)[None]) @ TO_POWERS
     return weights.astype(last.z.dtype) @ last.z
 
 
-def _frozen(tree):
+def _frozen(tree: PyTree):
     return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-def _error(equations, z, rate, to_error, finder, weights):
+def _error(equations, z: Array, rate: PyTree, to_error: Array, finder, weights: Array):
     """The estimate of the local error; filtered again if it would reject the step."""
     weighted = jnp.asarray(E, z.dtype) @ z
     error = to_error @ (rate + weighted)
@@ -478,7 +497,7 @@ def _error(equations, z, rate, to_error, finder, weights):
 
 
 @eqx.filter_custom_jvp
-def _solved(equations, *, fixed, max_steps):
+def _solved(equations, *, fixed, max_steps: int | None):
     """The stages z, and the result of their iteration."""
     start, inverse, finder = fixed
     options = {
@@ -501,7 +520,7 @@ def _solved(equations, *, fixed, max_steps):
 
 
 @_solved.def_jvp
-def _solved_jvp(primals, tangents, *, fixed, max_steps):
+def _solved_jvp(primals: Sequence, tangents: Sequence, *, fixed, max_steps: int | None):
     (equations,), (tangent,) = primals, tangents
     z, result = _solved(equations, fixed=fixed, max_steps=max_steps)
     _, forced = eqx.filter_jvp(lambda equations: equations.increments(z), (equations,), (tangent,))

@@ -23,17 +23,17 @@ import jax.tree_util as jtu
 import numpy as np
 from equinox import AbstractClassVar
 from jax import lax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 
 class Interpolation(diffrax.AbstractLocalInterpolation):
     """A dense output given by the state `at` a time; the change over an interval is the difference of two states."""
 
     @abc.abstractmethod
-    def at(self, t):
+    def at(self, t: Array):
         """The state at t."""
 
-    def evaluate(self, t0, t1=None, left=True):
+    def evaluate(self, t0: Array, t1: Array | None = None, left=True):
         """The state at t0, or its change from t0 to t1."""
         if t1 is None:
             return self.at(t0)
@@ -53,15 +53,24 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
 
     in_a_loop: bool = eqx.field(default=False, static=True)
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: diffrax.AbstractTerm, t0: Array, y0: PyTree, args: PyTree):
         """The vector field."""
         return terms.vf(t0, y0, args)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree):
         """The first stage, if the last stage of a step is the first of the next."""
         return terms.vf(t0, y0, args) if self.tableau.fsal else None
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Array,
+    ):
         """One step, its error and the data for the dense output."""
         tableau, control = self.tableau, terms.contr(t0, t1)
         first = solver_state
@@ -80,7 +89,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         stages = jtu.tree_map(lambda *k: jnp.stack(k), *increments)
         return y1, error, {"y0": y0, "y1": y1, "k": stages}, rate if tableau.fsal else None, diffrax.RESULTS.successful
 
-    def _in_a_loop(self, terms, t0, t1, y0, args, first):
+    def _in_a_loop(self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree, first: PyTree):
         """Like `step`, with the vector field compiled once; the loop includes the first stage unless it is given."""
         tableau, control, count = self.tableau, terms.contr(t0, t1), len(self.tableau.b_sol)
         rows = np.zeros((count, count))
@@ -91,7 +100,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         def by(weights: Any, ks: PyTree) -> PyTree:
             return jtu.tree_map(lambda k: jnp.tensordot(weights.astype(k.dtype), k, 1), ks)
 
-        def stage(i, ks):
+        def stage(i: Array, ks):
             t = jnp.where(nodes[i] == 1, t1, t0 + nodes[i] * (t1 - t0))
             y = jtu.tree_map(jnp.add, y0, terms.prod(by(rows[i], ks), control))
             return jtu.tree_map(lambda ks, k: ks.at[i].set(k), ks, terms.vf(t, y, args))
@@ -110,7 +119,7 @@ class ExplicitRungeKutta(diffrax.AbstractAdaptiveSolver):
         return y1, of(tableau.b_error), dense, last, diffrax.RESULTS.successful
 
 
-def weighted_sum(start, weights, increments):
+def weighted_sum(start: PyTree, weights: Array, increments):
     """`start + sum_i weights_i increments_i`, leaf by leaf."""
     chosen = [(w, k) for w, k in zip(weights, increments) if w != 0]
 
@@ -140,7 +149,7 @@ class Tsit5(ExplicitRungeKutta):
     tableau: ClassVar = diffrax.Tsit5.tableau
     interpolation_cls: ClassVar[Callable] = diffrax.Tsit5.interpolation_cls
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm):
         """5."""
         return 5
 
@@ -161,7 +170,7 @@ class Dopri8(ExplicitRungeKutta):
     tableau: ClassVar = diffrax.Dopri8.tableau
     interpolation_cls: ClassVar[Callable] = diffrax.Dopri8.interpolation_cls
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm):
         """8."""
         return 8
 
