@@ -162,39 +162,34 @@ def without_chains(closed: ClosedJaxpr) -> ClosedJaxpr:
     return _rewritten(closed, _chains_as_loops)
 
 
-def _chains_as_loops(jaxpr: Jaxpr):
+def _chains_as_loops(jaxpr: Jaxpr) -> Jaxpr:
     uses = Counter(x for e in jaxpr.eqns for x in variables(e))
     uses.update(x for x in jaxpr.outvars if not isinstance(x, Literal))
-    # The equations of each chain so far, by the variable that it ends with.
-    chains = {}
+    kept, chain = [], []
     for equation in jaxpr.eqns:
-        if not bodies(equation) or equation.effects or len(variables(equation)) != 1 or len(equation.outvars) != 1:
-            continue
-        (operand,), (result,) = variables(equation), equation.outvars
-        if operand.aval != result.aval:
-            continue
-        before = chains.get(operand, [])
-        if not (before and uses[operand] == 1 and _alike(before[-1], equation)):
-            before = []
-        chains.pop(operand, None)
-        chains[result] = [*before, equation]
-    loops = {id(chain[-1]): chain for chain in chains.values() if len(chain) >= LONG_CHAIN}
-    absorbed = {id(e) for chain in loops.values() for e in chain[:-1]}
-    kept = [e if id(e) not in loops else _loop(jaxpr, loops[id(e)]) for e in jaxpr.eqns if id(e) not in absorbed]
-    return jaxpr.replace(eqns=kept)
+        if chain and not (_is_again(chain[-1], equation) and uses[chain[-1].outvars[0]] == 1):
+            kept, chain = [*kept, *_as_loop(jaxpr, chain)], []
+        chain.append(equation)
+    return jaxpr.replace(eqns=[*kept, *_as_loop(jaxpr, chain)])
 
 
-def _alike(one, other):
-    return one.primitive is other.primitive and list(map(str, bodies(one))) == list(map(str, bodies(other)))
+def _is_again(call: JaxprEqn, equation: JaxprEqn) -> bool:
+    """Whether an equation is the same call of its own result."""
+    if len(call.outvars) != 1 or variables(equation) != call.outvars or equation.primitive is not call.primitive:
+        return False
+    alike = [x.aval for x in equation.outvars] == [x.aval for x in call.outvars] == [x.aval for x in variables(call)]
+    return alike and not equation.effects and list(map(str, bodies(equation))) == list(map(str, bodies(call)))
 
 
-def _loop(jaxpr: Jaxpr, chain: Sequence[JaxprEqn]):
-    (x,), last = variables(chain[0]), chain[-1]
+def _as_loop(jaxpr: Jaxpr, chain: Sequence[JaxprEqn]) -> list[JaxprEqn]:
+    if len(chain) < LONG_CHAIN or not bodies(chain[0]):
+        return list(chain)
+    (x,) = variables(chain[0])
     looped = jax.jit(
         lambda value: lax.fori_loop(0, len(chain), lambda _, value: evaluate(jaxpr, chain[0], {x: value})[0], value)
     )
     (call,) = jax.make_jaxpr(looped)(x.aval).eqns
-    return call.replace(invars=[x], outvars=last.outvars)
+    return [call.replace(invars=[x], outvars=chain[-1].outvars)]
 
 
 def equations(jaxpr: Jaxpr) -> Iterator:

@@ -136,7 +136,7 @@ def _constraint_force(model: Model, s: State, multipliers: Array):
 
 
 @compiled
-def _constraint_residual(model: Model, s: State, level: int):
+def _constraint_residual(model: Model, s: State, level: str):
     if level == "velocity":
         return model.split(constraints.velocity_residual(model, s.t, *model.vectors(s.q, s.v)))
     return {name: constraint.residual(*s) for name, constraint in model.system.constraints.items()}

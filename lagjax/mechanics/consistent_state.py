@@ -200,10 +200,10 @@ def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free
         force = metric @ (y - target) + multipliers @ rows_at(problem, y)
         return jnp.concatenate([force, residual(problem, y)])
 
-    def follow(state: PyTree, share: Array):
+    def follow(state: Array, share: Array):
         target = reached + share * (start - reached)
 
-        def step(state: PyTree, left: Array, i):
+        def step(state: Array, left: Array, i: Array):
             y, multipliers = state[:n], state[n:]
             independent = usable_rows(rows_at(fixed, y))
             left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))

@@ -183,7 +183,7 @@ class Banded(NamedTuple):
         operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
         schur, invert = _schur(plan, operators, x.dtype)
 
-        def of_residuals(which: str, r: Array):
+        def of_residuals(which: np.ndarray, r: Array):
             r = jnp.where(kept, jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r), 0.0)
             multipliers = lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)
             return operators.mass_inverse(pull(multipliers))

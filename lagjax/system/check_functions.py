@@ -115,7 +115,7 @@ def _is_complex(dtype: DTypeLike):
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 
-def _check_force(call: Call, force: Callable, q: PyTree):
+def _check_force(call: Call, force: PyTree, q: PyTree):
     expected = jax.tree.map(jnp.shape, q)
     if force is None:
         raise ValueError(

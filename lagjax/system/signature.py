@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.compiled import compiled
@@ -90,7 +89,7 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 
 @partial(compiled, in_numpy=True)
-def _signature(system, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree):
+def _signature(system, t: Array, q: PyTree, v: PyTree, params: PyTree):
     s, found = State(t, q, v, params), {}
 
     def flat(*trees) -> Array:

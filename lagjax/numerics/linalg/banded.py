@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.numerics.linalg import dense
 
@@ -61,7 +61,7 @@ def order(pattern: Bool[np.ndarray, "m m"]) -> Order:
     return Order(rows, int(np.max(np.abs(place[i] - place[j]), initial=0)))
 
 
-def _outwards(start: PyTree, neighbours, degree):
+def _outwards(start: int, neighbours, degree):
     """All rows connected to `start`, by distance; rows with few neighbours first."""
     found, seen = [start], {start}
     for row in found:

@@ -231,7 +231,7 @@ class Saddle:
 
         return stack(x[: self.n]), stack([-y for y in x[self.n :]])
 
-    def _substituted(self, known: Array):
+    def _substituted(self, known: list[Array]):
         y = list(known)
         for i, row in enumerate(self.lower):
             for j, factor in enumerate(row):

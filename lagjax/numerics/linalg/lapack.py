@@ -5,7 +5,7 @@ of ours is a loop over the matrices of a batch. Here the loop is around all of a
 platform.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 
 import jax
@@ -20,7 +20,7 @@ def one_by_one(function: Callable) -> Callable:
     looped = custom_vmap(function)
 
     @looped.def_vmap
-    def _(size: Array, batched, *args):
+    def _(size: int, batched: Sequence[bool], *args):
         def at(i: Array):
             one_matrix = jax.tree.map(lambda x, is_batched: x[i] if is_batched else x, args, tuple(batched))
             return looped(*one_matrix)
