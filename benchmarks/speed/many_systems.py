@@ -6,7 +6,7 @@ literals, so that no program can be reused. It computes accelerations, a short m
 and drops it.
 
     largest, last half / early      for memory maps and resident memory: the largest count in the last half, over the
-                                    largest between system 200, when the first programs are dropped, and the end of
+                                    largest between system 200, after JAX's caches were first cleared, and the end of
                                     the first quarter (or system 300, if that is later)
     lost                            systems with wrong results, judged by the Jacobi integral along the motion
 

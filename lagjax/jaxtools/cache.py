@@ -54,7 +54,7 @@ class Recent(OrderedDict):
 
 PROGRAMS, FACTS = Recent(64), Recent(1024)
 # So many programs are dropped before JAX's caches are cleared.
-CLEAR_AFTER = 512
+CLEAR_AFTER = 256
 
 
 def program_of(key: Hashable, make: Callable[[], T]) -> T:
