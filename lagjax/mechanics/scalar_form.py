@@ -66,7 +66,7 @@ class Numbers:
     user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
     """
 
-    def __init__(self, function, model: Model, most=math.inf):
+    def __init__(self, function: Callable, model: Model, most=math.inf):
         arrays, static = eqx.partition((model, *model.form.example), varies)
         self.shapes = []
 

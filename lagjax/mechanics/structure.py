@@ -114,7 +114,7 @@ class Invariance(NamedTuple):
 def invariance(model: Model) -> Invariance:
     """What is known to change nothing; of a large system less is known."""
 
-    def values(model, t, q, v):
+    def values(model: Model, t: Array, q: PyTree, v: PyTree):
         at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
         momentum = jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
         return [f(t, q, v, model.params) for f in functions_of(model)], momentum
@@ -286,8 +286,9 @@ def _contains(function: Callable, name: str, model: Model, argument=1) -> bool:
     sizes, known = [int(np.prod(shape)) for shape in model.form.shapes], model.names
     leaf = int(np.searchsorted(np.cumsum(sizes), known.index(name), side="right"))
     if sizes[leaf] == 1:
-        at = lambda args: jtu.tree_leaves(args[argument])[leaf : leaf + 1]
-        return _dependence(function, model, at) != Depends.NOT
+        return (
+            _dependence(function, model, lambda args: jtu.tree_leaves(args[argument])[leaf : leaf + 1]) != Depends.NOT
+        )
     alone = in_numbers(unchecked(System(function), model.params, model.form._replace(residuals=())))
     try:
         # The function may be a force: all its entries count.

@@ -61,7 +61,7 @@ class Form(NamedTuple):
         q = jtu.tree_unflatten(self.structure, leaves[1:])
         return leaves[0], q, q
 
-    def tree(self, x):
+    def tree(self, x: Array):
         """A vector (..., n) in the structure of q."""
         if len(self.shapes) == 1:
             return jtu.tree_unflatten(self.structure, [x.reshape(x.shape[:-1] + self.shapes[0])])
