@@ -15,7 +15,7 @@ periodic (made of sines and cosines), or anything else; the kind of a primitive'
 operands.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
 from typing import NamedTuple
 

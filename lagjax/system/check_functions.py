@@ -4,7 +4,7 @@ Each is checked, and becomes its jaxpr (`traced_functions.py`). `user_errors.py`
 them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
