@@ -381,7 +381,9 @@ class EnergyLedger(eqx.Module):
         return plot.stacked(self.t, stacked, self.jacobi_integral - self.jacobi_integral[0], "change of h")
 
     def __repr__(self):
-        change = lambda x: [x[-1] - x[0]]
+        def change(x: np.ndarray):
+            return [x[-1] - x[0]]
+
         rows = [("Jacobi integral h", change(self.jacobi_integral))]
         if self.kinetic is not None and self.potential is not None:
             rows += [("  kinetic", change(self.kinetic)), ("  potential", change(self.potential))]
@@ -397,7 +399,10 @@ class EnergyLedger(eqx.Module):
         cells = [[self._number(x) for x in numbers] for _, numbers in rows]
         widths = [max(len(row[i]) for row in [heads, *cells] if i < len(row)) for i in range(len(heads))]
         width = max(len(name) for name, _ in rows)
-        line = lambda name, cells: "  ".join([f"  {name:<{width}}", *(f"{x:>{w}}" for x, w in zip(cells, widths))])
+
+        def line(name: str, cells: list[str]) -> str:
+            return "  ".join([f"  {name:<{width}}", *(f"{x:>{w}}" for x, w in zip(cells, widths))])
+
         closure = f"{self.relative_closure:.0e} of the largest energy at the outputs, {self.scale:.6g}"
         verdict = "" if self.closes else f"; DOES NOT CLOSE: above {self.allowed:.0e}"
         return "\n".join([

@@ -169,7 +169,10 @@ def _cut_at_half_turns(q, v):
     edge = 2 * np.pi * np.maximum(turn[i], turn[i + 1]) - np.pi
     at_edge = v[i] + (edge - q[i]) / (q[i + 1] - q[i]) * (v[i + 1] - v[i])
     side, gap = np.pi * np.sign(turn[i + 1] - turn[i]), np.full(len(i), np.nan)
-    insert = lambda x, *pieces: np.insert(x, np.repeat(i + 1, 3), np.stack(pieces, axis=1).reshape(-1))
+
+    def insert(x: np.ndarray, *pieces):
+        return np.insert(x, np.repeat(i + 1, 3), np.stack(pieces, axis=1).reshape(-1))
+
     return insert(q - 2 * np.pi * turn, side, gap, -side), insert(v, at_edge, gap, at_edge)
 
 

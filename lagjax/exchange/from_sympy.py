@@ -23,6 +23,7 @@ import keyword
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import reduce
 from importlib import import_module
 from itertools import count
 from typing import Any, cast
@@ -48,6 +49,16 @@ FUNCTIONS = {
 }  # fmt: skip
 # Functions without a value or a slope at some numbers, but with both at one half.
 DELICATE = ("log", "asin", "acos", "atanh", "log2", "log10", "log1p", "gamma", "loggamma", "digamma")
+# SymPy's nodes as text in JAX, and those that are functions of two arguments, applied one after the other. The only
+# undefined function left is `harmless`.
+TEMPLATES = {
+    "Not": "jnp.logical_not({})", "BooleanTrue": "True", "BooleanFalse": "False", "Infinity": "jnp.inf",
+    "NegativeInfinity": "(-jnp.inf)", "AppliedUndef": "jnp.where({1}, {0}, 0.5)", "frac": "jnp.mod({}, 1)",
+}  # fmt: skip
+PAIRWISE = {
+    "Max": "jnp.maximum({}, {})", "Min": "jnp.minimum({}, {})", "And": "jnp.logical_and({}, {})",
+    "Or": "jnp.logical_or({}, {})",
+}  # fmt: skip
 # Larger integers are written as floats, since JAX's integers may have 32 bits.
 WHOLE = 2**31 - 1
 RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
@@ -220,31 +231,18 @@ def _printer():
         def _print_Relational(self, expr):
             return f"({self._print(expr.lhs)} {expr.rel_op} {self._print(expr.rhs)})"
 
-        def _nested(self, function, args):
-            first, *others = map(self._print, args)
-            for other in others:
-                first = f"{function}({first}, {other})"
-            return first
-
         _print_Exp1 = _print_Pi = _print_NumberSymbol = _print_Float
         _print_EulerGamma = _print_GoldenRatio = _print_Catalan = _print_Float
-        _print_Max = lambda self, expr: self._nested("jnp.maximum", expr.args)
-        _print_Min = lambda self, expr: self._nested("jnp.minimum", expr.args)
-        _print_And = lambda self, expr: self._nested("jnp.logical_and", expr.args)
-        _print_Or = lambda self, expr: self._nested("jnp.logical_or", expr.args)
-        _print_Not = lambda self, expr: f"jnp.logical_not({self._print(expr.args[0])})"
-        _print_BooleanTrue = lambda self, expr: "True"
-        _print_BooleanFalse = lambda self, expr: "False"
-        _print_Infinity = lambda self, expr: "jnp.inf"
-        _print_NegativeInfinity = lambda self, expr: "(-jnp.inf)"
-        _print_sinc = lambda self, expr: f"jnp.sinc({self._print(expr.args[0] / sympy.pi)})"
 
-        # The only undefined function left is `harmless`.
-        _print_AppliedUndef = lambda self, expr: "jnp.where({1}, {0}, 0.5)".format(*map(self._print, expr.args))
-        _print_frac = lambda self, expr: f"jnp.mod({self._print(expr.args[0])}, 1)"
+        def _print_sinc(self, expr):
+            return f"jnp.sinc({self._print(expr.args[0] / sympy.pi)})"
 
     for name in FUNCTIONS:
         setattr(Printer, f"_print_{name}", Printer._of_function)
+    for name, template in TEMPLATES.items():
+        setattr(Printer, f"_print_{name}", lambda self, e, text=template: text.format(*map(self._print, e.args)))
+    for name, of_two in PAIRWISE.items():
+        setattr(Printer, f"_print_{name}", lambda self, e, text=of_two: reduce(text.format, map(self._print, e.args)))
     return Printer()
 
 
@@ -412,7 +410,10 @@ class _Names:
         given, role = [*given] if several else given, f"constraint '{name}'"
         equations = [self.expression(x, role) for x in (given if several else [given])]
         found = equations if several else equations[0]
-        has = lambda parts: any(x.has(*parts) for x in equations)
+
+        def has(parts: list) -> bool:
+            return any(x.has(*parts) for x in equations)
+
         if self.coordinates and has([x.diff(self.time) for x in self.coordinates]):
             return Nonholonomic(self.function(role, found))
         if not has(self.coordinates):

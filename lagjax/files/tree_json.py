@@ -87,7 +87,10 @@ class Writer:
         """A value in a form for JSON; `path` is how the user would write it."""
         if depth > DEEPEST:
             raise NotWritable(f"{path[:80]}... is nested deeper than {DEEPEST} levels.\nFix: a flatter structure.")
-        inside = lambda x, name: self.down(x, name, depth + 1)
+
+        def inside(x: Any, name: str):
+            return self.down(x, name, depth + 1)
+
         if isinstance(value, str) and not is_plain(value):
             raise NotWritable(f"{printable(path)} is text with control characters.\nFix: leave them out.")
         if value is None or isinstance(value, (bool, str)) or type(value) is int:
@@ -195,7 +198,10 @@ class Reader:
             raise ValueError(f"a node of kind '{kind}' has entries that are not known.")
         if depth > DEEPEST:
             raise ValueError(f"it is nested deeper than {DEEPEST} levels.")
-        inside = lambda x: self.up(x, depth + 1)
+
+        def inside(x: Any):
+            return self.up(x, depth + 1)
+
         if kind == "float":
             text = node["float"]
             return float.fromhex(text) if "x" in text else float(text)

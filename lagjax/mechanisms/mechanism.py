@@ -16,13 +16,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from lagjax.system.system import System
 
 
 def rod_kinetic_energy(mass, start, end):
     """T of a uniform rod from the velocities of its ends, (..., dimension) -> (...)."""
-    squares = lambda x, y: jnp.sum(x * y, axis=-1)
+
+    def squares(x: Array, y: Array):
+        return jnp.sum(x * y, axis=-1)
+
     return mass * (squares(start, start) + squares(start, end) + squares(end, end)) / 6
 
 

@@ -222,8 +222,9 @@ def _two_balls_run():
 
 def charges_along(name, trajectory):
     """`charges` at every output of a trajectory."""
-    at = lambda q, v, params: charges(name, q, v, params)
-    return jax.jit(jax.vmap(at, in_axes=(0, 0, None)))(trajectory.q, trajectory.v, trajectory.params)
+    return jax.jit(jax.vmap(lambda q, v, params: charges(name, q, v, params), in_axes=(0, 0, None)))(
+        trajectory.q, trajectory.v, trajectory.params
+    )
 
 
 def cases():
@@ -278,7 +279,10 @@ def _surface_case():
 def _finite_cylinder_cases():
     params = PARAMS["finite cylinder"]
     a, b = params["a"], params["b"]
-    fine = lambda q, params: potentials.finite_cylinder(q, params, 400, 1e-11)
+
+    def fine(q: dict, params: dict):
+        return potentials.finite_cylinder(q, params, 400, 1e-11)
+
     points = jax.tree.map(lambda *x: np.array(x), vector(a, 0.0, b), vector(a, 0.0, 0.0), vector(a * 1.001, 0.0, b))
     got, exact = (
         jax.jit(jax.vmap(lambda q: potentials.gradient(f, q, params)))(points)

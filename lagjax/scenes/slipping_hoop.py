@@ -90,9 +90,15 @@ def exact(params) -> Friction:
     at_slip = _root(
         lambda x: beta * np.cos(x) - mu * ((3 + beta) * np.sin(x) - 2), np.arcsin(2 / (3 + beta)), np.pi / 2
     )
-    particular = lambda x: ((4 * mu**2 - 2) * np.sin(x) - 6 * mu * np.cos(x)) / (1 + 4 * mu**2)
+
+    def particular(x: np.ndarray):
+        return ((4 * mu**2 - 2) * np.sin(x) - 6 * mu * np.cos(x)) / (1 + 4 * mu**2)
+
     off = 2 * (1 - np.sin(at_slip)) / (1 + beta) - particular(at_slip)
-    u = lambda x: off * np.exp(-2 * mu * (x - at_slip)) + particular(x)
+
+    def u(x: np.ndarray):
+        return off * np.exp(-2 * mu * (x - at_slip)) + particular(x)
+
     leaves = _root(lambda x: u(x) - np.sin(x), 0.4, at_slip)
     speed = np.sqrt(l * g * u(leaves))
     # dφ̇/dθ = (μ λ / (β m a)) / θ̇, with λ = m g (sin θ - u) and θ̇ = -√(g u / l).

@@ -31,6 +31,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from lagjax.display import plots
 from lagjax.integrate.integrate import integrate
@@ -256,18 +257,20 @@ def _over_the_poles():
 @compiled
 def arrivals(q0, v0, arc):
     """The end points (N, 3) of a batch of starts in r after their arc lengths."""
-    ends = lambda q, v, s: integrate(
-        embedded, q, v, PARAMS, ts=jnp.stack([0 * s, s]), rtol=1e-10, atol=1e-10, throw=False
-    ).q[-1]
+
+    def ends(q: Array, v: Array, s: Array):
+        return integrate(embedded, q, v, PARAMS, ts=jnp.stack([0 * s, s]), rtol=1e-10, atol=1e-10, throw=False).q[-1]
+
     return jax.vmap(ends)(q0, v0, arc)
 
 
 @compiled
 def colatitudes(psi, slope, theta1, theta2, atol):
     """ψ(θ₂) for a batch of starts (ψ, ψ') at θ₁, over the azimuth."""
-    ends = lambda q, v, a, b, atol: integrate(
-        over_azimuth, q, v, PARAMS, ts=jnp.stack([a, b]), rtol=1e-10, atol=atol, throw=False
-    ).q[-1]
+
+    def ends(q: dict, v: dict, a: Array, b: Array, atol: Array):
+        return integrate(over_azimuth, q, v, PARAMS, ts=jnp.stack([a, b]), rtol=1e-10, atol=atol, throw=False).q[-1]
+
     return jax.vmap(ends)(psi, slope, theta1, theta2, atol)
 
 

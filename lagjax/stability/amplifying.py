@@ -1,7 +1,8 @@
 """Motions that amplify errors more than any method causes: close encounters, tumbling and chaos.
 
 The end of a chaotic motion depends on the last digit of a number, so the only correct answer is a warning. The
-reference end states were extrapolated in long double, from equations derived by hand (`benchmarks/accuracy/amplifying.py`).
+reference end states were extrapolated in long double, from equations derived by hand
+(`benchmarks/accuracy/amplifying.py`).
 """
 
 from functools import partial

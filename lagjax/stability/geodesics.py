@@ -23,8 +23,7 @@ def _circle(q0, v0, params, ts):
 
 def _circle_from_angles(q0, v0, params, ts):
     """The exact path in space, from angles and their rates."""
-    at = lambda q: sphere_geodesic.cartesian(params, q["psi"], q["theta"])
-    r, rate = jax.jvp(at, (q0,), (v0,))
+    r, rate = jax.jvp(lambda q: sphere_geodesic.cartesian(params, q["psi"], q["theta"]), (q0,), (v0,))
     speed = jnp.sqrt(jnp.sum(rate**2))
     path, direction = sphere_geodesic.exact_embedded(r, rate / speed, speed * ts)
     return path

@@ -38,10 +38,13 @@ def long():
     turn = float(bead_on_hoop.rotation_period(UNIT, rate**2 - 2.0))
     # Steps at equal angles: their errors due to a weak periodic force cancel over a turn.
     fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(turn / per_turn), "max_steps": None}
-    turns = lambda n, **what: Trial(
-        "long", f"{n:.0e} turns, {per_turn} fixed steps each", rotor, 0.0, rate, {}, np.array([0.0, n * turn]),
-        _whole_turns, method=diffrax.Tsit5(), tolerance=1e-9, options=fixed, observed=_direction, periods=n, **what,
-    )  # fmt: skip
+
+    def turns(n: float, **what):
+        return Trial(
+            "long", f"{n:.0e} turns, {per_turn} fixed steps each", rotor, 0.0, rate, {}, np.array([0.0, n * turn]),
+            _whole_turns, method=diffrax.Tsit5(), tolerance=1e-9, options=fixed, observed=_direction, periods=n, **what,
+        )  # fmt: skip
+
     return [
         *by_both(
             [

@@ -3,6 +3,7 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanisms import car_axis, governor
 from lagjax.numerics.methods.radau import Radau5
@@ -52,7 +53,9 @@ def _spring(k, method, derived=False, **what):
 
 
 def _mechanism(mechanism):
-    vectors = lambda q, v: (coordinates.flatten(q)[0], coordinates.flatten(v)[0])
+    def vectors(q: PyTree, v: PyTree):
+        return (coordinates.flatten(q)[0], coordinates.flatten(v)[0])
+
     return Trial(
         "stiff mechanism", mechanism.name.replace("_", " "), mechanism.system, mechanism.q0, mechanism.v0,
         dict(mechanism.params), np.array([0.0, mechanism.end]), lambda *_: vectors(*mechanism.reference),
@@ -80,7 +83,10 @@ def _braking(q0, v0, params, ts):
 
 def _fixed_steps():
     """Fixed steps below and above the largest stable one, 3.70/ω on an oscillator and 5.17/c on a brake (Dopri8)."""
-    constant = lambda h: {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(h)}
+
+    def constant(h: float):
+        return {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(h)}
+
     rows = []
     for step, expected in ((0.25, ACCURATE), (3.9, DEGRADED), (8.0, REFUSED)):
         h = step / oscillator.OMEGA

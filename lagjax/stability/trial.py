@@ -193,8 +193,9 @@ class Trial:
         start = coordinates.state(self.ts[0], self.q0, self.v0, self.params)
         point, dtype = [start.q, start.v, start.params], start.t.dtype
         tangents = jax.tree.map(lambda x, dx: dx.astype(x.dtype), point, tangents)
-        as_array = lambda x: np.asarray(x, dtype) if isinstance(x, (float, np.ndarray)) else x
-        options = jax.tree.map(as_array, self._options())
+        options = jax.tree.map(
+            lambda x: np.asarray(x, dtype) if isinstance(x, (float, np.ndarray)) else x, self._options()
+        )
         got = _in_lanes(self.system, point, tangents, np.asarray(self.ts, dtype), options, self.observed)
         return relative_error(got[0], wanted[0]), relative_error(*map(_gathered, (got[1], wanted[1])))
 
@@ -258,7 +259,9 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
 
 
 def _cells(outcome):
-    number = lambda x: "-" if x is None or not np.isfinite(x) else f"{x:.1e}"
+    def number(x: float | None) -> str:
+        return "-" if x is None or not np.isfinite(x) else f"{x:.1e}"
+
     verdict = outcome.verdict if outcome.passed else f"{outcome.verdict} (!)"
     return (
         f"{outcome.family}: {outcome.name}",

@@ -79,6 +79,10 @@ class Tracer(abc.ABC):
     dtype: np.dtype
     unit: float
 
+    def cast(self, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Vectors in the dtype of the equations."""
+        return tuple(np.asarray(x, self.dtype) for x in vectors)
+
     def __init__(self, low: float, high: float):
         self.low, self.high = low, high
         # The ratio of Newton's second step to its first in the last correction.

@@ -140,7 +140,10 @@ def _directions(tracer, big):
     z, psi = big[: n + 1], big[n + 1 : 2 * n + 1]
     jacobian = tracer.at(z)[1]
     basis = np.linalg.svd(jacobian)[2][-2:]
-    form = lambda i, j: float(psi @ np.asarray(_curvature(tracer, z, basis[i], basis[j])))
+
+    def form(i: int, j: int) -> float:
+        return float(psi @ np.asarray(_curvature(tracer, z, basis[i], basis[j])))
+
     a, b, c = form(0, 0), form(0, 1), form(1, 1)
     disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
     if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
@@ -156,8 +159,7 @@ def _directions(tracer, big):
 
 
 def _curvature(tracer, z, a, b):
-    cast = lambda x: np.asarray(x, tracer.dtype)
-    return curvature(tracer.frame, cast(z), cast(a), cast(b))
+    return curvature(tracer.frame, *tracer.cast(z, a, b))
 
 
 def _fold(tracer, a, b):
@@ -229,15 +231,17 @@ def _divergence(tracer, a, b, few, many):
     k-th root of round-off.
     """
     fastest = tracer.fastest
-    count_zeros = lambda point: int(np.sum(np.abs(point.outputs[-1]) < 1e-5 * fastest))
+
+    def count_zeros(point: BranchPoint) -> int:
+        return int(np.sum(np.abs(point.outputs[-1]) < 1e-5 * fastest))
+
     zeros = min(count_zeros(a), count_zeros(b))
 
     def product(roots):
         known = roots[np.isfinite(roots)]
         return float(np.poly(known / fastest)[known.size - zeros].real)
 
-    leading = lambda point: product(point.outputs[-1])
-    best, off = tracer.zero_between(a, b, leading) or (many, np.inf)
+    best, off = tracer.zero_between(a, b, lambda point: product(point.outputs[-1])) or (many, np.inf)
     if off > tracer.eps**0.6 * tracer.size(best.z):
         return CriticalPoint("divergence", many.z, [], 0.0, None, float(np.max(np.abs(few.z - many.z))), [])
     derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).outputs[-1]))
@@ -272,9 +276,9 @@ def _slopes(tracer, point, value):
 
         return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
 
-    is_parameter = lambda i, entry: (
-        number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
-    )
+    def is_parameter(i: int, entry: int) -> bool:
+        return number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
+
     slopes = [np.reshape([0.0 if is_parameter(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
              for i, x in enumerate(leaves)]  # fmt: skip
     return structure.unflatten(slopes)
@@ -315,10 +319,9 @@ def _flutter(tracer, few, many, root):
 
 def _newton(tracer, kind, big, guide):
     """Solve the extended system by Newton's method with steps of least norm; also returns the parameter's last step."""
-    cast = lambda x: np.asarray(x, tracer.dtype)
 
     def step(big):
-        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, cast(big), cast(guide)))
+        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, *tracer.cast(big, guide)))
         finite = np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))
         return _least_squares(jacobian, value) if finite else None
 
@@ -341,9 +344,8 @@ def _least_squares(matrix, known):
 
 def _derivative(tracer, kind, big, guide):
     """The derivatives of the critical parameter by every number in `params`, a tree like `params`."""
-    cast = lambda x: np.asarray(x, tracer.dtype)
-    _, jacobian = extended_at(kind, tracer.frame, cast(big), cast(guide))
-    by_params = extended_by_params(kind, tracer.frame, cast(big), cast(guide))
+    _, jacobian = extended_at(kind, tracer.frame, *tracer.cast(big, guide))
+    by_params = extended_by_params(kind, tracer.frame, *tracer.cast(big, guide))
     n, unit = tracer.frame.columns.size, tracer.unit
     leaves, structure = jax.tree.flatten(by_params)
     if not leaves:

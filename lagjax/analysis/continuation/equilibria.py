@@ -22,6 +22,7 @@ from lagjax.analysis.continuation.equilibrium_equations import (
 )
 from lagjax.analysis.continuation.result import Branch, Branches, Critical
 from lagjax.analysis.equilibria.balance import VELOCITY, Steady
+from lagjax.analysis.equilibria.degenerate import unknowns
 from lagjax.analysis.equilibria.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
 from lagjax.analysis.equilibria.result import OK, WORDS
 from lagjax.jaxtools.compiled import compiled
@@ -147,14 +148,17 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
     """The unknowns of the equilibrium near `steady.x0`, or a message that says why there is none."""
     if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
         v = coordinates.like(v, np.asarray(_velocity(steady, steady.x0)))
-    one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
+
+    def one(tree: PyTree):
+        return jax.tree.map(lambda x: np.asarray(x)[None], tree)
+
     lasting = not steady.symmetries.count and is_autonomous(steady.model)
     q = steady.model.tree(np.asarray(steady.x0))
     row = jax.tree.map(lambda x: np.asarray(x)[0], searched(steady, one(q), one(v), lasting, 0, True))
     if row.status != OK:
         return WORDS[row.status]
-    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])
-    return np.concatenate([flat(row.q), row.rates, flat(row.multipliers)])
+
+    return unknowns(row)
 
 
 def _frame(steady: Steady, place: ParameterPlace, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
@@ -197,7 +201,10 @@ def _parts(steady, y, positions, units=None):
     jacobian = np.asarray(full_jacobian(steady, np.asarray(y, steady.t.dtype))[1], float)
     if units is None:
         n = steady.n
-        positive = lambda x: np.where(x > 0, x, 1.0)
+
+        def positive(x: np.ndarray):
+            return np.where(x > 0, x, 1.0)
+
         rows = np.max(np.abs(jacobian[:, :n] * positions), axis=1)
         rows = positive(np.where(rows > 0, rows, np.max(np.abs(jacobian), axis=1)))
         # A row that is small where the branch begins may be large elsewhere.
@@ -364,7 +371,9 @@ class _Run:
 
 
 def _cosine(tracer, a, b):
-    inner = lambda a, b: (tracer.weights * a) @ b
+    def inner(a: np.ndarray, b: np.ndarray) -> float:
+        return (tracer.weights * a) @ b
+
     return inner(a, b) / np.sqrt(inner(a, a) * inner(b, b))
 
 

@@ -143,8 +143,7 @@ def outputs_at(frame: Frame, z):
 @compiled
 def curvature(frame: Frame, z, a, b):
     """The second derivative `D²E[a, b]`."""
-    along = lambda direction: lambda z: jax.jvp(frame.residual, (z,), (direction,))[1]
-    return jax.jvp(along(a), (z,), (b,))[1]
+    return jax.jvp(lambda z: jax.jvp(frame.residual, (z,), (a,))[1], (z,), (b,))[1]
 
 
 def dynamic(frame: Frame, z):
@@ -153,7 +152,10 @@ def dynamic(frame: Frame, z):
     d = equations.departures(s, y, jax.jacfwd(lambda y: equations.balance(s, y))(y))
     m = d.rows.shape[0]
     kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
-    keep = lambda rows: jnp.where(kept[:, None], rows, 0.0)
+
+    def keep(rows: Array):
+        return jnp.where(kept[:, None], rows, 0.0)
+
     holonomic = s.model.holonomic[:, None]
     rows, slopes, none = keep(d.rows), keep(d.slopes), jnp.zeros((s.n, m), d.rows.dtype)
     corner = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(d.rows.dtype)
@@ -194,8 +196,13 @@ def extended(kind: str, frame: Frame, big, guide):
     rows = lax.stop_gradient(jnp.max(jnp.abs(stiffness) + jnp.abs(omega * damping) + omega**2 * jnp.abs(mass), axis=1))
     rows = jnp.where(rows > 0, rows, 1.0)
     real, imaginary = (stiffness - omega**2 * mass) / rows[:, None], omega * damping / rows[:, None]
-    times = lambda a, b: (real @ a - imaginary @ b, real @ b + imaginary @ a)
-    unit = lambda a, b, one: jnp.stack([guide[:size] @ a + guide[size:] @ b - one, guide[:size] @ b - guide[size:] @ a])
+
+    def times(a: Array, b: Array):
+        return (real @ a - imaginary @ b, real @ b + imaginary @ a)
+
+    def unit(a: Array, b: Array, one: Array):
+        return jnp.stack([guide[:size] @ a + guide[size:] @ b - one, guide[:size] @ b - guide[size:] @ a])
+
     parts = [value, *times(re, im), unit(re, im, 1.0)]
     if kind == COLLISION:
         # ω D'(iω), with D' = C + 2 i ω M.
@@ -208,7 +215,10 @@ def extended(kind: str, frame: Frame, big, guide):
 @compiled
 def extended_at(kind: str, frame: Frame, big, guide):
     """The extended system and its Jacobian."""
-    residual = lambda big: extended(kind, frame, big, guide)
+
+    def residual(big: Array):
+        return extended(kind, frame, big, guide)
+
     return residual(big), jax.jacfwd(residual)(big)
 
 

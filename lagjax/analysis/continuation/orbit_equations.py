@@ -151,7 +151,10 @@ def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
     else:
         passed = jax.vmap(part)(jnp.arange(count), times, nodes)
     closing, slopes = _closing(frame, nodes, passed)
-    others = lambda z: _others(frame, z, guide)
+
+    def others(z: Array):
+        return _others(frame, z, guide)
+
     value = jnp.concatenate([closing, others(z)])
     jacobian = jnp.concatenate([slopes, jax.jacfwd(others)(z)])
 
@@ -173,13 +176,21 @@ def _times(frame, period):
 def _changes(frame, flow, z, j, span) -> Changes:
     """How parameters and times change with the frame columns: with μ, with log T, and not at all with the state."""
     last = jnp.eye(z.size, dtype=z.dtype)[-1]
-    floats = lambda z: eqx.filter(frame.split(z)[0].model.params, eqx.is_inexact_array)
+
+    def floats(z: Array):
+        return eqx.filter(frame.split(z)[0].model.params, eqx.is_inexact_array)
+
     if frame.along.number is None:
         by_number = jax.tree.map(jnp.zeros_like, floats(z))
     else:
         by_number = jax.jvp(floats, (z,), (last,))[1]
-    rows = lambda x: jnp.concatenate([jnp.zeros((frame.scale.size + 1, *x.shape), x.dtype), x[None]])
-    by_log_period = lambda x: jnp.zeros(frame.scale.size + 2, z.dtype).at[-2].set(x)
+
+    def rows(x: Array):
+        return jnp.concatenate([jnp.zeros((frame.scale.size + 1, *x.shape), x.dtype), x[None]])
+
+    def by_log_period(x: Array):
+        return jnp.zeros(frame.scale.size + 2, z.dtype).at[-2].set(x)
+
     return Changes(jax.tree.map(rows, by_number), by_log_period(j * span), by_log_period(span))
 
 
@@ -237,7 +248,10 @@ def drive_off(frame: OrbitFrame, flow, period):
 def _changed(frame, flow, period):
     """The change of the accelerations after a period, at the sampled times."""
     drive = frame.drive
-    at = lambda t: flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
+
+    def at(t: Array):
+        return flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
+
     # Sampled at the same phases for every period.
     times = frame.t + period * jnp.asarray(SAMPLED_AT, period.dtype)
     return jax.vmap(at)(times + period) - jax.vmap(at)(times)
@@ -247,7 +261,10 @@ def drive_of(flow: Flow, t, z, period, scale) -> Drive:
     """The drive at the branch's start, at a state off the motion: on it a parametric drive may have no effect."""
     displaced = z + scale * jnp.cos(jnp.arange(1.0, z.size + 1.0, dtype=z.dtype))
     times = t + period * jnp.asarray(SAMPLED_AT, t.dtype)
-    at = lambda t: flow.rate(t, displaced)[flow.size :] / scale[flow.size :]
+
+    def at(t: Array):
+        return flow.rate(t, displaced)[flow.size :] / scale[flow.size :]
+
     slopes = jax.vmap(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1])(times + period)
     return Drive(displaced, slopes)
 
@@ -287,7 +304,10 @@ def sizes_at(flow: Flow, t, z, period, scale):
     rows = jnp.zeros(0, z.dtype)
     if flow.rows:
         rows = jnp.linalg.norm(flow.normals(t, z, scale), axis=1)
-    positive = lambda x: jnp.where(x > 0, x, 1.0)
+
+    def positive(x: Array):
+        return jnp.where(x > 0, x, 1.0)
+
     return integral_at(flow, t, z), positive(size), positive(rows), drive_of(flow, t, z, period, scale)
 
 

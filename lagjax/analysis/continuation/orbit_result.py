@@ -79,7 +79,10 @@ class OrbitBranch(eqx.Module):
     def __getitem__(self, i: int) -> PeriodicOrbit:
         if not -len(self) <= i < len(self):
             raise IndexError(f"there are {len(self)} cycles, branch[0] to branch[{len(self) - 1}].")
-        pick = lambda tree: jax.tree.map(lambda x: x[i], tree)
+
+        def pick(tree: PyTree):
+            return jax.tree.map(lambda x: x[i], tree)
+
         system, params = self.orbit.system, self.orbit.params
         if self.place.kind == NUMBER and self.place.number is not None:
             params = self.place.number.put(params, self.parameter[i])
@@ -147,7 +150,10 @@ class OrbitBranch(eqx.Module):
     def __repr__(self):
         count = len(self.critical)
         points = f"{count} critical point{'s' * (count != 1)}" if count else "no critical point"
-        number = lambda x: f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.10g}"
+
+        def number(x: float) -> str:
+            return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.10g}"
+
         lines = [
             f"Branch of cycles along {self.along}, from {self.first:.6g} to {self.last:.6g}: {len(self)} of them, "
             f"with {points}"

@@ -83,7 +83,10 @@ def dips(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint, c: BranchPoint) ->
 
 def _beyond_zero(tracer, a, b, c, of):
     """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
-    length = lambda p, q: float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
+
+    def length(p: BranchPoint, q: BranchPoint) -> float:
+        return float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
+
     whole = length(a, b) + length(b, c)
     x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
     sign, tried = np.sign(f[0]), set(x)
@@ -392,7 +395,10 @@ class _Follower:
 def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
     """The result in the user's structure."""
     outputs = [p.outputs for p in path.points]
-    trees = lambda rows: coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
+
+    def trees(rows: list[np.ndarray]):
+        return coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
+
     n = len(coordinates.names(orbit.q))
     known = [i for i, p in enumerate(path.points) if p.growing is not None]
     nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
@@ -403,14 +409,14 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
             p.outputs.multipliers,
         ) for i, p in enumerate(path.points) if p.critical is not None
     ]  # fmt: skip
-    cast = lambda x: np.asarray(x, tracer.dtype)
+
     return OrbitBranch(
-        cast([s.parameter for s in outputs]), cast([s.period for s in outputs]),
+        *tracer.cast([s.parameter for s in outputs], [s.period for s in outputs]),
         trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
         trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
         np.stack([s.multipliers for s in outputs]),
-        np.stack([cast(s.nodes) for s in outputs]), critical, _with_floats(orbit, problem), place, along, first, last,
-        path.status,
+        np.stack(tracer.cast(*(s.nodes for s in outputs))), critical, _with_floats(orbit, problem), place, along,
+        first, last, path.status,
     )  # fmt: skip
 
 

@@ -110,7 +110,10 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     # Without the roots of the zero modes, of unseen coordinates, and of other speeds along the symmetries.
     rest = rest[min(rest.size, (1 if rubs else 2) + 2 * (zeros - 1 + int(np.sum(unseen))) + k) :]
     margin = 1e-6 * np.max(np.abs(rest), initial=0.0)
-    decision = lambda verdict: Decision(verdict, y, radius, 1)
+
+    def decision(verdict: int) -> Decision:
+        return Decision(verdict, y, radius, 1)
+
     if np.any(rest.real > margin):
         return decision(UNSTABLE)
     loses = system.force is None and (conservative or _only_loses(steady, y, size))
@@ -192,7 +195,10 @@ def _of_rays(bordered, dtype) -> Decision:
     radius = (
         4 * (1e2 * float(np.finfo(dtype).eps)) ** (1 / max(known, default=2.0)) * float(np.max(bordered.columns[:n]))
     )
-    decision = lambda verdict: Decision(verdict, None, radius, z)
+
+    def decision(verdict: int) -> Decision:
+        return Decision(verdict, None, radius, z)
+
     if any(term is not None and term.sign < 0 and term.exponent > 1.5 for term in terms):
         # Gyroscopic forces may hold what the potential does not.
         turns = np.any(np.asarray(_velocity_terms(bordered.steady, bordered.y.astype(dtype), _at(bordered))[0]))
@@ -264,5 +270,4 @@ def _momenta(steady, x, rates):
 
 def unknowns(row) -> np.ndarray:
     """The unknowns y of a row of `Equilibria`: positions, rates, multipliers."""
-    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)] or [np.zeros(0)])
-    return np.concatenate([flat(row.q), np.ravel(row.rates), flat(row.multipliers)])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves((row.q, row.rates, row.multipliers))])

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria import degenerate
@@ -87,7 +87,11 @@ def stacked(starts, what="starts") -> PyTree:
 def stacked_one(q):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
-    return q, jax.tree.map(lambda x: numpy_of(x).zeros_like(x), q)
+    return q, _at_rest(q)
+
+
+def _at_rest(q: PyTree) -> PyTree:
+    return jax.tree.map(lambda x: numpy_of(x).zeros_like(x), q)
 
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> SteadySymmetries:
@@ -220,8 +224,7 @@ def equilibria(
     check_system(system, params, starts)
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
-    zeros = lambda x: numpy_of(x).zeros_like(x)
-    v = jax.tree.map(zeros, q) if velocities is None else _velocities(velocities, q, count)
+    v = _at_rest(q) if velocities is None else _velocities(velocities, q, count)
     first = jax.tree.map(lambda x: x[0], (q, v))
     try:
         system, s = checked(system, State(t, *first, params))
@@ -245,11 +248,17 @@ def equilibria(
     concrete = is_eager() and not is_traced((steady, q, v))
     expected = int(np.sum(np.delete(unseen, list(symmetries.places))))
     rows = searched(steady, q, v, lasting, expected, concrete)
-    as_table = lambda rows: Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
+
+    def as_table(rows: EquilibriumRow) -> Equilibria:
+        return Equilibria(t=s.t, params=s.params, symmetries=symmetries, starts=q, **rows._asdict())
+
     if not concrete:
         return as_table(rows)
     unseen[list(symmetries.places)] = False
-    search = lambda q, v: searched(steady, q, v, lasting, expected, True)
+
+    def search(q: PyTree, v: PyTree) -> EquilibriumRow:
+        return searched(steady, q, v, lasting, expected, True)
+
     rows, radii = _decided(steady, rows, q, lasting, unseen, search)
     return merged(as_table(rows), angles(model), radii)
 
@@ -263,12 +272,19 @@ def _decided(
     """
     radii = np.zeros(len(rows.found))
     soft = rows.soft > int(np.sum(unseen))
-    pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
-    size_of = lambda q, i: float(np.max(np.abs(_flat((q, pick(starts, i))))))
+
+    def pick(tree: PyTree, i: int):
+        return jax.tree.map(lambda x: x[i], tree)
+
+    def size_of(q: PyTree, i: int) -> float:
+        return float(np.max(np.abs(_flat((q, pick(starts, i))))))
+
+    def is_far(i: int) -> bool:
+        return np.max(np.abs(_flat(pick(rows.last, i)))) > 3 * np.max(np.abs(_flat(pick(starts, i))))
+
     if np.any(lost := soft & (rows.status == NO_BALANCE)) and lasting and not steady.symmetries.count:
         # A search that went far away fades there.
-        far = lambda i: np.max(np.abs(_flat(pick(rows.last, i)))) > 3 * np.max(np.abs(_flat(pick(starts, i))))
-        lost = [i for i in np.flatnonzero(lost) if not far(i)]
+        lost = [i for i in np.flatnonzero(lost) if not is_far(i)]
         rows = _from_valleys(steady, rows, np.array(lost, int), unseen, search, size_of)
     made = {}
     for i in np.flatnonzero(rows.found & (rows.soft > int(np.sum(unseen)))):
@@ -410,7 +426,10 @@ def _row(steady: Steady, y, root, y0, lasting, expected, concrete) -> Equilibriu
     undecided = settled & (zero_modes > expected)
     momenta = steady.momenta(x, u) if steady.symmetries.count else jnp.zeros(0, x.dtype)
     is_found = status == OK
-    fill = lambda tree: jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
+
+    def fill(tree: PyTree):
+        return jax.tree.map(lambda x: jnp.where(is_found, x, jnp.nan), tree)
+
     return EquilibriumRow(
         fill(steady.model.tree(x)), fill(steady.model.tree(u)), fill(by_name), fill(rates), fill(momenta),
         settled & ~undecided, undecided, fill(roots), is_found, zero_modes, soft, imbalance, status,
@@ -454,14 +473,15 @@ def _zero_modes(steady: Steady, root):
     matrix = root.jacobian[: n + steady.m]
     along = jnp.concatenate([steady.fields(root.y[:n]), jnp.zeros((k, steady.m), matrix.dtype)], axis=1)
     matrix = jnp.concatenate([jnp.concatenate([matrix[:, :n], matrix[:, n + k :]], axis=1), along])
-    positive = lambda x: jnp.where(x > 0, x, 1.0)
     # Rows are compared with those at the start of the search too: a single number has no other scale.
     of_rows = jnp.max(jnp.abs(matrix), axis=1).at[: n + steady.m].max(root.rows[: n + steady.m])
-    matrix = matrix / positive(of_rows)[:, None]
+    matrix = matrix / jnp.where(of_rows > 0, of_rows, 1.0)[:, None]
     columns = jnp.max(jnp.abs(matrix), axis=0)
     # A coordinate that is small now has small columns, so for almost zero modes all positions have one unit.
     units = jnp.where(np.arange(columns.size) < n, jnp.max(columns[:n], initial=0.0), columns)
-    sizes = lambda matrix: lapack.singular_values(matrix) if matrix.size else jnp.zeros(0, matrix.dtype)
+
+    def sizes(matrix: Array):
+        return lapack.singular_values(matrix) if matrix.size else jnp.zeros(0, matrix.dtype)
 
     def count(columns, below):
         scaled = matrix / jnp.where(columns > least, columns, 1.0)[None, :]

@@ -80,7 +80,10 @@ def bordered_at(steady, y, size, unseen, soft=None) -> Bordered:
     shifts[0], shifts[:, n:] = 0.0, 0.0
     _, jacobians = (np.asarray(x, float) for x in values_at(steady, (y + shifts).astype(dtype)))
     jacobian = jacobians[0]
-    positive = lambda x: np.where(x > 0, x, 1.0)
+
+    def positive(x: np.ndarray):
+        return np.where(x > 0, x, 1.0)
+
     usable = np.where(np.isfinite(jacobians), np.abs(jacobians), 0.0)
     rows = positive(np.max(np.median(usable, axis=0)[:, :n], axis=1) * unit)
     of_columns = np.max(np.abs(jacobian) / rows[:, None], axis=0)

@@ -146,9 +146,12 @@ def merged(rows: Equilibria, is_angle: PyTree[bool], radii: np.ndarray) -> Equil
         else:
             of_start[i] = len(kept)
             kept.append(i)
-    pick = lambda tree: jax.tree.map(lambda x: x[np.array(kept, int)], tree)
     row_fields = [name for name in EquilibriumRow._fields if name not in ("status", "last")]
-    return replace(rows, **{name: pick(getattr(rows, name)) for name in row_fields}, of_start=of_start)
+    return replace(
+        rows,
+        **{name: jax.tree.map(lambda x: x[np.array(kept, int)], getattr(rows, name)) for name in row_fields},
+        of_start=of_start,
+    )
 
 
 def _close(off, size, angle):
@@ -185,7 +188,10 @@ def _lines(found: Equilibria):
         if lost.size:
             yield f"  {lost.size} start{'s' * (lost.size > 1)} led to none: {WORDS[code]}"
             for i in lost[:3]:
-                at = lambda tree, i=i: describe(jax.tree.map(lambda x: x[i], tree))
+
+                def at(tree: PyTree, i: int = i):
+                    return describe(jax.tree.map(lambda x: x[i], tree))
+
                 yield f"    from {at(found.starts)} as far as {at(found.last)}"
             if lost.size > 3:
                 yield "    ..."
@@ -193,7 +199,10 @@ def _lines(found: Equilibria):
 
 def _row(found, i):
     """One row of the table, by the heads of its columns."""
-    pick = lambda tree: jax.tree.map(lambda x: x[i], tree)
+
+    def pick(tree: PyTree):
+        return jax.tree.map(lambda x: x[i], tree)
+
     q, v = pick(found.q), pick(found.v)
     x = np.asarray(coordinates.flatten(q)[0])
     row = {name: _number(x, np.abs(x).max()) for name, x in zip(coordinates.names(q), x)}

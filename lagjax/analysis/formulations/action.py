@@ -71,11 +71,17 @@ def action(
     if t0 is None or t1 is None:
         raise ValueError("a path that is a function needs its ends.\nFix: lj.action(system, path, params, 0.0, 1.0).")
     t0, t1 = (jnp.asarray(t, jnp.result_type(float)) for t in (t0, t1))
-    edges = lambda pieces: t0 + (t1 - t0) * jnp.arange(pieces + 1) / pieces
+
+    def edges(pieces: int):
+        return t0 + (t1 - t0) * jnp.arange(pieces + 1) / pieces
+
     q, v = _position_and_velocity(path, t0)
     s = coordinates.state(t0, q, v, params)
     system = traced_system(system, s)
-    at = lambda t: system.lagrangian(t, *_position_and_velocity(path, t), s.params)
+
+    def at(t: Array):
+        return system.lagrangian(t, *_position_and_velocity(path, t), s.params)
+
     whole, halves = (_integral(at, edges(n)[:-1], edges(n)[1:]) for n in (pieces, 2 * pieces))
     return (whole, jnp.abs(halves - whole)) if error else whole
 
@@ -114,7 +120,10 @@ def _action_of_trajectory(system, path, params, t0, t1, pieces):
     # NaN for a motion that failed, also where the nodes lie before that.
     complete = jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in jax.tree.leaves((q, v))])))
     values = jnp.where(complete, jnp.where(turned, -values, values), jnp.nan)
-    integral = lambda weights: jnp.sum(0.5 * jnp.diff(edges) * (values @ weights.astype(t.dtype)))
+
+    def integral(weights: Array):
+        return jnp.sum(0.5 * jnp.diff(edges) * (values @ weights.astype(t.dtype)))
+
     found = integral(quadrature.KRONROD)
     return found, jnp.abs(found - integral(quadrature.GAUSS))
 
@@ -148,7 +157,10 @@ def _lagrangians(system: System, params: PyTree, t: Array, q: PyTree, v: PyTree)
 def _position_and_velocity(path, t):
     """The position and velocity of a path at time t."""
     q, v = jax.jvp(lambda t: coordinates.as_floats(path(t)), (t,), (jnp.ones_like(t),))
-    as_array = lambda x: jnp.asarray(x, jnp.result_type(t))
+
+    def as_array(x: Array):
+        return jnp.asarray(x, jnp.result_type(t))
+
     return jax.tree.map(as_array, q), jax.tree.map(as_array, v)
 
 

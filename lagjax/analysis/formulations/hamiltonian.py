@@ -177,7 +177,10 @@ def hamiltonian(system: System) -> Hamiltonian:
 def _hamiltonian(system, t, q, p, params):
     model = model_of(system, t, q, q, params)
     x, momentum = model.vectors(q, p)
-    lagrangian_of = lambda x, u: model.lagrangian(t, x, u)
+
+    def lagrangian_of(x: Array, u: Array):
+        return model.lagrangian(t, x, u)
+
     found = velocity_of(lambda u: jax.grad(lagrangian_of, argnums=1)(x, u), momentum)
     value, slope = jax.value_and_grad(lagrangian_of)(x, found.v)
     # -∂H/∂q at constant p equals ∂L/∂q at constant v.

@@ -78,7 +78,10 @@ class Routhian(eqx.Module):
         q = _together(q, self.cyclic, zeros)
         model = model_of(self.system, t, q, q, params)
         remembered(model, (Routhian, self.cyclic), lambda: self._check(model))
-        of = lambda u: self.system.lagrangian(t, q, _together(v, self.cyclic, list(u)), params)
+
+        def of(u: Array):
+            return self.system.lagrangian(t, q, _together(v, self.cyclic, list(u)), params)
+
         p = jnp.stack([jnp.asarray(momenta[name], shaped.dtype) for name in self.cyclic])
         found = velocity_of(jax.grad(of), p)
         u = jnp.where(found.regular & found.reached, found.v, jnp.nan)

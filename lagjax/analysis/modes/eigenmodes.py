@@ -74,7 +74,10 @@ def symmetric_roots(stiffness, mass) -> Roots:
 def general_roots(matrix, inertia) -> Roots:
     """All λ of `A x = λ E x`, of a regular E."""
     values, vectors, left = lapack.eigen(matrix, inertia)
-    norm = lambda x, axis: jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
+
+    def norm(x: Array, axis: int):
+        return jnp.sqrt(jnp.sum(jnp.abs(x) ** 2, axis=axis))
+
     condition = norm(vectors, 0) * norm(left, 1)
     return _followed(values, vectors, left, matrix, inertia, jnp.max(jnp.abs(values), initial=0.0), condition)
 
@@ -254,7 +257,10 @@ def _gyroscopic(linear) -> Motions:
     values = lax.complex(real, values.imag)
     x = roots.vectors[:d]
     of_mass, of_stiffness = (jnp.real(jnp.sum(x.conj() * (m @ x), axis=0)) for m in (M, K))
-    size = lambda m: jnp.sum(jnp.abs(x) * (jnp.abs(m) @ jnp.abs(x)), axis=0)
+
+    def size(m: Array):
+        return jnp.sum(jnp.abs(x) * (jnp.abs(m) @ jnp.abs(x)), axis=0)
+
     energy = values.imag**2 * of_mass + of_stiffness
     noise = 1e-9 * (values.imag**2 * size(M) + size(K))
     swings = (values.imag != 0) & (values.real == 0) & ~zero & (jnp.abs(energy) > noise)
@@ -264,7 +270,10 @@ def _gyroscopic(linear) -> Motions:
     mirrored = jnp.where(zero, parity, (values.imag < 0) | ((values.imag == 0) & (values.real < 0)))
     growing = values.real > 0
     order = _order(values, mirrored)[:d]
-    pick = lambda y: y[order]
+
+    def pick(y: Array):
+        return y[order]
+
     return _with_shifts(
         linear, reduced, pick(values) * rate, (scale[:, None] * x)[:, order], pick(mirrored), pick(energies),
         pick(roots.double), pick(zero), pick(growing), pick(roots.defective),
@@ -298,7 +307,10 @@ def _general(linear) -> Motions:
     moving = p.velocities @ w + p.turning @ rho
     still = p.positions @ rho
     nonzero = jnp.where(zero, 1.0, values * rate)
-    size = lambda y: jnp.max(jnp.abs(y), axis=0, initial=0.0)
+
+    def size(y: Array):
+        return jnp.max(jnp.abs(y), axis=0, initial=0.0)
+
     # The shape of a zero mode is its velocities if it only changes speeds, and its positions if it is a shift.
     only_speed = size(roots.vectors[:count]) <= 1e-6 * size(roots.vectors)
     unseen = np.array(linear.kind.unseen, bool)[:, None]
@@ -338,7 +350,10 @@ def _units(mass):
 
 def _rate(position, velocity, drift=0.0):
     """The unit of inverse time in which no entry is larger than one."""
-    largest = lambda y: jnp.max(jnp.abs(lax.stop_gradient(y)), initial=0.0)
+
+    def largest(y: Array):
+        return jnp.max(jnp.abs(lax.stop_gradient(y)), initial=0.0)
+
     rate = jnp.maximum(jnp.sqrt(largest(position)), jnp.maximum(largest(velocity), largest(drift)))
     return jnp.where(rate > 0, rate, 1.0)
 
@@ -381,11 +396,17 @@ def _with_shifts(linear, reduced, values, x, mirrored, energies, double, zero, g
         rest = reduced.with_rate.astype(x.dtype) @ x + (reduced.follow.astype(x.dtype) @ x) / nonzero[None, :]
         full = full.at[names].set(jnp.where(zero[None, :], 0.0, rest))
     shapes = jnp.concatenate([jnp.eye(n, dtype=x.dtype)[names], full.T])
-    before = lambda fill, y: jnp.concatenate([jnp.full(c, fill, y.dtype), y])
+
+    def before(fill: Array, y: Array):
+        return jnp.concatenate([jnp.full(c, fill, y.dtype), y])
+
     code = _conservative_verdict(values, energies, zero, growing, defective)
     all_values, all_zero = before(0.0, values), before(True, zero)
     order = _order(all_values, before(False, mirrored))
-    pick = lambda y: y[order]
+
+    def pick(y: Array):
+        return y[order]
+
     return Motions(
         pick(all_values), _normalised(shapes[order]), pick(before(False, mirrored)), pick(before(0, energies)),
         pick(before(False, double)), pick(all_zero), pick(before(False, growing)), jnp.sum(zero), code,

@@ -49,12 +49,21 @@ def steadiness_of(kind: LinearisationKind, s: State, parts: LinearParts) -> Stea
     """Accelerations and constraint residuals, relative to those of small motions of the state's own size."""
     x, u = coordinates.flatten(s.q)[0], coordinates.flatten(s.v)[0]
     eps = jnp.finfo(x.dtype).eps
-    largest = lambda y: jnp.max(jnp.abs(y), initial=0.0)
+
+    def largest(y: Array):
+        return jnp.max(jnp.abs(y), initial=0.0)
+
     size = largest(jnp.where(np.array(kind.unseen), 0.0, x))
     size, speed = jnp.where(size > 0, size, 1.0), largest(u)
-    row_sum = lambda matrix: jnp.max(jnp.sum(jnp.abs(matrix), axis=1), initial=0.0)
+
+    def row_sum(matrix: Array):
+        return jnp.max(jnp.sum(jnp.abs(matrix), axis=1), initial=0.0)
+
     mass = jnp.where(parts.sound, parts.mass, jnp.eye(parts.mass.shape[0], dtype=x.dtype))
-    per_mass = lambda matrix: row_sum(lapack.solve(mass, jnp.nan_to_num(matrix)))
+
+    def per_mass(matrix: Array):
+        return row_sum(lapack.solve(mass, jnp.nan_to_num(matrix)))
+
     rate = per_mass(parts.velocity) + row_sum(parts.drift)
     typical = (per_mass(parts.position) + rate**2) * size + rate * speed
     left = jnp.maximum(jnp.abs(parts.a) - 1e4 * eps * (largest(parts.forces) + speed**2 / size), 0.0)
@@ -151,7 +160,10 @@ def _check_time(linearisation: "Linearisation", equations: list[str], linearised
 
 def _changed(parts, later):
     """The first matrix that changes, the entry, and its values before and after; None if none changes."""
-    largest = lambda x: float(np.max(np.abs(x), initial=0.0))
+
+    def largest(x: np.ndarray):
+        return float(np.max(np.abs(x), initial=0.0))
+
     mass, position = largest(parts.raw.mass), largest(parts.raw.position)
     scales = (mass, max(largest(parts.raw.velocity), np.sqrt(mass * position)), position, None, None)
     words = (
@@ -300,8 +312,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
         linearisation, steadiness = _linearised(kind, model, s)
     if not linearisation.sound:
         raise ValueError(explain_failure(model, s) or _singular(linearisation.parts, s))
-    later = lambda *state: linearised(kind, model, State(*state))
-    check_steady(linearisation, steadiness, model.equation_names, later)
+    check_steady(linearisation, steadiness, model.equation_names, lambda *state: linearised(kind, model, State(*state)))
     return linearisation
 
 
@@ -350,7 +361,10 @@ def _linearised(kind: LinearisationKind, model, s: State) -> tuple[Linearisation
     parts = parts_of(kind, model, s)
     # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.
     along = parts.position @ parts.transfer
-    half = lambda matrix, sign: (matrix + sign * matrix.T) / 2
+
+    def half(matrix: Array, sign: int):
+        return (matrix + sign * matrix.T) / 2
+
     shifts = jnp.eye(model.n, dtype=s.t.dtype)[:, np.array(kind.unseen, bool)]
     steadiness = steadiness_of(kind, s, parts)
     sound = parts.sound
@@ -370,6 +384,6 @@ def _linearised(kind: LinearisationKind, model, s: State) -> tuple[Linearisation
         state=s,
         parts=parts,
         kind=kind,
-        names=tuple(model.names),
+        names=tuple(coordinates.names(s.q)),
     )
     return linearisation, steadiness

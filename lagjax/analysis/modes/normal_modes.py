@@ -131,14 +131,14 @@ def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: 
             "Fix: mode.animate(positions, seconds=6.0), and a trail of zero or more seconds."
         )
     s = mode.linearisation.state
-    flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for x in jax.tree.leaves(tree)])
     t = np.linspace(0.0, _span(complex(mode.root)), count)
     growing = np.exp(complex(mode.root) * t)
     growing = amplitude * growing / np.max(np.abs(growing))
     if complex(mode.root) == 0:
         # A shift is shown as one oscillation.
         growing = amplitude * np.sin(2 * np.pi * t / t[-1]).astype(complex)
-    path = flat(s.q) + t[:, None] * flat(s.v) + np.real(growing[:, None] * flat(mode.shape))
+    x, u, shape = (np.asarray(coordinates.vector(tree)) for tree in (s.q, s.v, mode.shape))
+    path = x + t[:, None] * u + np.real(growing[:, None] * shape)
     q = coordinates.like(s.q, path)
     at = float(s.t) + t
     return Animation(at, drawn(positions, at, q, s.params), rate, int(min(trail * rate, count)))
@@ -510,7 +510,10 @@ def _with_symmetries(system, linearisation, motions: Motions) -> Motions:
     explained = np.all(np.abs(motions.shapes[:, ~unseen]) <= 1e-6, axis=1)
     s = linearisation.state
     model, dtype = model_of(system, *s), linearisation.mass.dtype
-    at = lambda x: linearised(linearisation.kind, model, s._replace(q=model.tree(jnp.asarray(x, dtype))))
+
+    def at(x: Array):
+        return linearised(linearisation.kind, model, s._replace(q=model.tree(jnp.asarray(x, dtype))))
+
     if not leads_to_others(linearisation, motions.shapes[motions.zero & ~explained], at):
         verdict = _by_first_term(system, linearisation)
         if verdict == degenerate.UNSTABLE:

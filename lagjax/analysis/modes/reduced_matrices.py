@@ -127,7 +127,10 @@ def parts_of(kind: LinearisationKind, model: Model, s: State) -> LinearParts:
     stacked = _spread(rows, live, lift, chosen, -_least_squares(pushing[:, chosen], forcing))
 
     if m:
-        constraint_force = lambda x, u: jax.grad(lambda u: stacked @ constraints.velocity_residual(model, t, x, u))(u)
+
+        def constraint_force(x: Array, u: Array):
+            return jax.grad(lambda u: stacked @ constraints.velocity_residual(model, t, x, u))(u)
+
         by_position, by_velocity = jax.jacfwd(constraint_force, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
@@ -191,8 +194,8 @@ def _forces(kind: LinearisationKind, model, t, x, u):
     """-∂F/∂u, -∂F/∂x and F, without constraint forces."""
     if kind.at_rest:
         # At rest there is no momentum, so the force is that of the potential.
-        slope = lambda x: jax.grad(model.lagrangian, argnums=1)(t, x, jnp.zeros_like(u))
-        position, forcing = jax.jacfwd(lambda x: 2 * (slope(x),), has_aux=True)(x)
+        slope = jax.grad(model.lagrangian, argnums=1)
+        position, forcing = jax.jacfwd(lambda x: 2 * (slope(t, x, jnp.zeros_like(u)),), has_aux=True)(x)
         return jnp.zeros((x.size, x.size), x.dtype), -position.astype(x.dtype), forcing.astype(x.dtype)
 
     def force(x, u):

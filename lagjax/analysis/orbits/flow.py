@@ -230,7 +230,10 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
     def field(part, y, args):
         flow, t0, span, scale, changes = args
         t = t0 + span * part
-        rate = lambda z: span * flow.rate(t, z * scale) / scale
+
+        def rate(z: Array):
+            return span * flow.rate(t, z * scale) / scale
+
         if changes is not None:
             motion, frame_motion = _with_changes(flow, part, y, t0, span, scale, changes)
             return {"z": motion, "frame": frame_motion, "growth": jnp.zeros_like(span)}

@@ -224,7 +224,10 @@ def _first_counted(count):
 
 def _estimates(ts, growth):
     first = _first_counted(len(ts))
-    mean = lambda a, b: jnp.sum(growth[a:b], axis=0) / (ts[b] - ts[a])
+
+    def mean(a: int, b: int):
+        return jnp.sum(growth[a:b], axis=0) / (ts[b] - ts[a])
+
     edges = np.linspace(first, len(ts) - 1, BLOCKS + 1).astype(int)
     blocks = jnp.stack([mean(a, b) for a, b in zip(edges[:-1], edges[1:])])
     spread = DEVIATIONS * jnp.std(blocks, axis=0, ddof=1) / np.sqrt(BLOCKS)

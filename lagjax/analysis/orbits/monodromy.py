@@ -80,8 +80,7 @@ def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array,
     if reasons.autonomous:
         rows.append(flow.rate(t, z) / scale)
     if reasons.energy:
-        integral = lambda z: momentum(z) @ z[n:] - flow.model.lagrangian(t, z[:n], z[n:])
-        rows.append(jax.grad(integral)(z) * scale)
+        rows.append(jax.grad(lambda z: momentum(z) @ z[n:] - flow.model.lagrangian(t, z[:n], z[n:]))(z) * scale)
     rows += shifts
     if reasons.momenta and shifts:
         slopes = jax.jacfwd(momentum)(z) * scale[None]
@@ -202,7 +201,10 @@ def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, 
     # Unrolled stages run in a third of the time but take three times as long to compile, which pays off in sweeps.
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
     rtol, period = tolerance_of(rtol, s.t.dtype), numpy_of(period).asarray(period, s.t.dtype)
-    run = lambda rtol: _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
+
+    def run(rtol: Array):
+        return _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
+
     first = run(rtol)
     if eager:
         second = run(LOOSER * rtol)
@@ -223,7 +225,10 @@ def _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, 
     count = len(nodes)
     times = t + period * jnp.arange(count, dtype=t.dtype) / count
     bases = [flow.tangent_space(t, z, scale) for t, z in zip(times, nodes)]
-    part = lambda t, z, basis: flow.passage(t, z, period / count, basis, scale, True, differentiable)
+
+    def part(t: Array, z: Array, basis: Array):
+        return flow.passage(t, z, period / count, basis, scale, True, differentiable)
+
     if count == 1:
         passed = jax.tree.map(lambda x: x[None], part(times[0], nodes[0], bases[0]))
     else:

@@ -6,6 +6,7 @@ analyse the system  ->  one compiled search (`shooting.py`)  ->  raise or warn a
 import difflib
 import warnings
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -101,11 +102,8 @@ def periodic_orbit(
         raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
     given_turns = None if turns is None else _turns(turns, names, dtype)
     eager = is_eager() and not is_traced((s, period))
-    search = lambda state, period: shooting.closed(
-        problem.system, state, period, rtol, asked, problem.rows, parts, given_turns, most
-    )
     if eager:
-        found = search(s, period)
+        found = shooting.closed(problem.system, s, period, rtol, asked, problem.rows, parts, given_turns, most)
         _raise_or_warn(found, float(period), problem)
     else:
         state = coordinates.state(*s)
@@ -113,11 +111,12 @@ def periodic_orbit(
         found = shooting.closed(*given, rtol, asked, problem.rows, parts, given_turns, most)
         found = shooting.implicit(problem.system, state, rtol, asked, problem.rows, found)
     orbit = _orbit(problem, found, asked)
-    report_of = lambda orbit: Report(
-        jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value),
-        orbit.iterations, jnp.zeros((), dtype), orbit.residual,
-    )  # fmt: skip
-    return reported(orbit, report_of)
+    return reported(orbit, _report)
+
+
+def _report(orbit: PeriodicOrbit) -> Report:
+    result = jnp.where(orbit.converged, RESULTS.successful._value, RESULTS.not_converged._value)
+    return Report(result, orbit.iterations, jnp.zeros_like(orbit.residual), orbit.residual)
 
 
 def _pair(start):
@@ -211,7 +210,8 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     s, xp = problem.state, numpy_of(found)
     if xp is np:
         found = jax.tree.map(np.asarray, found)
-    like = lambda x: coordinates.like(s.q, x)
+
+    like = partial(coordinates.like, s.q)
     z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
     shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
     arrays, static = hashable_partition((problem.system, coordinates.state(*s).params))

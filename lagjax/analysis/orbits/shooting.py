@@ -26,6 +26,7 @@ The guess is followed for a period, and for two more if the period is unknown, w
 start after the given period, the time at which it comes nearest is taken as the period instead.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -98,8 +99,7 @@ def guessed(flow: Flow, t, z, period, asked: OrbitRequest, parts: int, turns) ->
         )
     # In a driven system an unstable guess may go anywhere, so all parts begin at the given state.
     nodes = path[np.arange(parts) * PIECES // parts] if asked.moves else jnp.broadcast_to(z, (parts, z.size))
-    onto = lambda node: flow.onto_constraints(t, node, scale)
-    nodes = jnp.stack([z, *(onto(node) for node in nodes[1:])])
+    nodes = jnp.stack([z, *(flow.onto_constraints(t, node, scale) for node in nodes[1:])])
     chosen_turns = path_turns[index] if turns is None else jnp.asarray(turns)
     return Guess(z, nodes, period * jnp.asarray(index, z.dtype) / PIECES, scale, chosen_turns)
 
@@ -259,8 +259,8 @@ def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) ->
     nodes = jax.vmap(lambda z: flow.onto_constraints(t, z, scale))(found.candidate.nodes)
     candidate = OrbitCandidate(nodes, found.candidate.period)
     no_frame = jnp.zeros((flow.size * 2, 0), nodes.dtype)
-    part = lambda t, z: flow.passage(t, z, found.candidate.period / len(nodes), no_frame, scale, differentiable=True).z
-    ends = jnp.stack([part(t, z) for t, z in zip(_times(t, candidate), nodes)])
+    passage = partial(flow.passage, span=found.candidate.period / len(nodes), frame=no_frame, scale=scale)
+    ends = jnp.stack([passage(t, z, differentiable=True).z for t, z in zip(_times(t, candidate), nodes)])
     residual = _residual(flow, t, candidate, ends, asked, goal, found.guess)
     # The value is that of the search, the derivative that of the step.
     change = residual - lax.stop_gradient(residual)
@@ -283,26 +283,29 @@ def _next_candidate(flow, t, search, asked, scale):
     longest = jnp.maximum(jnp.max(jnp.abs(moves)), jnp.abs(log_period))
     part = jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0, longest, 1.0))
     candidate = OrbitCandidate(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
-    onto = lambda t, z: flow.onto_constraints(t, z, scale)
-    return candidate._replace(nodes=jax.vmap(onto)(_times(t, candidate), candidate.nodes))
+    onto = jax.vmap(partial(flow.onto_constraints, scale=scale))
+    return candidate._replace(nodes=onto(_times(t, candidate), candidate.nodes))
 
 
 def _evaluate(flow, t, candidate, asked, goal, guess) -> OrbitEvaluation:
     """Follow the flow from each node to the next, with the tangent spaces."""
     times, span, scale = _times(t, candidate), candidate.period / len(candidate.nodes), guess.scale
     bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, candidate.nodes)
-    part = lambda t, z, basis: flow.passage(t, z, span, basis, scale)
+    part = partial(flow.passage, span=span, scale=scale)
     if len(candidate.nodes) == 1:
-        passed = jax.tree.map(lambda x: x[None], part(times[0], candidate.nodes[0], bases[0]))
+        passed = jax.tree.map(lambda x: x[None], part(times[0], candidate.nodes[0], frame=bases[0]))
     else:
-        passed = jax.vmap(part)(times, candidate.nodes, bases)
+        passed = jax.vmap(lambda t, z, basis: part(t, z, frame=basis))(times, candidate.nodes, bases)
     displacement = passed.z[-1] - candidate.nodes[0]
     residual = _residual(flow, t, candidate, passed.z, asked, goal, guess)
     matrix, moves = _equations(flow, t, candidate, passed, bases, scale, asked)
     # Root mean square rather than the largest entry, because a step reduces the sum of squares.
     size = jnp.sqrt(jnp.mean(residual**2))
     finished = jnp.all(passed.ended) & jnp.isfinite(size) & jnp.all(jnp.isfinite(matrix))
-    clean = lambda x: jnp.where(finished, x, 0.0)
+
+    def clean(x: Array):
+        return jnp.where(finished, x, 0.0)
+
     amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(finished, size, jnp.inf)
     return OrbitEvaluation(size, clean(residual), clean(matrix), bases, amplified, displacement, moves)
 
@@ -323,7 +326,10 @@ def _equations(flow, t, candidate, passed, bases, scale, asked):
         row = row.at[:, after * k : (after + 1) * k].add(-bases[after])
         row = row.at[:, -1].set(rates[j] if asked.free else 0.0)
         blocks.append(row)
-    on_first_node = lambda gradient: jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
+
+    def on_first_node(gradient: Array):
+        return jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
+
     if asked.moves:
         blocks.append(on_first_node(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
     # Held quantities have priority over the closing residual.

@@ -91,16 +91,9 @@ def _scalings(q, n):
 
 def _element(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
     zero = np.zeros(n)
-    or_default = lambda x, default: default if x is None else x
-    return Element(
-        name,
-        kind,
-        or_default(shift, zero),
-        or_default(matrix, np.zeros((n, n))),
-        or_default(drift, zero),
-        clock,
-        clock_rate,
-    )
+    matrix = np.zeros((n, n)) if matrix is None else matrix
+    shift, drift = (zero if x is None else x for x in (shift, drift))
+    return Element(name, kind, shift, matrix, drift, clock, clock_rate)
 
 
 def _is_shift(element):
@@ -189,8 +182,8 @@ class Combination(NamedTuple):
     def __call__(self, t, q, params):
         """ξ, with the structure of q."""
         x, unflatten = coordinates.flatten(q)
-        cast = lambda y: jnp.asarray(y, x.dtype)
-        return unflatten(cast(self.shift) + cast(self.matrix) @ x + t * cast(self.drift))
+        shift, matrix, drift = (jnp.asarray(y, x.dtype) for y in (self.shift, self.matrix, self.drift))
+        return unflatten(shift + matrix @ x + t * drift)
 
 
 class Clock(NamedTuple):

@@ -41,7 +41,10 @@ class Affine(eqx.Module):
 
     def at(self, t, x, u) -> GeneratorFlow:
         """The flow of each generator at a state."""
-        to = lambda y: jnp.asarray(y, x.dtype)
+
+        def to(y: Array):
+            return jnp.asarray(y, x.dtype)
+
         xi = to(self.shift) + to(self.matrix) @ x + t * to(self.drift)
         xi_rate = to(self.matrix) @ u + to(self.drift)
         tau, tau_rate = to(self.clock) + t * to(self.clock_rate), to(self.clock_rate)
@@ -100,14 +103,20 @@ def rates(model, affine: Affine, generators: tuple[Generator, ...], s, places) -
     raw = _StateRates(*(xp.asarray(y) for y in raw))
     finite = xp.isfinite(raw.energy) & xp.all(xp.isfinite(raw.by_lagrangian + raw.by_force), axis=1)
     found = states.found & finite
-    kept = lambda y: xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
+
+    def kept(y: Array):
+        return xp.where(found.reshape(-1, *[1] * (y.ndim - 1)), y, xp.zeros_like(y))
+
     count = xp.maximum(xp.sum(found), 1).astype(raw.energy.dtype)
     size = xp.sqrt(xp.sum(kept(raw.size) ** 2, axis=0) / count)
     size = xp.where(size > 0, size, xp.ones_like(size))
     # A state where nothing moves and no force acts has no scale of its own.
     energy = kept(raw.energy) + raw.energy.dtype.type(1e-12) * xp.max(kept(raw.energy))
     energy = xp.where(found & (energy > 0), energy, xp.ones_like(energy))
-    relative = lambda y: kept(y) / (energy[:, None] * size[None])
+
+    def relative(y: Array):
+        return kept(y) / (energy[:, None] * size[None])
+
     slope = xp.where(raw.slope > 0, raw.slope, xp.ones_like(raw.slope))[:, :, None] * size[None, None]
     return Rates(
         states._replace(found=found),
@@ -149,7 +158,8 @@ def _constraint_rates(model, scales, state, moved, turned, displaced):
     if not model.m:
         empty = jnp.zeros((0, moved.tau.size), x.dtype)
         return empty, jnp.zeros(0, x.dtype), empty
-    residual = lambda t, x, u: constraints.velocity_residual(model, t, x, u)
-    of_t, of_x, rows = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, u)
+    of_t, of_x, rows = jax.jacfwd(lambda t, x, u: constraints.velocity_residual(model, t, x, u), argnums=(0, 1, 2))(
+        t, x, u
+    )
     change = jnp.outer(of_t, moved.tau) + of_x @ moved.xi.T + rows @ turned.T
     return rows @ displaced.T, jnp.abs(rows) @ scales.x, change

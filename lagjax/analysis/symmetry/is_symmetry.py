@@ -137,9 +137,13 @@ def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
     count = xp.sum(found.states.found)
     if xp is np and count < AT_LEAST:
         raise ValueError(too_few(system, s, int(count)))
-    largest = lambda y: xp.max(xp.abs(y))
-    worst = lambda y: model.split(xp.max(xp.abs(y[:, :, 0]), axis=0))
-    by_name = lambda y: {name: largest(value) for name, value in worst(y).items()}
+
+    def largest(y: Array):
+        return xp.max(xp.abs(y))
+
+    def by_name(y: Array):
+        return {name: largest(value) for name, value in model.split(xp.max(xp.abs(y[:, :, 0]), axis=0)).items()}
+
     displacement, invariance = by_name(found.displacement), by_name(found.invariance)
     of_velocities = {name for name, c in system.constraints.items() if not c.of_positions}
     residual = xp.max(xp.stack([largest(found.charge), *displacement.values()]))

@@ -65,8 +65,7 @@ def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
     """The states at the displacements `places` from a given one, moved onto the constraints."""
     # With concrete values only the program that moves states is compiled, and all questions about a system share it.
     xp = numpy_of((s, model))
-    vector = lambda tree: xp.concatenate([xp.ravel(xp.asarray(x)) for x in jax.tree.leaves(tree)])
-    x, u = vector(s.q), vector(s.v)
+    x, u = (xp.asarray(coordinates.vector(tree)) for tree in (s.q, s.v))
     n, scales = len(x), sizes(model, s, x, u)
     places = places.astype(x.dtype)
     t = s.t + scales.t * places[:, 0]
@@ -92,7 +91,10 @@ def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
 def sizes(model, s: coordinates.State, x, u) -> StateScales:
     """The size of each coordinate and velocity of a state."""
     xp, same = numpy_of((x, u)), _groups(s.q)
-    together = lambda y: xp.sqrt(same.astype(y.dtype) @ y**2)
+
+    def together(y: Array):
+        return xp.sqrt(same.astype(y.dtype) @ y**2)
+
     of_x = together(x)
     of_x = xp.where(of_x > 0, of_x, xp.ones_like(x))
     # Angles are at least 1: with small angles only, a pendulum would look like a harmonic oscillator.
@@ -122,8 +124,12 @@ def _onto_constraints(model, scales, t, xs, us):
 
 
 def _on_constraints(model, scales, t, x, u):
-    position = lambda x: constraints.position_residual(model, t, x)
-    velocity = lambda x, u: constraints.velocity_residual(model, t, x, u)
+    def position(x: Array):
+        return constraints.position_residual(model, t, x)
+
+    def velocity(x: Array, u: Array):
+        return constraints.velocity_residual(model, t, x, u)
+
     holds = jnp.asarray(True)
     if model.holonomic.any():
         x = _newton(position, x, scales.x)

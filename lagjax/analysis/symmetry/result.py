@@ -8,7 +8,7 @@ The recognised form is only a guess, so it is displayed but never used in comput
 
 from collections.abc import Iterator
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -59,8 +59,12 @@ class Words(NamedTuple):
 
 def named_parameters(params) -> dict[str, float]:
     """The numeric parameters, by name."""
-    is_number = lambda x: isinstance(x, (float, int, np.number)) or np.issubdtype(getattr(x, "dtype", bool), np.number)
-    leaves = jax.tree.map(lambda x: np.asarray(x) if is_number(x) else None, params)
+
+    def number_or_none(x: Any) -> np.ndarray | None:
+        is_number = isinstance(x, float | int | np.number) or np.issubdtype(getattr(x, "dtype", bool), np.number)
+        return np.asarray(x) if is_number else None
+
+    leaves = jax.tree.map(number_or_none, params)
     values = [float(x) for leaf in jax.tree.leaves(leaves) for x in np.ravel(leaf)]
     alone = jtu.treedef_is_leaf(jtu.tree_structure(leaves)) and len(values) == 1
     names = ["params"] if alone else coordinates.names(leaves)

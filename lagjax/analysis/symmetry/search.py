@@ -157,12 +157,15 @@ def scalings_of(model, tried: Basis, sampled: Rates, precision: Precision) -> tu
     if model.system.force is not None or model.system.dissipation is not None:
         return ()
     chosen = np.flatnonzero(np.array(tried.kinds) == "scaling")
-    flat = lambda i: np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i])
-    chosen = chosen[independent(np.stack([flat(i) for i in chosen], axis=1), precision)]
+    columns = [np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i]) for i in chosen]
+    chosen = chosen[independent(np.stack(columns, axis=1), precision)]
     size = sampled.size[chosen]
     holonomic = model.holonomic
     root = np.sqrt(len(sampled.value))
-    rows = lambda y: y.reshape(-1, y.shape[-1])
+
+    def rows(y: np.ndarray):
+        return y.reshape(-1, y.shape[-1])
+
     # The set g = 0 and the velocity constraints must be preserved.
     kept = np.concatenate([rows(sampled.displacement[:, holonomic]), rows(sampled.invariance[:, ~holonomic])])[
         :, chosen
@@ -337,9 +340,15 @@ def _found(model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetr
 def _columns(tried: Basis, own, gauge: Gauge, sampled: Rates) -> _Columns:
     count, n_own, states = len(tried.names), len(own), len(sampled.value)
     order = np.concatenate([np.arange(count, count + n_own), np.arange(count)]).astype(int)
-    rows = lambda y: y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
+
+    def rows(y: np.ndarray):
+        return y.reshape(-1, y.shape[-1])[:, order] / np.sqrt(states)
+
     of_gauge = gauge.rates(*map(np.asarray, sampled.states[:3])) / sampled.energy[:, None]
-    unit = lambda y: y / np.maximum(np.std(y, axis=(0, 1)), np.finfo(float).tiny)
+
+    def unit(y: np.ndarray):
+        return y / np.maximum(np.std(y, axis=(0, 1)), np.finfo(float).tiny)
+
     # A few states are enough to tell motions apart.
     few = slice(0, 16 + 4 * (count + n_own) // sampled.xi.shape[2])
     moves = np.concatenate(
@@ -423,9 +432,13 @@ def _gauge_of(columns: _Columns, whole, gauge: Gauge, timed, shifted, precision:
         return solution, np.linalg.norm(scaled[:, chosen] @ solution - rate)
 
     # On constraints some functions are equal. Those of shifted coordinates, of low degree and without t are preferred.
-    degree = lambda k: len(gauge.factors[k]) + gauge.powers[k]
-    simplicity = lambda k: (shifted.issuperset(gauge.factors[k]), -degree(k), not gauge.timed[k])
-    kept = sorted(np.flatnonzero((size > 0) & (timed | ~gauge.timed)), key=simplicity)
+    def degree(k: int):
+        return len(gauge.factors[k]) + gauge.powers[k]
+
+    kept = sorted(
+        np.flatnonzero((size > 0) & (timed | ~gauge.timed)),
+        key=lambda k: (shifted.issuperset(gauge.factors[k]), -degree(k), not gauge.timed[k]),
+    )
     few = [k for k in kept if shifted.issuperset(gauge.factors[k]) and degree(k) == 1]
     if few and fitted(few)[1] <= 1e3 * precision.exact * np.linalg.norm(rate):
         kept = few
