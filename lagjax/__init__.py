@@ -61,6 +61,7 @@ from lagjax import learned
 from lagjax.fit.fit import fit
 from lagjax.fit.identifiability import identifiability
 from lagjax.fit.load import load_fit
+from lagjax.fit.loss import FitFunction, fit_loss, fit_residuals
 from lagjax.fit.problem.records import Record
 from lagjax.fit.result.result import Fit, FitWarning
 from lagjax.fit.uncertainty.identifiable import Identifiability
@@ -235,6 +236,9 @@ __all__ = [
     "interact",
     "Knobs",
     "fit",
+    "fit_residuals",
+    "fit_loss",
+    "FitFunction",
     "Record",
     "Fit",
     "FitWarning",

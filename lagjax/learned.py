@@ -1,7 +1,7 @@
 """For Lagrangians that contain a network: tools against the known pitfalls of learning one from motion.
 
-`lj.fit` trains, with an optimiser of optax or by Levenberg-Marquardt; any module of equinox, or plain arrays in
-`params`, can be learned. This module only covers what otherwise goes wrong easily:
+`lj.fit` trains by Levenberg-Marquardt, and `lj.fit_loss` is trained by an optimiser of optax or another; any module of
+equinox, or plain arrays in `params`, can be learned. This module only covers what otherwise goes wrong easily:
 
 - A force is a slope of L, so a network in L needs two continuous derivatives: `Network`.
 - A mass matrix M must stay regular during training, and dissipation must never supply energy. Both use
@@ -91,8 +91,8 @@ class Network(eqx.Module):
         _check_activation(activation)
         self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in accepted_names)
         mlp = eqx.nn.MLP(len(flat) + sum(self.angular), out or "scalar", width, depth, activation, key=key)
-        last = lambda mlp: (mlp.layers[-1].weight, mlp.layers[-1].bias)
-        self.mlp = eqx.tree_at(last, mlp, tuple(first * x for x in last(mlp)))
+        last = jax.tree.map(lambda x: first * x, mlp.layers[-1])
+        self.mlp = eqx.tree_at(lambda mlp: mlp.layers[-1], mlp, last)
 
     def __call__(self, q: PyTree[ArrayLike]) -> Array:
         """The network at coordinates `q`: a scalar, or `(out,)`."""
@@ -239,8 +239,11 @@ def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) ->
             "a single model has nothing to disagree with.\nFix: several fits, with different keys of their networks."
         )
     times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jnp.shape(jax.tree.leaves(q)[0])[0],))
-    each = lambda params: jax.vmap(lambda t, q, v: accelerations(system, t, q, v, params)[0])(times, q, v)
-    return jax.tree.map(lambda *a: jnp.std(jnp.stack(a), axis=0, ddof=1), *map(each, members))
+
+    def at_states(params):
+        return jax.vmap(lambda t, q, v: accelerations(system, t, q, v, params)[0])(times, q, v)
+
+    return jax.tree.map(lambda *a: jnp.std(jnp.stack(a), axis=0, ddof=1), *map(at_states, members))
 
 
 def _at_states(system, t, q, v, params):

@@ -143,7 +143,7 @@ def test_functions_that_pickle_cannot_find():
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("stored", [False, True])
 def test_sweeps(stored, tmp_path):
-    """Values, statuses and texts stay the same; the function is included, or its absence is reported."""
+    """Values, statuses and texts stay the same; a pickle is data, and takes the function again."""
     store = tmp_path / "store" if stored else None
     swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
     for way in ("copy", "deepcopy", "pickle"):
@@ -155,7 +155,9 @@ def test_sweeps(stored, tmp_path):
         with pytest.raises(ValueError, match="the values in a store belong to the run"):
             found.resweep(where=True)
     else:
-        assert found.resweep(where=[True, False]).ran == 1
+        with pytest.raises(ValueError, match="unpickled does not know the function that ran it"):
+            found.resweep(where=[True, False])
+        assert found.resweep(at, where=[True, False]).ran == 1
 
 
 @pytest.mark.exhaustive

@@ -21,7 +21,7 @@ import pytest
 import lagjax as lj
 from lagjax.files import npz, tree_json
 from lagjax.files import table as file_table
-from lagjax.sweep import chunks, fingerprint, metadata, result, store
+from lagjax.sweep import chunks, metadata, result, store
 from tests import mutated
 from tests.mutated import describe, mutated_file, mutated_store
 
@@ -318,7 +318,7 @@ def larger_grid(path, n):
 
     def change(said):
         said["block"] = [1, n]
-        said["fingerprint"]["axes"] = {name: fingerprint.of_axis(x) for name, x in axes.items()}
+        said["fingerprint"]["axes"] = {name: metadata.of_axis(x) for name, x in axes.items()}
         return said
 
     describe(path, change)

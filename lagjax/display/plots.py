@@ -293,23 +293,6 @@ def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
     return fig
 
 
-def training(curves: dict[str, tuple[np.ndarray, np.ndarray]], best: int):
-    """Draw mean squared residuals against training steps, and mark the `best` step.
-
-    **Arguments:** `curves` by name: steps (S,) and values (S,), NaN for missing values.
-
-    **Returns:** a matplotlib `Figure`.
-    """
-    fig, axes = figure(size=(6.0, 3.2))
-    axis = axes[0, 0]
-    for i, (name, (steps, values)) in enumerate(curves.items()):
-        axis.plot(steps, values, label=name, marker="" if len(steps) > 200 or i == 0 else ".", **style(i))
-    axis.axvline(best, color="black", linewidth=0.8)
-    axis.set(xlabel="step", ylabel="mean squared residual", yscale="log", title=f"The best parameters: step {best}")
-    axis.legend(fontsize=8, frameon=False)
-    return fig
-
-
 @names_as_they_are()
 def lines(label: str, x, panels: dict[str, np.ndarray], bad):
     """Draw values against one axis of a sweep, one panel per value; `bad` points are marked at the bottom."""

@@ -136,10 +136,8 @@ lagjax.fit.search.search
   Misfit: times large curved doubtful
 lagjax.fit.search.search
   Evaluation: rows well covariance determined singular_values combinations chi2 freedom
-lagjax.fit.training.training
-  Training: losses judged scores best steps early failed skipped held_back batch windows
 lagjax.fit.result.result
-  Fit: problem unknowns cost steps rested misfit costs evaluation units training
+  Fit: problem unknowns cost steps rested misfit costs evaluation units
 """
 
 

@@ -15,12 +15,10 @@ from lagjax.display.progress import meter, waiting
 from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.checks import check_motion
 from lagjax.fit.problem.records import Record
-from lagjax.fit.problem.residuals import FitProblem, Stage
+from lagjax.fit.problem.residuals import JOINING, FitProblem, Stage
 from lagjax.fit.result.result import Fit, FitWarning
 from lagjax.fit.result.warnings import caveats
 from lagjax.fit.search.search import Course, evaluate, listening, search
-from lagjax.fit.training.rounds import is_of_optax
-from lagjax.fit.training.training import held_problem, split_records, train
 from lagjax.integrate.solve.harvest import reported
 from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.tracing import is_traced, numpy_of
@@ -30,9 +28,6 @@ from lagjax.system.system import System
 
 # Measurements per unknown in the first part of a record, which doubles stage by stage; the largest number of stages.
 FIRST_PART, STAGES = 4, 7
-# The cost of a jump between joined windows, stage by stage, relative to the cost of an equal distance from the data.
-# (With larger weights the round-off of chaotic motions in the jumps keeps a search from converging.)
-JOINING = (0.1, 1.0, 10.0, 100.0, 1e3)
 # A robust loss takes this many more stages, which estimate the size of an ordinary error.
 SETTLING_STAGES = 2
 # While only a part of a record counts, a change of a number by this fraction costs as much as a measurement error;
@@ -43,6 +38,8 @@ HOLD_REACH, ASSUMED_ERROR = 0.3, 0.03
 FINAL_HOLD = 1e-7
 # Further starts if the end is doubtful, for at most this many numbers.
 RESTARTS, RESTARTS_UP_TO = 8, 20
+# Arguments of trainings with optax, which `fit` does no longer do.
+TRAINING = {"batch", "held_back", "patience"}
 # Uncertainties of more numbers than this are not computed.
 COVARIANCE_UP_TO = 1000
 # Tolerances of a stage and of the last stage, in units of the data's spread; the last is at least this many times the
@@ -69,9 +66,6 @@ def fit(
     seed: int = 0,
     optimiser: Any = None,
     iterations: int | None = None,
-    batch: int | None = None,
-    held_back: float | Record | Sequence[Record] | None = None,
-    patience: int | None = None,
     progress: bool | None = None,
     **options,
 ) -> Fit:
@@ -119,17 +113,7 @@ def fit(
       `optimistix.BFGS(rtol, atol)`.
     - `iterations`: the largest number in each stage, 100 by default.
 
-    **Training,** with an `optimiser` of optax, such as `optax.adam(1e-2)`, for thousands of parameters; its windows do
-    not grow and are independent (`joined=False`), and it searches once:
-
-    - `iterations`: the largest number of steps, 1000 by default. `batch`: the number of windows in a step, all by
-      default; `seed` draws a new order in each pass through all windows. Derivatives are taken in reverse mode, of all
-      windows of a batch at once.
-    - `held_back`: records, or the fraction of the given ones, that only serve to evaluate the parameters at intervals,
-      with starts fitted to them. The parameters with the smallest residuals of these count; without `held_back` those
-      with the smallest residuals of all records.
-    - `patience`: after how many evaluations without improvement training stops; 10 if records are held back.
-    - The optimiser does not move the starts of windows: with each batch they take half a Newton step.
+    Networks with thousands of weights are trained by gradient steps on `lj.fit_loss`, by optax for example.
 
     **Further:**
 
@@ -151,18 +135,8 @@ def fit(
     (multiple shooting); Huber, *Robust Statistics*, §7.8 (scale by the median); Bierman, *Factorization Methods for
     Discrete Sequential Estimation* (covariance); Box & Pierce, *J. Am. Stat. Assoc.* 65 (1970) 1509 (residuals).
     """
-    apart = None
-    if is_of_optax(optimiser):
-        _check_training(window is not None and joined, restarts)
-        records, apart = split_records(records, held_back, seed)
-    else:
-        _check_optimiser(optimiser, {"batch": batch, "held_back": held_back, "patience": patience})
+    _check_optimiser(optimiser, options)
     problem = problem_of(system, records, params, free, observe, bounds, priors, loss, window, dict(options))
-    if is_of_optax(optimiser):
-        check = lambda: check_motion(problem, np.zeros(problem.windows.count, bool), problem.start)
-        held = held_problem(problem, apart, system, params, observe, loss, window, options)
-        trained = train(problem, held, optimiser, batch, iterations, patience, seed, progress, check)
-        return _reported(Fit(problem, *trained.searched, trained.evaluation, _sorted(units), trained.course))
     further = restarts
     if restarts is None:
         further = RESTARTS if optimiser is None and 0 < problem.found.start.size <= RESTARTS_UP_TO else 0
@@ -197,25 +171,20 @@ def _sorted(units):
     return tuple(sorted((units or {}).items()))
 
 
-def _check_training(joined, restarts):
-    if joined:
-        raise ValueError(
-            "an optimiser of optax takes a batch of windows at a time, and cannot join them.\nFix: joined=False."
+def _check_optimiser(optimiser, options):
+    trains = isinstance(optimiser, tuple) and all(callable(getattr(optimiser, x, None)) for x in ("init", "update"))
+    if trains or TRAINING & set(options):
+        what = "an optimiser of optax" if trains else f"{listed(sorted(TRAINING & set(options)))}, of a training,"
+        raise TypeError(
+            f"{what} was given to lj.fit, which searches for the minimum with least squares and does not train.\n"
+            "Usual cause: a network with many weights, or code for an earlier lagjax.\n"
+            "Fix: loss = lj.fit_loss(system, records, params, window=1.0, joined=False), a function whose slope "
+            "jax.grad(loss)(unknowns) any optimiser takes: the recipe in docs/learned.md, 'Training'."
         )
-    if restarts:
-        raise ValueError("restarts= is for a search, but an optimiser of optax trains once.\nFix: leave it out.")
-
-
-def _check_optimiser(optimiser, of_training):
     if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         raise TypeError(
-            "optimiser must be one of optimistix's least-squares solvers or minimisers, or a gradient transformation "
-            f"of optax, not {optimiser!r:.60}.\nFix: leave it out; or optax.adam(1e-3), called with its learning rate."
-        )
-    if given := [name for name, value in of_training.items() if value is not None]:
-        raise ValueError(
-            f"{listed(given)} is for training with an optimiser of optax.\n"
-            "Fix: optimiser=optax.adam(1e-2), or leave it out."
+            "optimiser must be one of optimistix's least-squares solvers or minimisers, not "
+            f"{optimiser!r:.60}.\nFix: leave it out; or optimistix.BFGS(1e-6, 1e-6); lj.fit_loss for all others."
         )
 
 
@@ -228,8 +197,13 @@ def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: b
         for kind, tree in problem.measured.items()
         for x in jax.tree.leaves(tree)
     )
-    growing = lambda measured: _doubled(measured / max(FIRST_PART * unknowns, 1)) if grow else np.zeros(0)
-    alike = lambda parts: np.repeat(np.asarray(parts)[:, None], windows.count, axis=1)
+
+    def growing(measured):
+        return _doubled(measured / max(FIRST_PART * unknowns, 1)) if grow else np.zeros(0)
+
+    def alike(parts):
+        return np.repeat(np.asarray(parts)[:, None], windows.count, axis=1)
+
     of_windows = alike(growing(measured))
     # Joined windows form one record, which may grow as a whole.
     of_records = np.zeros((0, windows.count))

@@ -67,8 +67,11 @@ def identifiability(
 
     Source: Pukelsheim, *Optimal Design of Experiments*, ch. 2.
     """
-    settings = lambda observe: (free, observe, None, priors, "squares", window, dict(options))
-    problem = problem_of(system, records, params, *settings(observe))
+
+    def problem_for(records, observe):
+        return problem_of(system, records, params, free, observe, None, priors, "squares", window, dict(options))
+
+    problem = problem_for(records, observe)
     if shrink is None and candidates is not None:
         raise ValueError('candidates= needs shrink=, the number that they are compared by.\nFix: shrink="g".')
     at = None if shrink is None else survey(problem, problem.start)
@@ -81,11 +84,13 @@ def identifiability(
     check_motion(problem, evaluation.well, problem.start)
     following = None
     if at is not None:
-        # Only candidates with `observed` measurements take `observe`.
-        observing = lambda runs: observe if "observed" in runs[0].measured else None
-        problem_for = lambda runs: problem_of(system, runs, params, *settings(observing(runs)))
         runs = [records] if isinstance(records, Record) else list(records)
-        following = next_measurements(problem, runs, at, shrink, candidates, problem_for)
+
+        def of_candidates(runs):
+            # Only candidates with `observed` measurements take `observe`.
+            return problem_for(runs, observe if "observed" in runs[0].measured else None)
+
+        following = next_measurements(problem, runs, at, shrink, candidates, of_candidates)
     noise = np.asarray(1.0) if problem.absolute else None
     return Identifiability(
         problem.found.names, problem.found.start, evaluation.singular_values, evaluation.combinations, noise, following

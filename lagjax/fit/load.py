@@ -104,10 +104,7 @@ def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> 
             system = replace_fields(system, first=np.asarray(described.phase, np.int32))
         fields |= {"system": system, "first": system.first_phase}
     options = {name: known.get(f"options.{name}", x) for name, x in problem.options.items()}
-    training = found.training
-    if training is not None and training.held_back is not None:
-        training = replace(training, held_back=_with(training.held_back, known, described, path))
-    return replace(found, problem=replace(problem, options=options, **fields), training=training)
+    return replace(found, problem=replace(problem, options=options, **fields))
 
 
 def check_shapes(found: Fit, described: UnknownSystem) -> None:
@@ -169,8 +166,6 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
         raise ValueError(f"its options are not those of lj.integrate: {listed(sorted(unknown))}.")
     if sum(sizes) != p or not inside:
         raise ValueError(f"its parameters do not hold {p} numbers.")
-    if found.training is not None and found.training.held_back is not None:
-        check_shapes(found.training.held_back, replace(described, starts=None))
 
 
 def _short(role):

@@ -22,8 +22,7 @@ import numpy as np
 from lagjax.integrate.trajectory.results import in_words
 from lagjax.sliders.picture import DPI, WIDTH, Picture
 from lagjax.sweep.axes import axes_of
-from lagjax.sweep.batch_program import LAYOUTS, TRUSTED
-from lagjax.sweep.program_cache import program_for
+from lagjax.sweep.batch_program import LAYOUTS, TRUSTED, program_for
 from lagjax.sweep.web_page import drawn
 
 # The number of steps of a slider for which none is given.

@@ -6,7 +6,7 @@ axes, and yet each of its files holds consecutive flat indices.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -124,6 +124,10 @@ class Blocks(NamedTuple):
         region = self.region(number)
         first = int(np.ravel_multi_index([x.start for x in region], self.shape))
         return slice(first, first + math.prod(x.stop - x.start for x in region))
+
+    def size(self, numbers: Iterable[int]) -> int:
+        """The number of points of some blocks."""
+        return sum(here.stop - here.start for here in map(self.points, numbers))
 
 
 def divided(shape: tuple[int, ...], points: int) -> Blocks:

@@ -2,12 +2,16 @@
 
 Lanes run together under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"` runs
 one after the other, which is slower in nearly all measurements (`benchmarks/speed/sweep.py`) and needs the least memory.
+
+A later sweep that computes the same over axes of the same kinds uses the program of an earlier one. What a sweep
+computes is the jaxpr of its function, which is traced for each sweep, so that no stale program is ever used.
 """
 
 import hashlib
 import math
 import re
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -20,14 +24,18 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from lagjax.display.progress import waiting
 from lagjax.integrate.solve.harvest import reporting, watched
 from lagjax.integrate.solve.settings import PATIENCE
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.jaxtools.cache import program_of
 from lagjax.jaxtools.jaxpr import ClosedJaxpr, bodies
+from lagjax.jaxtools.jaxpr_identity import Meaning, content_of, meaning_of
 from lagjax.jaxtools.tracing import REGULAR_FIRST
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 from lagjax.sweep.axes import POINT, Axes
+from lagjax.sweep.chunks import nothing
 from lagjax.system.user_errors import Call, check_arguments, in_words
 
 NOT_RUN, LOST = -1, -2
@@ -131,7 +139,9 @@ def compiled(
     point = point_of(run)
 
     def lanes(values):
-        at = lambda values: point(dict(zip(axes.names, values)))
+        def at(values):
+            return point(dict(zip(axes.names, values)))
+
         return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
 
     function, sharding = lanes, SingleDeviceSharding(devices[0])
@@ -154,6 +164,34 @@ def compiled(
     return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event(), settled is not None)
 
 
+def program_for(
+    run: Callable,
+    axes: Axes,
+    chunk: int,
+    devices: Sequence,
+    layout: str,
+    patience: int | None = None,
+    robust: bool = True,
+    progress: bool | None = False,
+) -> tuple[Program, float]:
+    """The program, and the seconds it took to compile; 0 if it was in the cache."""
+    seconds = 0.0
+
+    def make():
+        nonlocal seconds
+        started = time.perf_counter()
+        with waiting(progress, "compiling"):
+            program = compiled(run, axes, chunk, devices, layout, patience, robust)
+        seconds = time.perf_counter() - started
+        return program
+
+    program, structure = traced_point(run, axes, patience, robust)
+    meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
+    settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
+    key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings
+    return program_of(key, make), seconds
+
+
 def raised(program: Program) -> tuple[PyTree, Status]:
     """The values and the status of one point at which a callback of the user's raised."""
     values, status = not_run(program, 1)
@@ -170,8 +208,7 @@ def raised(program: Program) -> tuple[PyTree, Status]:
 
 def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
     """Arrays for the values and statuses of some points, filled with NaN, or 0 for dtypes without NaN."""
-    empty = lambda x: np.nan if np.issubdtype(x.dtype, np.inexact) else 0
-    values = jax.tree.map(lambda x: np.full((count, *x.shape), empty(x), x.dtype), program.values)
+    values = jax.tree.map(lambda x: np.full((count, *x.shape), nothing(x.dtype), x.dtype), program.values)
     fills = (NOT_RUN, 0, np.nan, np.nan)
     return values, Status(*(np.full(count, fill, dtype) for fill, dtype in zip(fills, STATUS_TYPES)))
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from lagjax.sweep.axes import Axes, Blocks, divided
 from lagjax.sweep.batch_program import GOOD, Status, not_run
-from lagjax.sweep.fingerprint import in_words, named_leaves, versions
-from lagjax.sweep.labels import labels_of
+from lagjax.sweep.labels import labels_of, named_leaves
+from lagjax.sweep.metadata import in_words, versions
 from lagjax.sweep.store import Store
 from lagjax.sweep.structure import description_of
 
@@ -62,7 +62,10 @@ def _times(engine, axes, one):
 
 def _is_fixed(engine, axes, key):
     """Whether a leaf of what `run` returns does not depend on the point: `vmap` with `out_axes=None` decides."""
-    leaf = lambda point: dict(named_leaves(engine.run(point)))[key]
+
+    def leaf(point):
+        return dict(named_leaves(engine.run(point)))[key]
+
     try:
         jax.eval_shape(jax.vmap(leaf, out_axes=None), axes.at(np.zeros(1, int)))
     except ValueError as error:

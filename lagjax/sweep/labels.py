@@ -162,8 +162,31 @@ def _with_path(tree):
 
 
 def key_of(path) -> str:
-    """A path as `named_leaves` writes it."""
+    """A path as text; "" for a single leaf."""
     return jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".")
+
+
+def named_leaves(tree) -> list[tuple[str, Any]]:
+    """The leaves of what `run` returns, each with a name: its path, or "value" for a single leaf.
+
+    **Raises:** `ValueError` if two have the same name.
+    """
+    found = [(key_of(path) or "value", path, leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+    paths = {}
+    for name, path, _ in found:
+        paths.setdefault(name, []).append(jax.tree_util.keystr(path) or "the value itself")
+    for name, same_name in paths.items():
+        if len(same_name) > 1:
+            raise ValueError(
+                f"run returns {len(same_name)} values named '{name}': {', '.join(same_name)}.\n"
+                f"Usual cause: a key with a dot in it. Fix: another key, such as '{name.replace('.', '_')}'."
+            )
+    return [(name, leaf) for name, _, leaf in found]
+
+
+def shapes_of(values: PyTree, lead: int) -> str:
+    """The names and shapes of a point's values as text; the first `lead` dimensions are those of the sweep."""
+    return ", ".join(sorted(f"{name} {x.dtype}{list(np.shape(x)[lead:]) or ''}" for name, x in named_leaves(values)))
 
 
 def flags() -> dict[str, Any]:

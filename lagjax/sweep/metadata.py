@@ -3,7 +3,8 @@
 The description stands in the attributes of the group `lagjax`, with a digest: the fingerprint of the sweep, its blocks,
 and the places of its arrays. What zarr and xarray need, a `zarr.json` for each array, is made from it and read by them
 only; a sweep that continues writes it again where it is damaged. A store is made under a temporary name and then
-renamed, so that several processes may open it at the same time.
+renamed, so that several processes may open it at the same time. The fingerprint, of axes, values, program and versions,
+is what two runs must share to use one store.
 
 A store may come from anyone, and opening it writes nothing:
 
@@ -18,6 +19,8 @@ import os
 import re
 import shutil
 import uuid
+from collections.abc import Iterable
+from importlib.metadata import version
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
@@ -28,10 +31,14 @@ from lagjax.files.npz import MALFORMED, Explained, parsed
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.batch_program import NOT_RUN, STATUS_TYPES, Program, Status, digest
 from lagjax.sweep.chunks import Spec, chunk_file, nothing, write_chunk
-from lagjax.sweep.fingerprint import FORMAT, named_leaves
-from lagjax.sweep.labels import STORE_GROUP, labels_of, status_attributes
+from lagjax.sweep.labels import STORE_GROUP, labels_of, named_leaves, status_attributes
 
 META = "zarr.json"
+# Stores of other formats are not read.
+FORMAT = 4
+ANOTHER_FUNCTION = "run is another function"
+# Names reserved by zarr or by a store.
+RESERVED = ("", ".", "..", META, STORE_GROUP)
 MARKS = f"{STORE_GROUP}/marks"
 GROUP = {"zarr_format": 3, "node_type": "group", "attributes": {}}
 # Arrays of a store hold truth values and numbers, in the names of zarr and NumPy.
@@ -42,6 +49,64 @@ MOST_METADATA = 16_000_000
 MOST_BYTES, MOST_EXPANSION = 16_000_000, 1000
 # A sweep that continues computes as many points at a time as its store says, but no more than this.
 LONGEST_CHUNK = 1 << 24
+
+
+def fingerprint(axes: Axes, program: Program, layout: str) -> dict[str, Any]:
+    """The properties that two runs must share to use one store, readable where possible."""
+    return {
+        "format": FORMAT,
+        "points": ", ".join(f"{name}: {n}" for name, n in axes.dims.items()),
+        "axes": {name: of_axis(x) for name, x in axes.values.items()},
+        "values": {name: f"{x.dtype}{list(x.shape)}" for name, x in named_leaves(program.values)},
+        "chunk": program.chunk,
+        "layout": layout,
+        "program": program.digest,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """The versions of the packages that write a store."""
+    return {name: version(name) for name in ("lagjax", "jax", "diffrax")}
+
+
+def in_words(of_versions: dict[str, str]) -> str:
+    """Versions as text."""
+    return ", ".join(f"{name} {number}" for name, number in of_versions.items())
+
+
+def of_axis(x: np.ndarray) -> str:
+    """The dtype and shape of an axis and a digest of its values."""
+    return f"{x.dtype}{list(x.shape)} {digest(x.tobytes())}"
+
+
+def check_file_names(kind: str, names: Iterable[str]) -> None:
+    """Raise `ValueError` for names that cannot be folder names in a store."""
+    for name in names:
+        reserved = name in RESERVED or name.startswith("__") or "/" in name or "\\" in name
+        if reserved or not name.isprintable() or PureWindowsPath(name).anchor:
+            raise ValueError(
+                f"{kind} '{printable(name)}' cannot be kept in a store: it is reserved or not a valid folder name.\n"
+                "Fix: another key, of letters, digits and underscores."
+            )
+
+
+def differences(there: dict, here: dict, under: str = "") -> list[str]:
+    """The differences between two fingerprints, one line each."""
+    found = []
+    for key in dict.fromkeys((*there, *here)):
+        a, b, name = there.get(key), here.get(key), f"{under}{key}"
+        if isinstance(a, dict) and isinstance(b, dict):
+            found += differences(a, b, f"{name} ")
+        elif name == "program" and a != b:
+            found.append(ANOTHER_FUNCTION)
+        elif (
+            a != b and under == "axes " and isinstance(a, str) and isinstance(b, str) and a.split()[:1] == b.split()[:1]
+        ):
+            found.append(f"axis '{key}' has other values")
+        elif a != b:
+            found.append(f"{name}: {a} there, {b} here")
+    return found
 
 
 class Described(NamedTuple):

@@ -19,10 +19,9 @@ from lagjax.sweep import structure, tables
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import LOST, TRUSTED, Status
 from lagjax.sweep.chunks import nothing
-from lagjax.sweep.fingerprint import in_words as versions_in_words
-from lagjax.sweep.fingerprint import named_leaves, versions
-from lagjax.sweep.labels import words_of
-from lagjax.sweep.metadata import damaged
+from lagjax.sweep.labels import named_leaves, words_of
+from lagjax.sweep.metadata import damaged, versions
+from lagjax.sweep.metadata import in_words as versions_in_words
 from lagjax.sweep.store import Store, warn_of_damage
 from lagjax.sweep.web_page import MOST_MEGABYTES, page_of
 from lagjax.system import coordinates
@@ -204,8 +203,8 @@ class Sweep:
 
         **Raises:** `ValueError` if there is nothing to draw, or the page would be too large.
         """
-        in_front = lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[len(self.axes.shape) :])
-        flat = jax.tree.map(in_front, self.values)
+        lead = len(self.axes.shape)
+        flat = jax.tree.map(lambda x: np.asarray(x).reshape(self.axes.size, *np.shape(x)[lead:]), self.values)
         codes, film_settings = self.status.result.reshape(-1), {"seconds": seconds, "rate": rate, "trail": trail}
         page = page_of(self.axes, flat, codes, positions, megabytes, film_settings)
         if path is not None:
@@ -264,10 +263,9 @@ class Sweep:
     def _shapes(self):
         shown = []
         leaves = self._values.like if isinstance(self._values, Stored) else jax.tree.map(lambda x: x[0], self._values)
-        is_trajectory = lambda x: isinstance(x, Trajectory)
-        for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=is_trajectory):
+        for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=lambda x: isinstance(x, Trajectory)):
             name = jax.tree_util.keystr(path, simple=True, separator=".")
-            if is_trajectory(part):
+            if isinstance(part, Trajectory):
                 shown.append(f"{name or 'value'} Trajectory at {part.t.shape[-1]} times")
             else:
                 shown.append(f"{name or 'value'} {part.dtype}{list(part.shape) if part.shape else ''}")

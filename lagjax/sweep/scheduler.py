@@ -13,8 +13,7 @@ import numpy as np
 
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.jaxtools.fuse_cpu import TOGETHER
-from lagjax.sweep.batch_program import raised
-from lagjax.sweep.program_cache import program_for
+from lagjax.sweep.batch_program import program_for, raised
 
 # Each worker gets at least this many chunks, so that none waits long for the last one.
 CHUNKS_EACH = 4
@@ -61,11 +60,6 @@ class Engine:
         where = platform if count == 1 else f"{count} {platform}s"
         of_workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
         return f"{where}, {of_workers}, lanes {self.layout}, chunks of {self.chunk}"
-
-    def with_run(self, run, count):
-        """The same engine for another run, over `count` points."""
-        chunk = chunk_length(count, self.workers, self.chunk)
-        return Engine(run, self.axes, chunk, self.workers, self.sort, self.layout, self.devices, self.progress)
 
     def _program(self, robust, progress=False):
         chunk, devices, layout = self.chunk, self.devices, self.layout
@@ -150,7 +144,10 @@ class Engine:
         """Yield (positions among the indices, values, status) of chunks as they are finished, in any order."""
         chunk, order = self.chunk, self._order(indices)
         chunks = (order[start : start + chunk] for start in range(0, len(indices), chunk))
-        task = lambda positions: (positions, *self.at(indices[positions]))
+
+        def task(positions):
+            return positions, *self.at(indices[positions])
+
         if self.workers == 1:
             yield from map(task, chunks)
             return

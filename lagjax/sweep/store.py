@@ -43,9 +43,20 @@ from lagjax.sweep.chunks import (
     read_chunk,
     write_chunk,
 )
-from lagjax.sweep.fingerprint import ANOTHER_FUNCTION, differences, fingerprint, named_leaves, of_axis
-from lagjax.sweep.labels import flags
-from lagjax.sweep.metadata import MARKS, check_files, check_room, create, description_at, remove_leftovers, restore
+from lagjax.sweep.labels import flags, named_leaves
+from lagjax.sweep.metadata import (
+    ANOTHER_FUNCTION,
+    MARKS,
+    check_files,
+    check_room,
+    create,
+    description_at,
+    differences,
+    fingerprint,
+    of_axis,
+    remove_leftovers,
+    restore,
+)
 
 # The largest number of files that a message names.
 SHOWN = 5
@@ -264,13 +275,17 @@ class Store:
         return status, missing, lost
 
 
+def indented(lines: Iterable[str]) -> str:
+    """Lines of a message, each indented."""
+    return "".join(f"    {line}\n" for line in lines)
+
+
 def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
     """Warn of damage in a store."""
     wrong = list(wrong)
     more = [f"and {len(wrong) - SHOWN:,} more"] if len(wrong) > SHOWN else []
-    lines = "\n".join(f"    {line}" for line in [*wrong[:SHOWN], *more])
     warnings.warn(
-        f"the store {path} is damaged or incomplete:\n{lines}\n"
+        f"the store {path} is damaged or incomplete:\n{indented([*wrong[:SHOWN], *more])}"
         "Usual cause: a copy that was cut short, files removed, a disk or its network that failed.\n" + then,
         stacklevel=stacklevel + 1,
     )
@@ -317,16 +332,15 @@ def _check_belongs(path, stored, here, accept):
     older = [line for line in found if line.startswith(("versions", "format"))]
     # Other versions may trace another program from the same function.
     other = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
-    shown = lambda lines: "".join(f"    {line}\n" for line in lines)
     if other:
         raise ValueError(
-            f"{path} belongs to another sweep, and is left unchanged:\n{shown(found)}"
+            f"{path} belongs to another sweep, and is left unchanged:\n{indented(found)}"
             "Usual cause: run, the axes or a setting has changed since it was begun.\n"
             "Fix: another path; or undo the differences, to continue this one."
         )
     if older and not accept:
         raise ValueError(
-            f"{path} was written by other versions, and is left unchanged:\n{shown(older)}"
+            f"{path} was written by other versions, and is left unchanged:\n{indented(older)}"
             "Its contents can be read: lj.open_sweep(path).\n"
             "Fix: lj.sweep(..., accept_versions=True) continues it if run is still the same function, which "
             "cannot be checked across versions; or another path."

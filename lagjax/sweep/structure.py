@@ -24,7 +24,7 @@ from lagjax.integrate.trajectory.load import check_is_system, described_system, 
 from lagjax.integrate.trajectory.save import described, parts
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.sweep.axes import Axes
-from lagjax.sweep.fingerprint import named_leaves, shapes_of
+from lagjax.sweep.labels import named_leaves, shapes_of
 from lagjax.sweep.store import Store
 from lagjax.system.signature import UnknownSystem
 

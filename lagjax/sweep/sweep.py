@@ -4,8 +4,9 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,8 +16,8 @@ from lagjax.display.progress import meter
 from lagjax.sweep.axes import axes_of
 from lagjax.sweep.batch_program import LAYOUTS, not_run
 from lagjax.sweep.fill_store import Filling, compare_versions, groups_of_blocks, new_store
-from lagjax.sweep.fingerprint import check_file_names, shapes_of
-from lagjax.sweep.labels import labels_of
+from lagjax.sweep.labels import labels_of, shapes_of
+from lagjax.sweep.metadata import check_file_names
 from lagjax.sweep.result import Stored, Sweep, of_store
 from lagjax.sweep.scheduler import CHUNKS_EACH, Engine, chunk_length, usable_cores
 from lagjax.sweep.store import chunk_of, open_store, warn_of_damage
@@ -136,44 +137,34 @@ def _in_memory(engine, indices, before):
         except KeyboardInterrupt:
             _tell_interrupted(done, len(indices), "swept.resweep() runs the rest.")
     compiling, seconds = engine.seconds_since(started)
-
-    return Sweep(axes, values, status, engine.words, done, compiling, seconds, _Again(engine))
+    again = _Again((engine.chunk, engine.workers, engine.sort, engine.layout), engine)
+    return Sweep(axes, values, status, engine.words, done, compiling, seconds, again)
 
 
 class _Again:
-    """Runs points of a sweep in memory again, with the engine that ran it; a pickle has neither that nor `run`."""
+    """Runs points of a sweep in memory again; a pickle has neither the engine that ran it nor `run`."""
 
-    def __init__(self, engine: Engine):
-        self._engine = engine
+    def __init__(self, settings: tuple[int, int, bool | None, str], engine: Engine | None = None):
+        self._settings, self._engine = settings, engine
 
     def __deepcopy__(self, memo):
         return self
 
     def __reduce__(self):
+        return _Again, (self._settings,)
+
+    def __call__(self, swept: Sweep, run: Callable | None, which: np.ndarray) -> Sweep:
         engine = self._engine
-        return Elsewhere, (engine.chunk, engine.workers, engine.sort, engine.layout)
-
-    def __call__(self, swept, other, which):
-        engine = self._engine if other is None else self._engine.with_run(other, len(which))
-        return _again(swept, engine, which)
-
-
-class Elsewhere(NamedTuple):
-    """Runs points of an unpickled sweep again, with the function that is passed."""
-
-    chunk: int
-    workers: int
-    sort: bool
-    layout: str
-
-    def __call__(self, swept, other, which):
-        if other is None:
+        if run is not None:
+            chunk, *settings = self._settings
+            chunk = chunk_length(len(which), settings[0], chunk)
+            devices, progress = (jax.local_devices(), None) if engine is None else (engine.devices, engine.progress)
+            engine = Engine(run, swept.axes, chunk, *settings, devices, progress)
+        if engine is None:
             raise ValueError(
                 "a sweep that was unpickled does not know the function that ran it.\nFix: swept.resweep(run)."
             )
-        chunk = chunk_length(len(which), self.workers, self.chunk)
-        settings = self.workers, self.sort, self.layout
-        return _again(swept, Engine(other, swept.axes, chunk, *settings, jax.local_devices(), None), which)
+        return _again(swept, engine, which)
 
 
 def _again(swept, engine, which):
@@ -190,14 +181,13 @@ def _again(swept, engine, which):
 
 def _in_store(engine, axes, path, part, accept_versions):
     started = time.perf_counter()
-    new = lambda: new_store(engine, axes, CHUNKS_EACH * part[1])
+    new = partial(new_store, engine, axes, CHUNKS_EACH * part[1])
     store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, new)
     compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
-    length = lambda number: store.blocks.points(number).stop - store.blocks.points(number).start
     done = 0
-    with _meter(sum(map(length, missing)), engine.progress) as shown:
+    with _meter(store.blocks.size(missing), engine.progress) as shown:
         try:
             for numbers in groups_of_blocks(engine, store, missing):
                 filling = Filling(engine, store, numbers)
@@ -207,8 +197,8 @@ def _in_store(engine, axes, path, part, accept_versions):
                 done += len(filling.indices)
         except KeyboardInterrupt:
             # A block that was written just before the interruption counts as well.
-            done = sum(map(length, set(missing) - set(store.missing().tolist())))
-            _tell_interrupted(done, sum(map(length, missing)), "the same call continues from there.")
+            done = store.blocks.size(set(missing) - set(store.missing().tolist()))
+            _tell_interrupted(done, store.blocks.size(missing), "the same call continues from there.")
 
     here = f"{engine.words}, in {path}"
     status, _, lost = store.status()

@@ -7,8 +7,7 @@ import numpy as np
 
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.sweep.batch_program import Status
-from lagjax.sweep.fingerprint import named_leaves
-from lagjax.sweep.labels import Labels, labels_of, shared_times, status_attributes, words_of
+from lagjax.sweep.labels import Labels, labels_of, named_leaves, shared_times, status_attributes, words_of
 
 # The largest number of columns for one array of a point.
 MOST_COLUMNS = 100

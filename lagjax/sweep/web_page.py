@@ -218,8 +218,7 @@ def _film(axes, values, codes, positions, megabytes, seconds, rate, trail):
             "Fix: run = lambda point: lj.integrate(system, q0, v0, params | point, ts=ts)."
         )
     lanes = jax.tree.map(np.asarray, motions[0])
-    lane = lambda i: jax.tree.map(lambda x: x[i], lanes)
-    trajs = [lane(i) if code != NOT_RUN else None for i, code in enumerate(codes)]
+    trajs = [jax.tree.map(lambda x, i=i: x[i], lanes) if code != NOT_RUN else None for i, code in enumerate(codes)]
     frames = axes.size * rate * (seconds or 2.0)
     if frames > MOST_FRAMES:
         raise ValueError(

@@ -69,7 +69,10 @@ class TimedProgram:
     def call_seconds(self) -> float:
         """The least time of a call of an empty program with the same arguments and results."""
         args = self._arguments(1e-3)
-        zeros = lambda args: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
+
+        def zeros(args):
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
+
         idle = jax.jit(zeros).lower(args).compile()
         return min(seconds_of(lambda: idle(args)) for _ in range(50))
 

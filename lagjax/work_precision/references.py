@@ -1,5 +1,9 @@
 """The reference that errors are measured against, given or computed, and how far it can be trusted.
 
+Compared are states at the outputs or at the final event, and event times. Each leaf of the coordinates and of the
+velocities counts relative to its largest value during the motion, each event time relative to the time span; the error
+is the largest of all.
+
 A computed reference consists of two solves at the tightest tolerance by methods of different kinds. Their errors are
 unrelated, so the distance between them is the possible error of either. A given reference is checked, too: if solves at
 the tightest tolerances agree with each other, but all are far from it, the reference has that error.
@@ -7,25 +11,121 @@ the tightest tolerances agree with each other, but all are far from it, the refe
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
+from lagjax.integrate.events.event import Crossing
+from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.trajectory.results import ended_well, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.numerics.methods.radau import Radau5
 from lagjax.system import coordinates
-from lagjax.work_precision import compared
-from lagjax.work_precision.compared import Compared, ComparedScales, ComparedStates
 from lagjax.work_precision.methods import TIGHTEST, usual
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram
 
 # A given reference is wrong if it is this many times farther from solves than these are from each other.
 FARTHER = 10.0
 FIX_OF_FORM = "reference=traj, reference=(q, v) with each leaf at all ts, or reference=lambda ts: (q, v)"
+# The number of times at which the largest values are sought, and the tolerance of that motion.
+SAMPLES, ROUGH_TOLERANCE = 200, 1e-5
+
+
+class ComparedStates(NamedTuple):
+    """The coordinates and velocities of a motion at its outputs, each leaf with a leading axis."""
+
+    t: np.ndarray
+    q: PyTree
+    v: PyTree
+    params: PyTree
+
+
+class Compared(NamedTuple):
+    """States, each leaf with a leading axis, and times of events by name."""
+
+    q: PyTree
+    v: PyTree
+    times: dict[str, np.ndarray]
+
+
+def compared_of(motion: ComparedStates | Trajectory, events: Mapping[str, Crossing] | None) -> Compared:
+    """The compared states and event times of a motion."""
+    q, v, times = motion.q, motion.v, {}
+    if events and isinstance(motion, Trajectory):
+        times = {name: np.asarray(found.found().t) for name, found in motion.events.items()}
+        if any(crossing.terminal for crossing in events.values()):
+            q, v = (jax.tree.map(lambda x: np.asarray(x)[None], tree) for tree in (motion.end.q, motion.end.v))
+            times[""] = np.atleast_1d(np.asarray(motion.end.t))
+    return Compared(*(jax.tree.map(np.asarray, tree) for tree in (q, v)), times)
+
+
+def in_words(events: Mapping[str, Crossing] | None, outputs: int) -> str:
+    """A description of what is compared."""
+    at = f"at {outputs} times"
+    if events:
+        ends = any(crossing.terminal for crossing in events.values())
+        at = f"{'at the end' if ends else at}, and times of {', '.join(map(repr, events))}"
+    return f"coordinates and velocities {at}, each relative to its largest value on the way"
+
+
+class ComparedScales(NamedTuple):
+    """The units of an error: for each leaf of q and v, and for times."""
+
+    q: PyTree
+    v: PyTree
+    time: float
+
+    def error(self, found: Compared, right: Compared) -> float:
+        """The largest relative error; infinite if the numbers of events differ."""
+        errors = []
+        for tree, exact, scale in ((found.q, right.q, self.q), (found.v, right.v, self.v)):
+            leaves = zip(jax.tree.leaves(tree), jax.tree.leaves(exact), jax.tree.leaves(scale), strict=True)
+            errors += [np.max(np.abs(a - b), initial=0.0) / unit for a, b, unit in leaves]
+        for name, times in right.times.items():
+            if times.shape != found.times[name].shape:
+                return float("inf")
+            errors.append(np.max(np.abs(found.times[name] - times), initial=0.0) / self.time)
+        # Unlike Python's max, this keeps NaN.
+        return float(np.max(errors))
+
+
+def other_events(found: Compared, right: Compared) -> str:
+    """A message naming an event whose number differs from the reference; empty if there is none."""
+    for name, times in right.times.items():
+        if times.shape != found.times[name].shape:
+            return f"{len(found.times[name])} crossings of '{name}' where the reference has {len(times)}"
+    return ""
+
+
+def scales_of(samples: Any, ts) -> ComparedScales:
+    """The units from states (q, v) during the motion, each leaf with a leading axis."""
+    largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0)) or 1.0
+    return ComparedScales(*jax.tree.map(largest, tuple(samples)), time=abs(float(ts[-1] - ts[0])))
+
+
+def states_during(motion: ComparedMotion, program: TimedProgram):
+    """States (q, v) at many times; the compiled program runs from one short interval to the next, at its own outputs.
+
+    Backward in time the program's times are fixed, so another program is compiled.
+    """
+    ts, start, tolerance = motion.ts, motion.start, ROUGH_TOLERANCE
+    if runs_backward(ts):
+        found = TimedProgram(motion._replace(ts=np.linspace(ts[0], ts[-1], SAMPLES, dtype=ts.dtype)), None)(tolerance)
+        return found.q, found.v
+    q, v, rows = start.q, start.v, []
+    for a, b in pairwise(np.linspace(ts[0], ts[-1], 1 + max(1, SAMPLES // (len(ts) - 1)))):
+        found = program(tolerance, np.linspace(a, b, len(ts), dtype=ts.dtype), q, v)
+        rows.append((found.q, found.v))
+        # Stop at an event or a failure.
+        if not bool(ended_well(found.result)) or float(found.end.t) < b:
+            break
+        q, v = found.end.q, found.end.v
+    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves]), *rows)
 
 
 @dataclass(frozen=True)
@@ -92,7 +192,7 @@ def computed_reference(
         first = program if first is None else first
         trajectory = program(tolerance)
         if bool(ended_well(trajectory.result)):
-            found[name] = compared.compared_of(trajectory, motion.options["events"])
+            found[name] = compared_of(trajectory, motion.options["events"])
         else:
             reasons.append(f"{name}: {message(trajectory.result)}")
     if len(found) < 2 or first is None:
@@ -104,7 +204,7 @@ def computed_reference(
             "Fix: look at lj.integrate(system, q0, v0, params, ts=ts), shorten ts, or give reference=."
         )
     (one, best), (two, other) = found.items()
-    scales = compared.scales_of(compared.states_during(motion, first), motion.ts)
+    scales = scales_of(states_during(motion, first), motion.ts)
     apart = scales.error(best, other)
     apart = apart if np.isfinite(apart) else float("inf")
     how = f"{one} and {two} at {tolerance:.0e}, which agree"
@@ -117,7 +217,7 @@ def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgra
     ts, dtype, events = motion.ts, motion.ts.dtype, motion.options["events"]
     if isinstance(reference, Trajectory):
         _check_trajectory(reference, motion)
-        right, how = compared.compared_of(reference, events), "the trajectory that was given"
+        right, how = compared_of(reference, events), "the trajectory that was given"
     else:
         if events:
             raise TypeError(
@@ -126,12 +226,12 @@ def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgra
             )
         how = "the function that was given" if callable(reference) else "the states that were given"
         states = reference(jnp.asarray(ts)) if callable(reference) else reference
-        right = compared.compared_of(ComparedStates(ts, *_as_states(states, motion), None), None)
+        right = compared_of(ComparedStates(ts, *_as_states(states, motion), None), None)
     if callable(reference) and not isinstance(reference, Trajectory):
-        samples = reference(jnp.linspace(ts[0], ts[-1], compared.SAMPLES, dtype=dtype))
+        samples = reference(jnp.linspace(ts[0], ts[-1], SAMPLES, dtype=dtype))
     else:
-        samples = compared.states_during(motion, program)
-    return KnownAnswer(right, compared.scales_of(samples, ts), how, 0.0, dtype)
+        samples = states_during(motion, program)
+    return KnownAnswer(right, scales_of(samples, ts), how, 0.0, dtype)
 
 
 def _as_states(states, motion):

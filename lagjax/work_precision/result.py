@@ -1,9 +1,4 @@
-"""The result of a comparison: a table, a diagram, and the best choice.
-
-The parts of a comparison: points, the curve of each method, and its measured order.
-
-Plain-text tables.
-"""
+"""The result of a comparison: points, the curve of each method with its measured order, tables, and a diagram."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,9 +9,11 @@ import numpy as np
 from lagjax.display import plots as plot
 from lagjax.display.plots import DrawnAxes
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.work_precision import data_tables
 from lagjax.work_precision.methods import as_code
 from lagjax.work_precision.references import Reference
+
+# The numbers of a point; unknown ones are NaN.
+NUMBERS = ("error", "seconds", "least", "steps", "evaluations")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -198,14 +195,52 @@ class WorkPrecision:
 
         **Raises:** `ImportError` without pandas.
         """
-        return data_tables.frame(self)
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError('this needs pandas, an optional extra.\nFix: pip install "lagjax[data]"') from error
+        points = list(self.points)
+        names = ("method", "tolerance", "error", "trusted", "seconds", "least", "steps", "evaluations")
+        columns = {name: [getattr(point, name) for point in points] for name in names}
+        for name in ("steps", "evaluations"):  # Whole numbers, some of which may be unknown.
+            columns[name] = pandas.array(columns[name], "Int64")
+        columns["order"] = [self[point.method].order for point in points]
+        columns["compile_seconds"] = [self[point.method].compile_seconds for point in points]
+        for name in ("method", "result"):
+            words = [getattr(point, name) for point in points]
+            columns[name] = pandas.Categorical(words, list(dict.fromkeys(words)))
+        return pandas.DataFrame(columns)
 
     def to_xarray(self):
         """An `xarray.Dataset` over `solver` (the methods by name) and `tolerance`, loose to tight; NaN where not tried.
 
         **Raises:** `ImportError` without xarray.
         """
-        return data_tables.dataset(self)
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
+        methods, points = list(self.curves), list(self.points)
+        tolerances = sorted({point.tolerance for point in points}, reverse=True)
+        # Not called `method`, which is an argument of xarray's `sel`.
+        shape, dims = (len(methods), len(tolerances)), ("solver", "tolerance")
+        numbers = {name: np.full(shape, np.nan) for name in NUMBERS}
+        trusted, results = np.zeros(shape, bool), np.full(shape, "not tried", object)
+        for point in points:
+            at = methods.index(point.method), tolerances.index(point.tolerance)
+            for name, x in numbers.items():
+                known = getattr(point, name)
+                x[at] = np.nan if known is None else known
+            trusted[at], results[at] = point.trusted, point.result
+        variables: dict[str, Any] = {name: (dims, x) for name, x in numbers.items()}
+        variables |= {"trusted": (dims, trusted), "result": (dims, results.astype(str))}
+        coords: dict[str, Any] = {"solver": methods, "tolerance": tolerances}
+        for name in ("order", "compile_seconds"):
+            coords[name] = "solver", [getattr(curve, name) for curve in self.curves.values()]
+        attributes = {"measured": self.measured, "call_seconds": self.call_seconds}
+        if self.reference is not None:
+            attributes["reference_error"] = self.reference.error
+        return xarray.Dataset(variables, coords, attributes)
 
     def plot(self, title: str = ""):
         """Draw error against run time, and against evaluations of the accelerations; returns a matplotlib `Figure`.

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,11 +20,10 @@ from lagjax.numerics.methods.nystrom import evaluations_a_step
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
 from lagjax.system.system import System
-from lagjax.work_precision import compared, references
-from lagjax.work_precision.compared import Compared, ComparedStates
+from lagjax.work_precision import references
 from lagjax.work_precision.methods import chosen, ladder
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram, Times, interleaved_times, without_overhead
-from lagjax.work_precision.references import KnownAnswer, Reference
+from lagjax.work_precision.references import Compared, ComparedStates, KnownAnswer, Reference
 from lagjax.work_precision.result import Curve, Point, WorkPrecision
 
 # The options of `integrate` that mean the same for every method.
@@ -133,7 +133,7 @@ def work_precision(
             for name in (*solvers, *(others or {}))
         },
         reference=judged,
-        measured=compared.in_words(events, len(motion.ts)) if error is None else "as given by error=",
+        measured=references.in_words(events, len(motion.ts)) if error is None else "as given by error=",
         call_seconds=call_seconds,
     )
 
@@ -204,7 +204,7 @@ def _solves_of_other(motion, name, solve, tolerances, patience):
     solves, slow = [], ""
     solve(tolerances[0])
     for tolerance in tolerances:
-        call = lambda tolerance=tolerance: solve(tolerance)
+        call = partial(solve, tolerance)
         if slow:
             solves.append(Solve(name, tolerance, None, None, slow, call, 0.0))
             continue
@@ -241,7 +241,7 @@ def _tightest(motion, solved) -> list[Compared]:
     by_method = list({solve.method: solve for solve in reversed(good)}.values())
     by_method.sort(key=lambda solve: solve.tolerance)
     chosen = by_method if len(by_method) > 1 else good
-    return [compared.compared_of(solve.found, motion.options["events"]) for solve in chosen[:2]]
+    return [references.compared_of(solve.found, motion.options["events"]) for solve in chosen[:2]]
 
 
 def _points(motion, solvers, solved, known: KnownAnswer | None, judged: Reference | None, error, call_seconds, repeats):
@@ -260,8 +260,8 @@ def _point(motion, solve, times, solvers, known, judged, error, call_seconds):
     if solve.ended_well and known is None:
         distance = float(error(found))
     elif solve.ended_well:
-        of_motion = compared.compared_of(found, events)
-        distance, reason = known.distance(of_motion), compared.other_events(of_motion, known.right) or reason
+        of_motion = references.compared_of(found, events)
+        distance, reason = known.distance(of_motion), references.other_events(of_motion, known.right) or reason
     steps, evaluations = None, solve.evaluations
     if ours:
         steps, stages = int(found.stats["num_steps"]), evaluations_a_step(solvers[solve.method])

@@ -47,7 +47,7 @@ RECORD = lj.Record(T, q=Q)
         ((RECORD, PENDULUM, {"loss": "cubic"}), ValueError, "'squares'"),
         ((RECORD, PENDULUM, {"observe": lambda t, q, v, params: q}), ValueError, "belong together"),
         ((RECORD, PENDULUM, {"ts": T}), ValueError, "'ts' cannot be given"),
-        ((RECORD, PENDULUM, {"optimiser": "adam"}), TypeError, "optax.adam"),
+        ((RECORD, PENDULUM, {"optimiser": "adam"}), TypeError, "lj.fit_loss"),
         ((RECORD, PENDULUM, {"window": 0.01}), ValueError, "shorter than two intervals"),
         ((Q, PENDULUM, {}), TypeError, "lj.Record"),
         ((lj.Record(T, q={"theta": Q}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "was measured as"),

@@ -11,7 +11,7 @@ import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 import lagjax as lj
-from lagjax.sweep import fingerprint
+from lagjax.sweep import metadata
 from lagjax.sweep import store as store_module
 from lagjax.sweep.batch_program import LOST
 from lagjax.sweep.chunks import Spec, chunk_file, nothing, read_chunk, write_chunk
@@ -311,7 +311,7 @@ def rewrite(path, change):
 
 def by_another_version(description):
     """Pretend that another version, which traced another program, wrote the store."""
-    description["fingerprint"] |= {"versions": fingerprint.versions() | {"jax": "0.9.0"}, "program": "0" * 16}
+    description["fingerprint"] |= {"versions": metadata.versions() | {"jax": "0.9.0"}, "program": "0" * 16}
 
 
 def test_other_versions(store):

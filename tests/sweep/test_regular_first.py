@@ -14,7 +14,7 @@ from lagjax.fit.search.search import in_turn
 from lagjax.integrate.solve import harvest
 from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
-from lagjax.sweep import batch_program, program_cache
+from lagjax.sweep import batch_program
 from lagjax.sweep.axes import axes_of
 from tests.plain import not_plain
 from tests.tiers import exhaustive_but
@@ -52,20 +52,20 @@ def quiet(run, axes=BOTH, **settings):
 def regular_alone(run, axes=BOTH):
     """(values, status, settled) of only the program that assumes regular motions."""
     grid = axes_of(axes, False)
-    program, _ = program_cache.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
+    program, _ = batch_program.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
     return program.call(grid.at(np.arange(grid.size)), grid.size)
 
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch):
     """Count the compiled programs of each kind, starting with an empty cache."""
-    count, compiled = Counter(), program_cache.compiled
+    count, compiled = Counter(), batch_program.compiled
 
     def counted(*args):
         count["robust" if args[-1] else "regular"] += 1
         return compiled(*args)
 
-    monkeypatch.setattr(program_cache, "compiled", counted)
+    monkeypatch.setattr(batch_program, "compiled", counted)
     PROGRAMS.clear()
     return count
 

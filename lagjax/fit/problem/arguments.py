@@ -30,7 +30,13 @@ SET_BY_FIT = {"ts", "throw", "adjoint"}
 def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> FitProblem:
     """Check all arguments and make arrays of them."""
     check_system(system, records, params, phases=True)
-    system = _system_at_start(system, window, options)
+    # A motion in phases starts in that of `start=`, which is no option of the motions.
+    system = system.starting(options.pop("start", None))
+    if system.in_phases and window is not None:
+        raise ValueError(
+            "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "
+            "known.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."
+        )
     first = system.first_phase
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
@@ -46,8 +52,10 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     found = find(params, free, bounds or {}, priors or {}, dtype)
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
-    params_of = lambda r: replace(found.params, {name: values[r] for name, values in overrides.items()})
-    guessed, unflatten, guess = starts(first, records, windows, params_of, options)
+    params_of_records = [
+        replace(found.params, {name: values[r] for name, values in overrides.items()}) for r in range(len(records))
+    ]
+    guessed, unflatten, guess = starts(first, records, windows, params_of_records, options)
     system = traced_phases(system, guess)
     first, observe, options = system.first_phase, _traced(observe, guess), _with_traced_events(options, first, guess)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)
@@ -77,17 +85,6 @@ def _with_traced_events(options, system, guess):
     given = guess._asdict() | {"multipliers": model_of(traced_system(system, guess), *guess).zero_multipliers()}
     traced = {name: event.with_guard(traced_guard(name, event.guard, given)) for name, event in events.items()}
     return options | {"events": traced}
-
-
-def _system_at_start(system, window, options):
-    """The system; a motion in phases starts in that of `start=`, which is removed from the options."""
-    system = system.starting(options.pop("start", None))
-    if system.in_phases and window is not None:
-        raise ValueError(
-            "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "
-            "known.\nFix: leave window out; or a lj.Record for each part, with start= the phase of all of them."
-        )
-    return system
 
 
 def _absolute(records, loss, priors):
@@ -155,7 +152,10 @@ def _gathered(windows, trees, kind):
     if kind == "end":
         last = np.append(windows.record[1:] != windows.record[:-1], True)
         xp = numpy_of(trees)
-        place = lambda *x: xp.stack([xp.where(at, x[r], np.nan) for r, at in zip(windows.record, last)])
+
+        def place(*x):
+            return xp.stack([xp.where(at, x[r], np.nan) for r, at in zip(windows.record, last)])
+
         return jax.tree.map(place, *trees)
     return jax.tree.map(lambda *x: windows.gather(x), *trees)
 
@@ -179,8 +179,8 @@ def _sigmas(records, windows, measured, absolute):
     each = [{kind: _broadcast(record, kind) for kind in record.measured} for record in records]
     sigma = {kind: _gathered(windows, [tree[kind] for tree in each], kind) for kind in measured}
     xp = numpy_of((spreads, sigma))
-    finest = lambda s: xp.nanmin(xp.where(xp.isfinite(s), s, np.nan))
-    ratios = [a / finest(s) for a, s in zip(jax.tree.leaves(spreads), jax.tree.leaves(sigma))]
+    finest = [xp.nanmin(xp.where(xp.isfinite(s), s, np.nan)) for s in jax.tree.leaves(sigma)]
+    ratios = [a / s for a, s in zip(jax.tree.leaves(spreads), finest)]
     return sigma, spreads, xp.asarray(xp.max(xp.stack(ratios)))
 
 

@@ -14,12 +14,12 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.5.3 (ta
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.fit.problem.records import Record, Windows, spread
 from lagjax.integrate.integrate import integrate
@@ -37,6 +37,7 @@ from lagjax.system import constraints, coordinates
 from lagjax.system.check_functions import traced_system
 from lagjax.system.coordinates import State
 from lagjax.system.model import Model, model_of
+from lagjax.system.system import System
 
 # Position and velocity are read off a parabola through this many samples.
 SAMPLES = 7
@@ -92,13 +93,13 @@ class Starts(NamedTuple):
 
 
 def starts(
-    system, records: Sequence[Record], windows: Windows, params_of: Callable, options
+    system: System, records: Sequence[Record], windows: Windows, params: Sequence[PyTree], options: dict[str, Any]
 ) -> tuple[Starts, Callable, State]:
     """The guessed starts of all windows, the function from a vector of coordinates to a pytree, and one start."""
     guesses = []
     for r, record in enumerate(records):
         here = np.flatnonzero(windows.record == r)
-        first = _guess(system, record, r, params_of(r))
+        first = _guess(system, record, r, params[r])
         guesses.append(first)
         read = [_state_from_samples(record, windows.sample[w][windows.real[w]]) for w in here[1:]]
         structure = jax.tree.structure((first.q, first.v))
@@ -242,8 +243,8 @@ def _states_along_motion(system, first, ts, options):
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
     # If the motion from the guess does not reach a window, the start replaces the missing state.
     xp = numpy_of((motion.q, motion.v, first.q, first.v))
-    fill = lambda x, x0: xp.where(xp.isfinite(x), x, x0[None])
-    q, v = jax.tree.map(fill, (motion.q, motion.v), (first.q, first.v))
+    reached, start = (motion.q, motion.v), (first.q, first.v)
+    q, v = jax.tree.map(lambda x, x0: xp.where(xp.isfinite(x), x, x0[None]), reached, start)
     return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]
 
 

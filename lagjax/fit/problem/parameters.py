@@ -8,6 +8,7 @@ A fitted number x is searched as an unbounded one, z:
     x = low + (high - low) / (1 + exp(-z))         between
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import compress
@@ -65,12 +66,32 @@ class FreeNumbers:
             at += size
         return jtu.tree_unflatten(structure, leaves)
 
+    def tree(self, y: Float[Array, " p"]) -> PyTree:
+        """Numbers in the structure of `params`, with None in place of what is not fitted."""
+        leaves, structure = jtu.tree_flatten(self.params)
+        chosen: list[Any] = [None] * len(leaves)
+        at = 0
+        for number, places in self.leaves:
+            shape = leaves[number].shape if places is None else (len(places),)
+            size = math.prod(shape)
+            chosen[number] = y[at : at + size].reshape(shape)
+            at += size
+        return jtu.tree_unflatten(structure, chosen)
+
+    def vector(self, tree: PyTree) -> Float[Array, " p"]:
+        """The inverse of `tree`."""
+        parts = [jnp.ravel(x).astype(self.start.dtype) for x in jax.tree.leaves(tree)]
+        return jnp.concatenate(parts or [jnp.zeros(0, self.start.dtype)])
+
     def natural(self, z):
         """Numbers within their bounds from unbounded ones."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         below, above = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
-        # Zeros in branches that are not taken: an overflow there would make derivatives NaN.
-        z_if = lambda taken: jnp.where(taken, z, 0.0)
+
+        def z_if(taken):
+            # Zeros in branches that are not taken: an overflow there would make derivatives NaN.
+            return jnp.where(taken, z, 0.0)
+
         x = jnp.where(low & ~high, below + jnp.exp(z_if(low & ~high)), z)
         x = jnp.where(high & ~low, above - jnp.exp(-z_if(high & ~low)), x)
         return jnp.where(high & low, below + (above - below) * jax.nn.sigmoid(z_if(high & low)), x)

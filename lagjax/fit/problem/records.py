@@ -128,8 +128,9 @@ def channel_name(kind: str, path) -> str:
 def spread(x):
     """The standard deviation of the values that are not missing; 0 if all are."""
     xp, known = numpy_of(x), ~numpy_of(x).isnan(x)
-    mean = lambda y: xp.sum(xp.where(known, y, 0.0)) / xp.maximum(xp.sum(known), 1)
-    return xp.sqrt(mean((x - mean(x)) ** 2))
+    count = xp.maximum(xp.sum(known), 1)
+    mean = xp.sum(xp.where(known, x, 0.0)) / count
+    return xp.sqrt(xp.sum(xp.where(known, (x - mean) ** 2, 0.0)) / count)
 
 
 def _is_list_of_numbers(x):
@@ -216,6 +217,11 @@ class Windows(NamedTuple):
         return xp.stack(rows)
 
 
+def closest(t: Float[np.ndarray, " n"], dtype: Any) -> float:
+    """The interval of padding times, which costs next to nothing and is above round-off."""
+    return max(PADDING * np.min(np.diff(t)), 8 * np.finfo(dtype).eps * np.max(np.abs(t)))
+
+
 def padded(t: Float[np.ndarray, " n"], length: int, step: float) -> Float[np.ndarray, " length"]:
     """Times filled up to a length by others, at intervals of `step`."""
     return np.concatenate([t, t[-1] + step * (1 + np.arange(length - len(t)))])
@@ -242,8 +248,7 @@ def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
     real = np.zeros((len(pieces), length), bool)
     for w, (r, start, stop, seamed) in enumerate(pieces):
         t, n = records[r].t, stop - start
-        step = max(PADDING * np.min(np.diff(t)), 8 * np.finfo(dtype).eps * np.max(np.abs(t)))
-        ts[w] = padded(t[start : stop + seamed], length, step)
+        ts[w] = padded(t[start : stop + seamed], length, closest(t, dtype))
         sample[w, :n], real[w, :n] = np.arange(start, stop), True
     last = np.array([stop - start + seamed - 1 for _, start, stop, seamed in pieces])
     return Windows(

@@ -33,6 +33,9 @@ from lagjax.system.model import model_of
 NOT_REACHED = 10.0
 # The largest number of steps of a motion, per output and in addition: a bad guess may make the motion stiff.
 STEPS_EACH, STEPS = 16, 10_000
+# The cost of a jump between joined windows, stage by stage, relative to the cost of an equal distance from the data.
+# (With larger weights the round-off of chaotic motions in the jumps keeps a search from converging.)
+JOINING = (0.1, 1.0, 10.0, 100.0, 1e3)
 # The scale (in sigmas) for 95 % efficiency with normal errors, and the loss divided by the squared scaled residual.
 LOSSES = {
     "squares": (1.0, lambda z2: jnp.ones_like(z2)),
@@ -134,8 +137,7 @@ class FitProblem:
         values = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers, "end": motion.end._asdict()}
         observe = self.observe
         if observe is not None:
-            at = lambda t, q, v: observe(t, q, v, motion.params)
-            values["observed"] = jax.vmap(at)(motion.t, motion.q, motion.v)
+            values["observed"] = jax.vmap(lambda t, q, v: observe(t, q, v, motion.params))(motion.t, motion.q, motion.v)
         return values
 
     def predicted(self, motion) -> dict[str, PyTree]:
@@ -156,7 +158,9 @@ def starts_at(problem: FitProblem, u: Unknowns, windows: Int[Array, " R"]):
     p = u.shared.size
 
     def at(w):
-        state = lambda both: problem.state(both[:p], both[p:], w)
+        def state(both):
+            return problem.state(both[:p], both[p:], w)
+
         both = jnp.concatenate([u.shared, u.local[w]])
         return state(both), jax.jacfwd(state)(both)
 
@@ -181,14 +185,17 @@ def window_part(problem: FitProblem, x, s, w, stage: Stage, adjoint=None, loss: 
     motion, start = problem.motion(x, s, w, stage, adjoint)
     rows = residuals(problem, motion, w, stage, problem.loss if loss is None else loss)
     well = ended_well(motion.result)
-    vector = lambda tree: jnp.concatenate([jnp.ravel(y) for y in jax.tree.leaves(tree)])
     if problem.windows.count == 1:
         nothing = jnp.zeros(0, rows.dtype)
         return WindowPart(rows, nothing, nothing), well
     last = problem.windows.last[w]
-    end = vector(jax.tree.map(lambda y: y[last], (motion.q, motion.v)))
+    end = _vector(jax.tree.map(lambda y: y[last], (motion.q, motion.v)))
     reached = jnp.isfinite(end)
-    return WindowPart(rows, vector(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
+    return WindowPart(rows, _vector(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
+
+
+def _vector(tree):
+    return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
 def assemble(problem: FitProblem, u: Unknowns, parts: WindowPart, stage: Stage) -> WindowedEquations:
@@ -201,7 +208,7 @@ def assemble(problem: FitProblem, u: Unknowns, parts: WindowPart, stage: Stage) 
 def assemble_slopes(problem: FitProblem, by_shared: WindowPart, by_local: WindowPart, stage: Stage) -> Slopes:
     """The slopes of all equations, from the slopes (W, ..., p) and (W, ..., k) of the windows' contributions."""
     seam_weights = _seam_weights(problem, stage)[:, :, None]
-    following = lambda x: jnp.roll(x, -1, axis=0)
+    following = partial(jnp.roll, shift=-1, axis=0)
     return Slopes(
         by_shared.rows,
         by_local.rows,

@@ -140,7 +140,6 @@ class Fit:
       first: the search came to rest, and the residuals neither contradict `sigma` nor follow a curve.
     - Arrays are NumPy arrays, unless the fit is part of a compiled program.
     - `steps`, `cost`: of the search. `costs`: from each start, the guess first; NaN for starts that were not needed.
-    - `training`: the course of a training with optax, `found.training.plot()`, and the fit of the held-back records.
     """
 
     problem: FitProblem
@@ -152,7 +151,6 @@ class Fit:
     costs: Float[Array, " starts"]
     evaluation: Evaluation | None
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)
-    training: Any = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -440,7 +438,7 @@ class Fit:
     def __repr__(self):
         if is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
-        return by_line("\n".join(lines_of(self) + ([] if self.training is None else [repr(self.training)])))
+        return by_line("\n".join(lines_of(self)))
 
 
 @partial(compiled, in_numpy=True)
@@ -453,9 +451,7 @@ def _rows(problem: FitProblem, u: Unknowns):
 def _robust_variance(r, known, loss):
     """The variance of an M-estimate: Huber, *Robust Statistics*, Eq. (7.6.2)."""
     constant, _ = LOSSES[loss]
-    half = lambda r: 0.5 * dampened(r, loss) ** 2
-    slope = jax.vmap(jax.grad(half))
-    curvature = jax.vmap(jax.grad(jax.grad(half)))
+    slope = jax.grad(lambda r: 0.5 * dampened(r, loss) ** 2)
     r = jnp.where(r == 0, constant * 1e-9, r)
-    mean = lambda x: jnp.sum(jnp.where(known, x, 0.0)) / jnp.sum(known)
-    return mean(slope(r) ** 2) / mean(curvature(r)) ** 2
+    squares, curvatures = jax.vmap(slope)(r) ** 2, jax.vmap(jax.grad(slope))(r)
+    return jnp.mean(squares, where=known) / jnp.mean(curvatures, where=known) ** 2

@@ -14,7 +14,7 @@ ASTRAY = 1e6
 
 def caveats(fit: Fit) -> list[str]:
     """What a user has to know about a fit, the most serious first."""
-    words = [_search_caveat(fit), _training_caveat(fit), _astray_caveat(fit), _sigma_caveat(fit) or _curve_caveat(fit)]
+    words = [_search_caveat(fit), _astray_caveat(fit), _sigma_caveat(fit) or _curve_caveat(fit)]
     if fit.evaluation is not None:
         words += [_parameters_caveat(fit), _motion_caveat(fit)]
         words += [] if fit.problem.absolute else [_freedom_caveat(fit)]
@@ -26,11 +26,6 @@ def caveats(fit: Fit) -> list[str]:
 def _search_caveat(fit):
     if bool(fit.rested):
         return ""
-    if fit.training is not None:
-        return (
-            f"training ended after {int(fit.steps)} steps while the residuals were still getting smaller.\n"
-            "Fix: more iterations=; or params=found.params, to go on from here. found.training.plot() shows it."
-        )
     return (
         f"the search stopped after {int(fit.steps)} steps without converging; this is its best point.\n"
         "Usual cause: a guess too far off, parameters that the data hardly determine, noise in the motion itself.\n"
@@ -38,22 +33,7 @@ def _search_caveat(fit):
     )
 
 
-def _training_caveat(fit):
-    training = fit.training
-    if training is None or not (int(training.failed) or int(training.skipped)):
-        return ""
-    return (
-        f"in training {int(training.failed)} of {int(training.motions)} motions stopped early, and "
-        f"{int(training.skipped)} of {int(training.steps)} steps had no finite gradient. "
-        "These changed nothing.\n"
-        "Usual cause: steps that are too long, a nearly singular mass matrix, windows that are too long.\n"
-        "Fix: a smaller learning rate, optax.clip_by_global_norm, a shorter window=; lj.learned.positive_definite."
-    )
-
-
 def _astray_caveat(fit):
-    if fit.training is not None:
-        return ""
     guesses = zip(fit.names, np.asarray(fit.problem.found.start), np.asarray(fit.values))
     for name, guess, x in guesses:
         if guess and abs(x) > ASTRAY * abs(guess):

@@ -130,13 +130,19 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
         half = jnp.nanmedian(jnp.where(known, jnp.abs(r), jnp.nan))
         x, free = (OF_NORMAL * _undampened(half, problem.loss)) ** 2, EFFICIENCY * count * left
         largest = (OUTLIER_FACTOR * TOO_LARGE) ** 2
-    above = lambda z: (left > 0) & (x > _exceeded_by_chance(jnp.maximum(free, 1e-3), z))
+
+    def above(z):
+        return (left > 0) & (x > _exceeded_by_chance(jnp.maximum(free, 1e-3), z))
+
     lags, alike, squares = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
     if ordered:
         # (W, lag, T, ...): the residuals that follow each one.
         most = min(LAGS, r.shape[1] - 1)
         following = np.arange(1, most + 1)[:, None] + np.arange(r.shape[1])
-        later = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:, :most])], axis=1)[:, following]
+
+        def later(x):
+            return jnp.concatenate([x, jnp.zeros_like(x[:, :most])], axis=1)[:, following]
+
         each = (0, *range(2, r.ndim + 1))
         pairs = jnp.sum(known[:, None] & later(known), axis=each)
         lags = jnp.sum(pairs > 0).astype(r.dtype)
@@ -144,7 +150,10 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
         correlations = jnp.sum(r[:, None] * later(r), axis=each) / jnp.where(pairs > 0, pairs, 1) / one
         squares = jnp.sum(pairs * correlations**2)
         alike = jnp.max(jnp.where(pairs > count / 2, jnp.abs(correlations), 0.0))
-    follows = lambda z: (lags > 0) & (squares > lags * _exceeded_by_chance(jnp.maximum(lags, 1), z))
+
+    def follows(z):
+        return (lags > 0) & (squares > lags * _exceeded_by_chance(jnp.maximum(lags, 1), z))
+
     # The size of the curve, as a fraction of the data's spread.
     of_data = jnp.sqrt(alike * jnp.sum((r * jnp.where(known, sigma, 0.0)) ** 2) / count) / spread
     if not problem.absolute:
@@ -248,11 +257,13 @@ def linearised(problem: FitProblem, u: Unknowns, stage: Stage, loss: str) -> Lin
     p = u.shared.size
 
     def at(w, s):
-        of = lambda both: window_part(problem, both[:p], both[p:], w, stage, diffrax.ForwardMode(), loss)
+        def of(both):
+            return window_part(problem, both[:p], both[p:], w, stage, diffrax.ForwardMode(), loss)
+
         both = jnp.concatenate([u.shared, s])
         # The values do not depend on the direction, so vmap computes them once and repeats the result.
-        along = lambda d: jax.jvp(of, (both,), (d,), has_aux=True)
-        values, pushed, well = jax.vmap(along)(jnp.eye(both.size, dtype=both.dtype))
+        along = partial(jax.jvp, of, (both,), has_aux=True)
+        values, pushed, well = jax.vmap(lambda d: along((d,)))(jnp.eye(both.size, dtype=both.dtype))
         return jax.tree.map(lambda x: x[0], (values, well)), jax.tree.map(lambda x: x.T, pushed)
 
     (values, well), pushed = over_windows(at, problem, u)
@@ -297,7 +308,10 @@ def evaluation_from(problem: FitProblem, u: Unknowns, linear: LinearisedResidual
 def evaluate(problem: FitProblem, u: Unknowns, stage: Stage) -> Evaluation:
     """What the data determine at `u`."""
     check_predicted(problem)
-    at = lambda problem, u, stage: evaluation_from(problem, u, linearised(problem, u, stage, "squares"), stage)
+
+    def at(problem, u, stage):
+        return evaluation_from(problem, u, linearised(problem, u, stage, "squares"), stage)
+
     return in_turn(at, problem, u, stage)
 
 
@@ -493,10 +507,10 @@ def _no_end(problem, y, with_slopes):
     (p,), (windows, k), dtype = y.shared.shape, y.local.shape, y.shared.dtype
     m = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))
     j = 0 if windows == 1 else problem.unit.size
-    zeros = lambda *shape: jnp.zeros(shape, dtype)
     w = windows
-    values = WindowedEquations(zeros(w, m), zeros(w, j), zeros(p))
-    slopes = Slopes(zeros(w, m, p), zeros(w, m, k), zeros(w, j, p), zeros(w, j, k), zeros(w, j, k), zeros(p, p))
+    values = WindowedEquations(*(jnp.zeros(shape, dtype) for shape in ((w, m), (w, j), (p,))))
+    shapes = (w, m, p), (w, m, k), (w, j, p), (w, j, k), (w, j, k), (p, p)
+    slopes = Slopes(*(jnp.zeros(shape, dtype) for shape in shapes))
     no, each = jnp.zeros((), bool), jnp.zeros(len(jax.tree.leaves(problem.measured)), bool)
     unjudged = Misfit(jnp.zeros(each.shape, dtype), each, each, no)
     cost = jnp.full((), jnp.inf, dtype)

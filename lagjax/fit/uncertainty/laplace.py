@@ -191,7 +191,6 @@ def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:
     level = level / np.linalg.norm(level, axis=0)
     seen_part = np.sum(right[~seen] ** 2, axis=0) < NEGLIGIBLE_SHARE
     known = seen_part & (np.sum(level**2, axis=1) < NEGLIGIBLE_SHARE)
-    of_known = lambda known, covariance: np.where(known[:, None] & known[None, :], covariance, np.nan)
     directions = along.T / np.where(size > 0, size, 1.0)
     evidence = np.nan
     if problem.absolute and problem.loss == "squares" and peak.all() and seen.all():
@@ -200,8 +199,8 @@ def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:
     return Laplace(
         names,
         mean,
-        of_known(known, by_z[:, peak] @ by_z[:, peak].T),
-        of_known(seen_part, variance * whitened @ whitened.T),
+        np.where(np.outer(known, known), by_z[:, peak] @ by_z[:, peak].T, np.nan),
+        np.where(np.outer(seen_part, seen_part), variance * whitened @ whitened.T, np.nan),
         float(evidence),
         eigenvalues,
         directions,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lagjax.fit.problem.checks import check_predicted
-from lagjax.fit.problem.records import PADDING, Record, Windows, channel_name, padded
+from lagjax.fit.problem.records import Record, Windows, channel_name, closest, padded
 from lagjax.fit.problem.residuals import WHOLE, FitProblem
 from lagjax.fit.search.search import UNSEEN, Evaluation, LinearisedResiduals, evaluation_from, linearised
 from lagjax.fit.uncertainty.candidates import Candidate, NextMeasurements, assess, eliminate_unknowns, sd_of, units_of
@@ -91,7 +91,10 @@ def _direction(problem, shrink):
     """The name of a number, and its slopes by the fitted parameters."""
     names, x = problem.found.names, jnp.asarray(problem.found.start)
     if callable(shrink):
-        number = lambda x: jnp.asarray(shrink(problem.found.into(x)))
+
+        def number(x):
+            return jnp.asarray(shrink(problem.found.into(x)))
+
         shape = jax.eval_shape(number, x).shape
         if shape != ():
             raise ValueError(
@@ -149,12 +152,10 @@ def _candidate_runs(problem, candidates, known, direction, least, problem_for):
 
 def _one_window(problem: FitProblem, w: int) -> FitProblem:
     """The problem of one window alone, so that all windows of one form share one program."""
-    part = lambda tree: jax.tree.map(lambda x: x[w : w + 1], tree)
-    windows = Windows(*part(problem.windows))._replace(record=np.zeros(1, int), seam=np.zeros(1, bool))
-    return replace(
-        problem, windows=windows, starts=part(problem.starts), measured=part(problem.measured),
-        sigma=part(problem.sigma), overrides=part(problem.overrides),
-    )  # fmt: skip
+    names = ("windows", "starts", "measured", "sigma", "overrides")
+    parts = jax.tree.map(lambda x: x[w : w + 1], {name: getattr(problem, name) for name in names})
+    parts["windows"] = parts["windows"]._replace(record=np.zeros(1, int), seam=np.zeros(1, bool))
+    return replace(problem, **parts)
 
 
 def _candidate_run(name, record, parts, known, direction, least):
@@ -271,8 +272,7 @@ def _extended(problem: FitProblem, records: list[Record]) -> FitProblem:
             ts, real = np.append(ts, after), np.append(real, np.ones(len(ts), bool))
         pieces.append((ts, real))
     length = filled_up(max(len(ts) for ts, _ in pieces))
-    closest = lambda ts: max(PADDING * np.min(np.diff(ts)), 8 * np.finfo(ts.dtype).eps * np.max(np.abs(ts)))
-    filled = [padded(ts, length, closest(ts)) for ts, _ in pieces]
+    filled = [padded(ts, length, closest(ts, ts.dtype)) for ts, _ in pieces]
     real = np.stack([np.append(real, np.zeros(length - len(real), bool)) for _, real in pieces])
     longer = Windows(
         np.stack(filled), real, np.tile(np.arange(length), (windows.count, 1)),
@@ -291,10 +291,11 @@ def _sigmas(problem: FitProblem, records: list[Record], length):
     parts |= {"q": state, "v": state}
     sigmas = {}
     for kind in sorted(parts):
-        of_leaf = lambda path, x, kind=kind: np.stack([
-            np.broadcast_to(_error(problem, records[r], w, kind, path, x.shape), (length, *x.shape))
-            for w, r in enumerate(problem.windows.record)
-        ]).astype(problem.windows.ts.dtype)  # fmt: skip
+
+        def of_leaf(path, x, kind=kind):
+            each = [_error(problem, records[r], w, kind, path, x.shape) for w, r in enumerate(problem.windows.record)]
+            return np.stack([np.broadcast_to(s, (length, *x.shape)) for s in each]).astype(problem.windows.ts.dtype)
+
         tree = jtu.tree_map_with_path(of_leaf, parts[kind])
         if any(np.any(np.isfinite(x)) for x in jax.tree.leaves(tree)):
             sigmas[kind] = tree

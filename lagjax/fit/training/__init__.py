@@ -1,1 +1,0 @@
-"""Training with optimisers of optax."""

@@ -1,0 +1,243 @@
+"""What `fit` minimises as a function: against the fit, formulas and finite differences; and trained with optax."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scipy.optimize import least_squares
+
+import lagjax as lj
+
+T = np.linspace(0.0, 3.0, 31)
+EXACTLY = {"rtol": 1e-9, "atol": 1e-9}
+spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+
+
+def record(seed=0, known=True, amplitude=1.0, t=T, **of_run):
+    """The spring with k = 4, released at an amplitude, with errors of 0.01."""
+    q = amplitude * np.cos(2 * t) + 0.01 * np.random.default_rng(seed).normal(size=len(t))
+    held = dict(q0=amplitude, v0=0.0, hold_q=True, hold_v=True) if known else {}
+    return lj.Record(t, q=q, sigma=0.01, **held, **of_run)
+
+
+def quietly(*args, **options):
+    """A fit without its warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lj.FitWarning)
+        return lj.fit(*args, **{"progress": False} | EXACTLY | options)
+
+
+def trained(loss, unknowns, optimiser, steps, batch=None, seed=0):
+    """The recipe of `docs/learned.md`: the unknowns after some steps of an optimiser of optax."""
+
+    @jax.jit
+    def train(unknowns):
+        def step(carry, key):
+            unknowns, state = carry
+            chosen = None if batch is None else jax.random.choice(key, loss.windows, (batch,), replace=False)
+            slopes = jax.grad(loss)(unknowns, chosen)
+            changes, state = optimiser.update(slopes, state, unknowns)
+            return (optax.apply_updates(unknowns, changes), state), None
+
+        keys = jax.random.split(jax.random.key(seed), steps)
+        return jax.lax.scan(step, (unknowns, optimiser.init(unknowns)), keys)[0][0]
+
+    return train(unknowns)
+
+
+def test_the_loss_of_a_step_is_the_formula():
+    """At known starts: half the sum of squares, its slope by k, the prior's part, and what a batch stands for."""
+    records, prior = [record(), record(1, amplitude=0.5)], (5.0, 0.5)
+    loss = lj.fit_loss(spring, records, {"k": 3.9}, priors={"k": prior}, **EXACTLY)
+    w, at = np.sqrt(3.9), loss.guess
+    assert loss.windows == 2 and at["starts"].shape == (2, 0) and loss.params(at) == {"k": 3.9}
+    off = [a * np.cos(w * T) - r.measured["q"] for a, r in zip((1.0, 0.5), records)]
+    slope = [-a * T * np.sin(w * T) / (2 * w) for a in (1.0, 0.5)]
+    of_prior = (3.9 - prior[0]) / prior[1]
+    value, by = jax.value_and_grad(loss)(at)
+    np.testing.assert_allclose(value, 0.5 * (np.sum(np.square(off)) / 0.01**2 + of_prior**2), rtol=1e-6)
+    np.testing.assert_allclose(by["params"]["k"], np.sum(np.multiply(off, slope)) / 0.01**2 + of_prior / prior[1], 1e-5)
+    alone = [loss(at, [i]) for i in (0, 1)]
+    np.testing.assert_allclose(alone, [np.sum(x**2) / 0.01**2 + 0.5 * of_prior**2 for x in off], rtol=1e-6)
+    np.testing.assert_allclose(np.mean(alone), value, rtol=1e-12)
+    # Twin: without the prior it is another function.
+    assert abs(lj.fit_loss(spring, records, {"k": 3.9}, **EXACTLY)(at) - value) > 1.0
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"window": 1.0, "joined": False},
+        {"window": 1.0},
+        {"priors": {"k": (4.1, 0.05)}, "bounds": {"k": (0.0, None)}},
+        {"loss": "huber"},
+    ],
+    ids=["whole", "windows", "joined", "prior and bound", "robust"],
+)
+def test_a_fit_ends_at_its_minimum(options):
+    """At the end of a fit the loss is its cost, half the sum of squares, without a slope; twin: the guess."""
+    records = [record(i, known=False) for i in range(2)]
+    found = quietly(spring, records, {"k": 3.8}, **options)
+    loss = lj.fit_loss(spring, records, found.params, **options, **EXACTLY)
+    residuals = lj.fit_residuals(spring, records, found.params, **options, **EXACTLY)
+    end = loss.guess | {"starts": found.sampling["starts"]}
+    np.testing.assert_allclose(loss(end), found.cost, rtol=1e-7)
+    np.testing.assert_allclose(0.5 * np.sum(residuals(end) ** 2), found.cost, rtol=1e-7)
+    size = lambda tree: float(jnp.max(jnp.abs(jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(tree)]))))
+    nearby = jax.tree.map(lambda x: x + 0.01, end)
+    assert size(jax.grad(loss)(end)) < 1e-4 * size(jax.grad(loss)(nearby))
+
+
+@pytest.mark.exhaustive
+def test_slopes_on_a_constraint():
+    """For a mass on a rod of unknown length: compiled, in forward and reverse mode, and by finite differences."""
+    rod = {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2)}
+    mass = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"], rod)
+    t = np.linspace(0.0, 1.0, 11)
+    seen = lj.Record(t, q={"x": np.cos(2 * t)}, q0={"x": 1.0, "y": 0.0}, v0={"x": 0.0, "y": 0.0}, sigma=0.1)
+    residuals = lj.fit_residuals(mass, seen, {"g": 9.81, "l": 1.0}, bounds={"l": (0.5, 2.0)}, **EXACTLY)
+    at = jax.tree.map(lambda x: x + 0.03, residuals.guess)
+    assert at["starts"].shape == (1, 2) and 1.0 < residuals.params(at)["l"] < 2.0
+    forward, reverse = jax.jit(jax.jacfwd(residuals))(at), jax.jit(jax.jacrev(residuals))(at)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), forward, reverse)
+    moved = lambda d: residuals(at | {"params": at["params"] | {"l": at["params"]["l"] + d}})
+    np.testing.assert_allclose(forward["params"]["l"], (moved(1e-5) - moved(-1e-5)) / 2e-5, atol=1e-4)
+
+
+def test_unknowns_have_the_structure_of_params():
+    """None for what is not free, a vector for some entries of an array, a module; and back within the bounds."""
+    net = eqx.nn.MLP("scalar", "scalar", 4, 1, jnp.tanh, key=jax.random.key(0))
+    params = {"m": jnp.array([1.0, 2.0]), "potential": net, "k": 4.0}
+    system = lj.System(lambda t, q, v, p: 0.5 * p["m"][0] * v**2 - p["potential"](q) - 0.5 * p["k"] * q**2)
+    loss = lj.fit_loss(system, record(), params, free=["potential", "m[1]", "k"], bounds={"k": (0.0, None)})
+    at = loss.guess["params"]
+    assert at["m"].shape == (1,) and at["potential"].activation is None and len(jax.tree.leaves(at)) == 6
+    np.testing.assert_allclose(at["k"], np.log(4.0), rtol=1e-12)
+    again = loss.params({"params": at | {"m": at["m"] + 1.0}})
+    np.testing.assert_array_equal(again["m"], [1.0, 3.0])
+    np.testing.assert_allclose(again["k"], 4.0, rtol=1e-12)
+    assert eqx.tree_equal(again["potential"], net)
+    assert "loss" in repr(loss) and "1 starts" in repr(loss)
+
+
+def test_what_does_not_go_together():
+    """A batch of joined windows; optax or arguments of a training in `fit`, which name the recipe."""
+    residuals = lj.fit_residuals(spring, record(known=False), {"k": 3.9}, window=1.0)
+    with pytest.raises(ValueError, match="continue each other and make no batches.\nFix: joined=False"):
+        residuals(residuals.guess, [0])
+    with pytest.raises(ValueError, match="free names 'c'"):
+        lj.fit_loss(spring, record(), {"k": 3.9}, free="c")
+    with pytest.raises(ValueError, match="the motion has no such name|the motion has"):
+        lj.fit_loss(spring, lj.Record(T, q={"x": T}, q0=1.0, v0=0.0), {"k": 3.9})
+    for options, words in (
+        ({"optimiser": optax.sgd(0.1)}, "an optimiser of optax was given"),
+        ({"batch": 3, "patience": 2}, "'batch' and 'patience', of a training, was given"),
+    ):
+        with pytest.raises(TypeError, match=words) as refused:
+            lj.fit(spring, record(), {"k": 3.0}, **options)
+        assert "Fix: loss = lj.fit_loss(" in str(refused.value) and "docs/learned.md" in str(refused.value)
+    with pytest.raises(TypeError, match="optimistix's least-squares solvers or minimisers"):
+        lj.fit(spring, record(), {"k": 3.0}, optimiser=optax.sgd)
+
+
+@pytest.mark.exhaustive
+def test_starts_of_their_own():
+    """With nothing else free each window's start is that of SciPy's least squares with cos and sin."""
+    records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
+    found, w = quietly(spring, records, {"k": 3.0}, free=[]), np.sqrt(3.0)
+    for i, r in enumerate(records):
+        q = r.measured["q"]
+        off = lambda s, q=q: (s[0] * np.cos(w * T) + s[1] / w * np.sin(w * T) - q) / 0.01
+        exact = least_squares(off, [1.0, 0.0], xtol=1e-15)
+        np.testing.assert_allclose([found.q0[i], found.v0[i]], exact.x, atol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_what_fails_moves_nothing():
+    """A motion with NaN has a constant loss without a slope, and the others are still fitted; a fit then tells."""
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p["k"] + 0.0 * jnp.sqrt(p["sane"])) * q**2)
+    records = [record(i, params={"sane": sane}) for i, sane in enumerate((1.0, -1.0, 1.0))]
+    loss = lj.fit_loss(system, records, {"k": 3.0, "sane": 1.0}, free="k", **EXACTLY)
+    value, slopes = jax.value_and_grad(loss)(loss.guess, [1])
+    # Ten spreads of the data, at each sample but the first.
+    assert value > 3 * 0.5 * 30 * (10 * 0.5 / 0.01) ** 2 and slopes["params"]["k"] == 0.0
+    end = trained(loss, loss.guess, optax.adam(0.05), 150)
+    assert abs(end["params"]["k"] - 4.0) < 0.05
+    with pytest.raises(ValueError, match="from the guess the motion|record 1"):
+        quietly(system, records[1:2], loss.params(end), free=[])
+
+
+def well(q):
+    """A double well."""
+    return 0.25 * (q**2 - 1) ** 2
+
+
+learned = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["potential"](q))
+
+
+def records_of_well():
+    """Eight motions with errors of 0.002."""
+    true, rng = lj.System(lambda t, q, v, params: 0.5 * v**2 - well(q)), np.random.default_rng(0)
+    ts = np.linspace(0.0, 6.0, 121)
+    for q0, v0 in rng.uniform([-1.6, -0.4], [1.6, 0.4], (8, 2)):
+        q = np.asarray(lj.integrate(true, q0, v0, ts=ts).q)
+        yield lj.Record(ts, q=q + 0.002 * rng.normal(size=len(ts)), sigma=0.002)
+
+
+@pytest.mark.exhaustive
+def test_a_potential_is_learned():
+    """By the recipe, with batches: held-back residuals fall, the force is found, and a seed is reproducible."""
+    *records, one, other = records_of_well()
+    start = {"potential": lj.learned.Network(1.0, key=jax.random.key(0))}
+    cut = {"window": 1.0, "joined": False, "rtol": 1e-6, "atol": 1e-6}
+    first = quietly(learned, records, start, free=[], **cut)
+    loss = lj.fit_loss(learned, records, start, **cut)
+    unknowns = loss.guess | {"starts": first.sampling["starts"]}
+    optimiser = optax.adam(optax.cosine_decay_schedule(2e-2, 1000))
+    end = trained(loss, unknowns, optimiser, 1000, 16)
+    score = lambda params: float(quietly(learned, [one, other], params, free=[], **cut).rms()["q"])
+    assert score(loss.params(end)) < 0.004 < 0.02 < score(start)
+    q = jnp.linspace(-1.3, 1.3, 27)
+    off = jax.vmap(loss.params(end)["potential"])(q) - well(q)
+    assert float(jnp.max(jnp.abs(off - jnp.mean(off)))) < 0.1
+    short = [trained(loss, unknowns, optimiser, 20, 16, seed) for seed in (0, 0, 1)]
+    assert eqx.tree_equal(*short[:2]) and not eqx.tree_equal(*short[1:])
+
+
+@pytest.mark.exhaustive
+def test_inside_of_a_program():
+    """Under jit and in lanes, a training gives the same as a single call."""
+
+    def stiffness(q):
+        seen = lj.Record(T, q=q, q0=1.0, v0=0.0, sigma=0.01)
+        loss = lj.fit_loss(spring, seen, {"k": 3.5}, **EXACTLY)
+        return trained(loss, loss.guess, optax.adam(0.05), 60)["params"]["k"]
+
+    measured = np.stack([record(i).measured["q"] for i in range(2)])
+    alone = [stiffness(q) for q in measured]
+    np.testing.assert_allclose(jax.jit(jax.vmap(stiffness))(measured), alone, rtol=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_bounds_forgiveness_and_other_solvers():
+    """Bounds hold, a Huber loss tolerates outliers; SciPy's least squares ends where the fit does."""
+    rng = np.random.default_rng(1)
+    r = record(3)
+    wild = np.where(rng.random(len(T)) < 0.1, 1.0, 0.0)
+    dirty = lj.Record(T, q=r.measured["q"] + wild, q0=1.0, v0=0.0, hold_q=True, hold_v=True, sigma=0.01)
+    bounds = {"k": (0.0, None)}
+    ends = {}
+    for how in ("huber", "squares"):
+        loss = lj.fit_loss(spring, dirty, {"k": 3.5}, loss=how, bounds=bounds, **EXACTLY)
+        ends[how] = float(loss.params(trained(loss, loss.guess, optax.adam(0.02), 300))["k"])
+    assert abs(ends["huber"] - 4) < 0.05 < abs(ends["squares"] - 4)
+    residuals = lj.fit_residuals(spring, dirty, {"k": 3.5}, bounds=bounds, **EXACTLY)
+    of_vector = jax.jit(lambda y: residuals({"params": {"k": y[0]}, "starts": residuals.guess["starts"]}))
+    by_scipy = least_squares(of_vector, [np.log(3.5)], jax.jit(jax.jacfwd(of_vector)))
+    np.testing.assert_allclose(np.exp(by_scipy.x), quietly(spring, dirty, {"k": 3.5}, bounds=bounds).values, rtol=1e-5)
