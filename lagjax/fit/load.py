@@ -20,7 +20,7 @@ from lagjax.integrate.integrate import integrate
 from lagjax.integrate.trajectory.load import described_system, same_system
 from lagjax.jaxtools.cache import kinds
 from lagjax.mechanics.diagnosis import listed
-from lagjax.system.hybrid import Hybrid, replace_fields
+from lagjax.system.hybrid import Hybrid
 from lagjax.system.signature import UnknownSystem
 from lagjax.system.system import System
 
@@ -99,9 +99,9 @@ def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> 
     if "system" in known:
         system: Any = same_system(known["system"], described, path)
         if described.phase is not None:
-            if not system.in_phases or not 0 <= described.phase < len(system.systems):
+            if not system.in_phases or not 0 <= described.phase < len(system.phases):
                 raise ValueError(f"{path} starts in phase {described.phase}, which this system does not have.")
-            system = replace_fields(system, first=np.asarray(described.phase, np.int32))
+            system = system.starting(described.phase)
         fields |= {"system": system, "first": system.first_phase}
     options = {name: known.get(f"options.{name}", x) for name, x in problem.options.items()}
     return replace(found, problem=replace(problem, options=options, **fields))

@@ -1,6 +1,6 @@
-"""The result of a fit: estimates, their uncertainties, and whether the residuals look like measurement errors.
+"""The result of a fit: estimates, their uncertainties, whether the residuals look like measurement errors; its table.
 
-The printed table of a fit: estimates with their uncertainties, residuals, and what the data do not determine.
+A file of a fit holds everything except functions; a signature identifies those of the system.
 """
 
 import os
@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.display import plots as plot
 from lagjax.display.printable import by_line
+from lagjax.files import npz
+from lagjax.files.tree_json import NotGiven, NotWritable, Writer
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.problem.residuals import LOSSES, WHOLE, FitProblem, dampened, equations, starts_at
-from lagjax.fit.result.save import save
 from lagjax.fit.search.search import Evaluation, Misfit
 from lagjax.fit.uncertainty.identifiable import Identifiability
 from lagjax.fit.uncertainty.laplace import Laplace, laplace
@@ -34,7 +35,8 @@ from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
 from lagjax.numerics.windowed_least_squares import Unknowns
 from lagjax.system import coordinates
-from lagjax.system.signature import UnknownSystem
+from lagjax.system.coordinates import State
+from lagjax.system.signature import UnknownSystem, signature
 
 
 def lines_of(fit) -> list[str]:
@@ -429,7 +431,23 @@ class Fit:
 
         **Raises:** `TypeError` for values in `params` that are not data, by name; `OSError` if there is no such folder.
         """
-        save(self, path)
+        if is_traced(self):
+            raise TypeError("this fit is being traced and has no numbers yet.\nFix: save it outside of the program.")
+        problem = self.problem
+        # Without phases, `first` is the system itself.
+        roles = {id(problem.first): "first", id(problem.system): "system", id(problem.unflatten): "unflatten"}
+        if problem.observe is not None:
+            roles[id(problem.observe)] = "observe"
+        for name, value in problem.options.items():
+            if isinstance(value, NotGiven) or not _is_data(value):
+                roles[id(value)] = f"options.{name}"
+        writer = Writer(lambda value: roles.get(id(value)))
+        contents = {"fit": writer.down(self, ""), "known": writer.down(_known_of_system(self), "system")}
+        contents["q"] = writer.down(
+            jax.tree.map(np.asarray, problem.unflatten(problem.starts.q.guess[0])), "coordinates"
+        )
+        contents["functions"] = sorted(set(roles.values()) - {"first", "unflatten"})
+        npz.write(path, "fit", contents, writer.arrays)
 
     def plot(self, record: int = 0):
         """Draw data, fit and residuals of a record, one row per channel; returns a matplotlib `Figure`."""
@@ -439,6 +457,27 @@ class Fit:
         if is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
         return by_line("\n".join(lines_of(self)))
+
+
+def _is_data(value):
+    try:
+        Writer().down(value, "")
+    except NotWritable:
+        return False
+    return True
+
+
+def _known_of_system(fit) -> dict[str, Any]:
+    system = fit.problem.system
+    if isinstance(system, UnknownSystem):
+        return {name: getattr(system, name) for name in system.__dataclass_fields__}
+    q, v = jax.tree.map(np.asarray, fit.starts()[0])
+    params = jax.tree.map(np.asarray, fit.problem.params(fit.unknowns.shared, 0))
+    t = np.asarray(np.asarray(fit.problem.windows.ts)[0, 0], jax.tree.leaves(q)[0].dtype)
+    state = State(t, q, v, params)
+    phase = int(system.first) if system.in_phases else None
+    about = {"words": repr(system), "angles": (), "signature": signature(system, state), "state": tuple(state)}
+    return about | {"starts": jax.tree.map(np.asarray, fit.known_starts()), "phase": phase}
 
 
 @partial(compiled, in_numpy=True)
