@@ -26,6 +26,8 @@ from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.lagrangian import mass_matrix
 from lagjax.system import coordinates
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.system import System
 
 # The points at which an activation is checked, the distance over which its curvature may not jump, and the size of a
 # jump relative to the largest curvature.
@@ -181,7 +183,13 @@ class SameMotion:
 
 
 def same_motion(
-    system, other, q, v, params: PyTree = None, other_params: PyTree = None, t: ArrayLike = 0.0
+    system: System | Hybrid,
+    other: System | Hybrid,
+    q: PyTree,
+    v: PyTree,
+    params: PyTree = None,
+    other_params: PyTree = None,
+    t: ArrayLike = 0.0,
 ) -> SameMotion:
     """Say whether two systems have the same accelerations, and whether their Lagrangians are the same up to a gauge.
 
@@ -214,7 +222,9 @@ def same_motion(
     return SameMotion(differences, float(ratio) if proportional else np.nan)
 
 
-def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) -> PyTree[Float[Array, "N ..."]]:
+def disagreement(
+    system: System | Hybrid, members: Sequence[PyTree], q: PyTree, v: PyTree, t: ArrayLike = 0.0
+) -> PyTree[Float[Array, "N ..."]]:
     """Return the spread of the accelerations of several trained models, which is large where they lack data.
 
     >>> import jax.numpy as jnp
@@ -240,25 +250,25 @@ def disagreement(system, members: Sequence[PyTree], q, v, t: ArrayLike = 0.0) ->
         )
     times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jnp.shape(jax.tree.leaves(q)[0])[0],))
 
-    def at_states(params):
+    def at_states(params: PyTree):
         return jax.vmap(lambda t, q, v: accelerations(system, t, q, v, params)[0])(times, q, v)
 
     return jax.tree.map(lambda *a: jnp.std(jnp.stack(a), axis=0, ddof=1), *map(at_states, members))
 
 
-def _at_states(system, t, q, v, params):
+def _at_states(system: System | Hybrid, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree):
     """Accelerations (N, n) and mass matrices (N, n, n)."""
     q, v = jax.tree.map(jnp.asarray, (q, v))
     times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jax.tree.leaves(q)[0].shape[0],))
 
-    def at(t, q, v):
+    def at(t: ArrayLike, q: PyTree, v: PyTree):
         a, _ = accelerations(system, t, q, v, params)
         return coordinates.flatten(a)[0], mass_matrix(system, t, q, v, params)
 
     return tuple(map(np.asarray, jax.vmap(at)(times, q, v)))
 
 
-def _check_activation(activation):
+def _check_activation(activation: Callable):
     with jax.ensure_compile_time_eval():
         curvature = jax.vmap(jax.grad(jax.grad(lambda x: activation(x))))
         at = np.asarray(curvature(jnp.asarray(CHECKED_AT)))

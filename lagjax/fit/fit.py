@@ -9,12 +9,13 @@ import equinox as eqx
 import jax
 import numpy as np
 import optimistix as optx
-from jaxtyping import PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.display.progress import meter, waiting
 from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.checks import check_motion
-from lagjax.fit.problem.records import Record
+from lagjax.fit.problem.parameters import FreeNumbers
+from lagjax.fit.problem.records import Record, Windows
 from lagjax.fit.problem.residuals import JOINING, FitProblem, Stage
 from lagjax.fit.result.result import Fit, FitWarning
 from lagjax.fit.result.warnings import caveats
@@ -167,11 +168,11 @@ def _reported(found: Fit) -> Fit:
     return found
 
 
-def _sorted(units):
+def _sorted(units: Mapping[str, str] | None):
     return tuple(sorted((units or {}).items()))
 
 
-def _check_optimiser(optimiser, options):
+def _check_optimiser(optimiser: Any, options: dict[str, Any]):
     trains = isinstance(optimiser, tuple) and all(callable(getattr(optimiser, x, None)) for x in ("init", "update"))
     if trains or TRAINING & set(options):
         what = "an optimiser of optax" if trains else f"{listed(sorted(TRAINING & set(options)))}, of a training,"
@@ -188,7 +189,7 @@ def _check_optimiser(optimiser, options):
         )
 
 
-def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: bool) -> Course:
+def _course(problem: FitProblem, grow: bool, joined: bool, scattered: Array, try_all: bool) -> Course:
     """The stages of a search, and the starts from which it runs through them."""
     windows = problem.windows
     unknowns = sum(x.shape[-1] for x in jax.tree.leaves(problem.start))
@@ -198,10 +199,10 @@ def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: b
         for x in jax.tree.leaves(tree)
     )
 
-    def growing(measured):
+    def growing(measured: float):
         return _doubled(measured / max(FIRST_PART * unknowns, 1)) if grow else np.zeros(0)
 
-    def alike(parts):
+    def alike(parts: ArrayLike):
         return np.repeat(np.asarray(parts)[:, None], windows.count, axis=1)
 
     of_windows = alike(growing(measured))
@@ -243,7 +244,7 @@ def _course(problem: FitProblem, grow: bool, joined: bool, scattered, try_all: b
 
 
 @contextmanager
-def _step_meter(problem, course, progress):
+def _step_meter(problem: FitProblem, course: Course, progress: bool | None):
     """Show a meter of the search's steps; yields whether there is one."""
     if is_traced(problem):
         yield False
@@ -256,7 +257,7 @@ def _step_meter(problem, course, progress):
             return
         with waiting(progress, "compiling") as started:
 
-            def step(stage, cost):
+            def step(stage: int, cost: float):
                 started.set()
                 shown.set_postfix_str(f"stage {stage - unused + 1} of {stages}, cost {cost:.4g}", refresh=False)
                 shown.update(1)
@@ -265,12 +266,12 @@ def _step_meter(problem, course, progress):
                 yield True
 
 
-def _doubled(times):
+def _doubled(times: float):
     """Fractions that double up to the whole, which is not among them; the first is about 1/`times`."""
     return 2.0 ** -np.arange(np.clip(np.floor(np.log2(max(times, 1))), 0, STAGES - 1), 0, -1)
 
 
-def _parts_of_windows(windows, parts):
+def _parts_of_windows(windows: Windows, parts: Array):
     """The fraction of each window's time (S, W) that lies in the first `parts` (S,) of its record."""
     begin, end = windows.ts[:, 0], np.take_along_axis(windows.ts, windows.last[:, None], axis=1)[:, 0]
     first, record = begin[windows.first][windows.record], windows.record
@@ -278,7 +279,7 @@ def _parts_of_windows(windows, parts):
     return np.clip((first + parts[:, None] * whole - begin) / (end - begin), 0.0, 1.0)
 
 
-def _scattered_starts(found, count, spread, seed):
+def _scattered_starts(found: FreeNumbers, count: int, spread: float, seed: int):
     """Random starts (count, p) around the guess, or between two bounds."""
     xp = numpy_of(found.start)
     start, low, high = (x[None] for x in (found.start, found.low, found.high))
@@ -291,7 +292,7 @@ def _scattered_starts(found, count, spread, seed):
 
 
 @once
-def _random_numbers(seed, shape):
+def _random_numbers(seed: int, shape: tuple[int, ...]):
     """Normal numbers, and uniform ones between 0 and 1 without the ends."""
     random = np.random.default_rng(seed)
     return random.normal(size=shape), random.uniform(0.01, 0.99, shape)

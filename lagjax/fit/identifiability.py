@@ -68,7 +68,7 @@ def identifiability(
     Source: Pukelsheim, *Optimal Design of Experiments*, ch. 2.
     """
 
-    def problem_for(records, observe):
+    def problem_for(records: Sequence[Record], observe: Callable | None):
         return problem_of(system, records, params, free, observe, None, priors, "squares", window, dict(options))
 
     problem = problem_for(records, observe)
@@ -86,7 +86,7 @@ def identifiability(
     if at is not None:
         runs = [records] if isinstance(records, Record) else list(records)
 
-        def of_candidates(runs):
+        def of_candidates(runs: Sequence[Record]):
             # Only candidates with `observed` measurements take `observe`.
             return problem_for(runs, observe if "observed" in runs[0].measured else None)
 

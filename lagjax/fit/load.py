@@ -91,7 +91,7 @@ def load_fit(
     return _with(found, known, described, path)
 
 
-def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path) -> Fit:
+def _with(found: Fit, known: dict[str, Any], described: UnknownSystem, path: Any) -> Fit:
     """A fit with the functions that the user passes again."""
     problem, fields = found.problem, {}
     if "observe" in known:
@@ -114,7 +114,7 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
     p, (count, times), n = len(numbers.names), windows.ts.shape, np.size(problem.unit) // 2
     k, searched = starts.unknowns, found.unknowns
 
-    def check(name, kinds, *expected, lead=False):
+    def check(name: str, kinds: str, *expected, lead: bool = False):
         for x, shape in expected:
             here = np.shape(x)[: len(shape)] if lead else np.shape(x)
             if not isinstance(x, (np.ndarray, np.generic, jax.Array)) or here != shape or x.dtype.kind not in kinds:
@@ -168,5 +168,5 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
         raise ValueError(f"its parameters do not hold {p} numbers.")
 
 
-def _short(role):
+def _short(role: str):
     return role.removeprefix("options.")

@@ -151,11 +151,13 @@ def fit_loss(system: System | Hybrid, records: Record | Sequence[Record], params
 
 
 @jitted
-def _residuals(problem: FitProblem, stage: Stage, unknowns, batch, joined: bool) -> Float[Array, " r"]:
+def _residuals(
+    problem: FitProblem, stage: Stage, unknowns: Mapping[str, PyTree], batch: Int[Array, " B"], joined: bool
+) -> Float[Array, " r"]:
     """All residuals in one vector; those of a batch of windows are scaled to the size of all."""
     u = Unknowns(problem.found.natural(problem.found.vector(unknowns["params"])), unknowns["starts"])
 
-    def part(w, s):
+    def part(w: Int[Array, ""], s: Array):
         found, well = window_part(problem, u.shared, s, w, stage)
         return jax.tree.map(lambda x: jnp.where(well, x, lax.stop_gradient(x)), found)
 

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import ArrayLike
 
 # The single dimension of paired axes.
 POINT = "point"
@@ -49,7 +50,7 @@ class Axes(eqx.Module):
         """The number of points."""
         return math.prod(self.shape)
 
-    def at(self, index) -> dict[str, Any]:
+    def at(self, index: ArrayLike) -> dict[str, Any]:
         """The point at a flat index as a dictionary; for indices (n,) the values are (n, ...)."""
         positions = [index] * len(self.names) if self.paired else np.unravel_index(index, self.shape)
         return {name: x[i] for name, x, i in zip(self.names, self.arrays, positions)}

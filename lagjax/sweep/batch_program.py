@@ -21,8 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import Jaxpr
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from lagjax.display.progress import waiting
 from lagjax.integrate.solve.harvest import reporting, watched
@@ -92,7 +93,7 @@ def point_of(run: Callable) -> Callable:
     """
     reporting_run = reporting(run)
 
-    def point(at):
+    def point(at: dict[str, Array]):
         values, report, settled = reporting_run(at)
         if report is None:
             floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.inexact)]
@@ -102,7 +103,7 @@ def point_of(run: Callable) -> Callable:
         status = Status(*(jnp.asarray(x, dtype) for x, dtype in zip(report, STATUS_TYPES)))
         well = jnp.any(jnp.stack([status.result == code for code in GOOD]))
 
-        def masked(x):
+        def masked(x: Any):
             # A trajectory records itself how far it got, and is NaN from there on.
             if isinstance(x, Trajectory) or not jnp.issubdtype(x.dtype, jnp.inexact):
                 return x
@@ -114,14 +115,16 @@ def point_of(run: Callable) -> Callable:
 
 
 @contextmanager
-def _explained(run, axes, patience, robust):
+def _explained(run: Callable, axes: Axes, patience: int | None, robust: bool):
     of_user = Call("run", run, (POINT,))
     check_arguments(of_user, "the axes taken one by one; a point is one dictionary")
     with PATIENCE(patience), REGULAR_FIRST(not robust), in_words(of_user, {POINT: axes.values}):
         yield
 
 
-def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> tuple[ClosedJaxpr, PyTree]:
+def traced_point(
+    run: Callable, axes: Axes, patience: int | None = None, robust: bool = True
+) -> tuple[ClosedJaxpr, PyTree]:
     """What the user's function computes at one point, and the structure in which it does."""
     shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
     with _explained(run, axes, patience, robust):
@@ -129,7 +132,13 @@ def traced_point(run: Callable, axes: Axes, patience=None, robust=True) -> tuple
 
 
 def compiled(
-    run: Callable, axes: Axes, chunk: int, devices: Sequence, layout: str, patience=None, robust=True
+    run: Callable,
+    axes: Axes,
+    chunk: int,
+    devices: Sequence,
+    layout: str,
+    patience: int | None = None,
+    robust: bool = True,
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
@@ -138,8 +147,8 @@ def compiled(
     """
     point = point_of(run)
 
-    def lanes(values):
-        def at(values):
+    def lanes(values: tuple):
+        def at(values: tuple):
             return point(dict(zip(axes.names, values)))
 
         return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
@@ -157,7 +166,7 @@ def compiled(
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
 
-    def call(point, count):
+    def call(point: dict[str, np.ndarray], count: int):
         return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
@@ -197,7 +206,7 @@ def raised(program: Program) -> tuple[PyTree, Status]:
     values, status = not_run(program, 1)
     code = RESULTS.raised._value
 
-    def with_result(x):
+    def with_result(x: Any):
         if not isinstance(x, Trajectory):
             return x
         return eqx.tree_at(lambda traj: traj.result._value, x, np.full_like(x.result._value, code))
@@ -223,13 +232,13 @@ def program_digest(closed: ClosedJaxpr) -> str:
     return digest(_text(closed).encode())
 
 
-def _text(closed):
+def _text(closed: ClosedJaxpr):
     # Memory addresses are removed; the constants of nested programs are added.
     constants = "".join(digest(_data(x)) for x in closed.consts if not isinstance(x, Tracer))
     return re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)) + constants + "".join(_constants(closed.jaxpr))
 
 
-def _constants(jaxpr):
+def _constants(jaxpr: Jaxpr):
     for equation in jaxpr.eqns:
         for value in equation.params.values():
             for part in value if isinstance(value, (tuple, list)) else (value,):
@@ -239,6 +248,6 @@ def _constants(jaxpr):
             yield from _constants(body)
 
 
-def _data(x):
+def _data(x: Any):
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jax.random.key_data(x) if is_key else x).tobytes()

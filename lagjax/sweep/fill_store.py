@@ -7,11 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.sweep.axes import Axes, Blocks, divided
 from lagjax.sweep.batch_program import GOOD, Status, not_run
 from lagjax.sweep.labels import labels_of, named_leaves
 from lagjax.sweep.metadata import in_words, versions
+from lagjax.sweep.scheduler import Engine
 from lagjax.sweep.store import Store
 from lagjax.sweep.structure import description_of
 
@@ -44,7 +46,7 @@ def new_store(engine: Any, axes: Axes, shares: int) -> NewStore:
     return NewStore(blocks, _times(engine, axes, one), description_of(engine.program.values, one))
 
 
-def _block(engine, axes, shares, seconds):
+def _block(engine: Engine, axes: Axes, shares: int, seconds: float):
     """Points per block: a few seconds' worth, at least `shares` blocks, and no more bytes than allowed."""
     chunk = engine.program.chunk
     wanted = max(1, round(BLOCK_SECONDS * engine.workers / max(seconds, 1e-6))) * chunk
@@ -53,17 +55,17 @@ def _block(engine, axes, shares, seconds):
     return min(wanted, fair, fits)
 
 
-def _times(engine, axes, one):
+def _times(engine: Engine, axes: Axes, one: PyTree):
     labels = labels_of(axes, engine.program.values).values
     named = dict(named_leaves(one))
     times = [key for key, label in labels.items() if label.times and np.ndim(named[key]) == 1]
     return {key: np.asarray(named[key]) for key in times if _is_fixed(engine, axes, key)}
 
 
-def _is_fixed(engine, axes, key):
+def _is_fixed(engine: Engine, axes: Axes, key: str):
     """Whether a leaf of what `run` returns does not depend on the point: `vmap` with `out_axes=None` decides."""
 
-    def leaf(point):
+    def leaf(point: dict[str, Any]):
         return dict(named_leaves(engine.run(point)))[key]
 
     try:

@@ -68,7 +68,7 @@ def labels_of(axes: Axes, like: PyTree) -> Labels:
     return Labels(of_axes, values, status)
 
 
-def _of_axes(axes):
+def _of_axes(axes: Axes):
     found, taken = {}, set(axes.names) | {POINT}
     for name, x in axes.values.items():
         inner = tuple(_unused_dimension(dim, taken) for dim in inner_dims(name, x.ndim - 1))
@@ -85,14 +85,14 @@ def inner_dims(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}_{i}" for i in range(count))
 
 
-def _unused_name(name, kind, taken):
+def _unused_name(name: str, kind: str, taken: set[str]):
     for candidate in (name, f"{kind}_{name}"):
         if candidate not in taken:
             return candidate
     raise ValueError(f"two of the values are named '{name}'.\nFix: another key in the dictionary that run returns.")
 
 
-def _unused_dimension(dim, taken):
+def _unused_dimension(dim: str, taken: set[str]):
     while dim in taken:
         dim = f"value_{dim}"
     return dim
@@ -112,7 +112,7 @@ class _ShownArray(NamedTuple):
     times: bool = False
 
 
-def _shown_arrays(like) -> Iterable[_ShownArray]:
+def _shown_arrays(like: PyTree) -> Iterable[_ShownArray]:
     for path, part in _with_path(like):
         key = key_of(path) or "value"
         if isinstance(part, Trajectory):
@@ -121,12 +121,12 @@ def _shown_arrays(like) -> Iterable[_ShownArray]:
             yield _ShownArray(key, _flat(key), (), len(part.shape))
 
 
-def _of_motion(motion, prefix):
+def _of_motion(motion: Trajectory, prefix: str):
     """The arrays that a trajectory shows, named as by its own `to_xarray`."""
     batch = inner_dims(f"{prefix}lane", len(motion.t.shape) - 1)
     dims = *batch, f"{prefix}{TIMES}"
 
-    def part(key, name, dims, x, of="", times=False):
+    def part(key: str, name: str, dims: tuple[str, ...], x: Any, of: str = "", times: bool = False):
         inner, flat = len(x.shape) - len(dims), tuple(map(_flat, dims))
         return _ShownArray(prefix + key, _flat(prefix + name), flat, inner, _flat(prefix + of) if of else "", times)
 
@@ -148,25 +148,25 @@ def _of_motion(motion, prefix):
         yield part(_joined(f"arrays.{PARAMS}", inner), _joined("params", inner), batch, x)
 
 
-def _joined(which, inner):
+def _joined(which: str, inner: str):
     return f"{which}.{inner}" if inner else which
 
 
-def _flat(name):
+def _flat(name: str):
     # Zarr and netCDF interpret a slash as a folder separator.
     return name.replace("/", "_")
 
 
-def _with_path(tree):
+def _with_path(tree: PyTree):
     return jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Trajectory))
 
 
-def key_of(path) -> str:
+def key_of(path: tuple[Any, ...]) -> str:
     """A path as text; "" for a single leaf."""
     return jax.tree_util.keystr(path, simple=True, separator=".").lstrip(".")
 
 
-def named_leaves(tree) -> list[tuple[str, Any]]:
+def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
     """The leaves of what `run` returns, each with a name: its path, or "value" for a single leaf.
 
     **Raises:** `ValueError` if two have the same name.
@@ -202,7 +202,7 @@ def status_attributes(field: str) -> dict[str, Any]:
     return {"long_name": getattr(STATUS_LONG_NAMES, field)} | (flags() if field == "result" else {})
 
 
-def words_of(code) -> str:
+def words_of(code: int) -> str:
     """A result code in words."""
     return {NOT_RUN: "not run", LOST: "lost from the store"}.get(int(code)) or in_words(code)
 

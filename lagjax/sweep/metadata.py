@@ -176,7 +176,14 @@ def checked(description: dict[str, Any]) -> Described:
 
     arrays = {}
 
-    def add(place, of_axes, inner, dtype, fill, chunk=None):
+    def add(
+        place: str,
+        of_axes: tuple[int, ...],
+        inner: tuple[int, ...],
+        dtype: np.dtype,
+        fill: float,
+        chunk: tuple[int, ...] | None = None,
+    ):
         shape = *of_axes, *inner
         chunk = (*(chunk or of_axes), *(max(1, n) for n in inner))
         _require(_is_inside(place) and place not in arrays, f"two arrays are at {place}")
@@ -210,7 +217,7 @@ def checked(description: dict[str, Any]) -> Described:
     return Described(arrays, blocks)
 
 
-def _dtype_and_shape(words):
+def _dtype_and_shape(words: str):
     """The dtype and shape at the beginning of words such as "float64[2, 3]"."""
     found = re.match(r"(\w+)\[([\d, ]*)\]", words)
     if found is None or found[1] not in NUMBERS:
@@ -220,7 +227,7 @@ def _dtype_and_shape(words):
     return dtype, shape
 
 
-def _is_inside(name):
+def _is_inside(name: str):
     """True for the name of an array that stays inside its store; raises `ValueError` for any other."""
     parts = name.split("/")
     inside = not PureWindowsPath(name).anchor and "\\" not in name and name.isprintable() and len(name) < 1000
@@ -314,7 +321,7 @@ def create(
         raise
 
 
-def _places(axes, program, times):
+def _places(axes: Axes, program: Program, times: dict[str, np.ndarray]):
     """Where the arrays are, by content, the names of their dimensions, and the times that are coordinates."""
     labels, lead = labels_of(axes, program.values), list(axes.dims)
     places = {"axes": {name: label.name for name, label in labels.axes.items()}, "values": {}}
@@ -337,14 +344,14 @@ def _places(axes, program, times):
     return {"places": places, "dims": dims, "times": shared}
 
 
-def _hidden_name(key, taken):
+def _hidden_name(key: str, taken: Iterable[str]):
     name = f"{STORE_GROUP}/values/{key.replace('/', '_')}"
     while name in taken:
         name += "_"
     return name
 
 
-def _metadata_of(description):
+def _metadata_of(description: dict[str, Any]):
     """The text of the `zarr.json` of every group and array of a store, by place."""
     status = {place: status_attributes(name) for name, place in description["places"]["status"].items()}
     arrays = {place: spec.metadata(status.get(place, {})) for place, spec in checked(description).arrays.items()}
@@ -376,7 +383,7 @@ def damaged(path: Path, description: dict[str, Any]) -> dict[str, str]:
     return found
 
 
-def _holds(found, expected):
+def _holds(found: Any, expected: Any):
     """Whether metadata are unchanged; users may add attributes and consolidate more arrays."""
     if not isinstance(expected, dict):
         return found == expected
@@ -397,13 +404,13 @@ def restore(path: Path, description: dict[str, Any]) -> list[str]:
     return list(found.values())
 
 
-def _read_metadata(file):
+def _read_metadata(file: Path):
     if file.stat().st_size > MOST_METADATA:
         raise ValueError(f"{file} is longer than {MOST_METADATA:,} bytes.")
     return parsed(file.read_bytes(), MOST_METADATA)
 
 
-def _write(file, text):
+def _write(file: Path, text: str):
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_suffix(f".{uuid.uuid4().hex[:8]}.partial")
     partial.write_text(text)

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from lagjax.display import plots as plot
 from lagjax.display.printable import printable
@@ -65,7 +65,7 @@ class Sweep:
         same.__dict__.update(self.__dict__)
         return same
 
-    def __deepcopy__(self, memo):
+    def __deepcopy__(self, memo: dict):
         # Only arrays are copied: structures, systems and the engine never change.
         same, values = copy(self), self._values
         same.axes, same.status = (jax.tree.map(np.copy, x) for x in (self.axes, self.status))
@@ -96,7 +96,7 @@ class Sweep:
         codes, counts = np.unique(self.status.result, return_counts=True)
         return {words_of(codes[i]): int(counts[i]) for i in np.argsort(-counts)}
 
-    def resweep(self, run: Callable | None = None, where=None) -> "Sweep":
+    def resweep(self, run: Callable | None = None, where: ArrayLike | None = None) -> "Sweep":
         """Run the points that are not `ok` again, with another `run` (other settings), and keep the rest.
 
         **Arguments:** `run` as in `lj.sweep`, returning the same structure; by default the same one, which finishes a
@@ -211,7 +211,7 @@ class Sweep:
             page.save(path)
         return page
 
-    def _plot_motions(self, motions):
+    def _plot_motions(self, motions: Trajectory):
         (name, x), *others = self.axes.values.items()
         if others or x.ndim > 1:
             name, x = POINT if others else name, np.arange(len(x))
@@ -220,7 +220,7 @@ class Sweep:
         one = jax.tree.map(lambda q: q[0, 0], motions.q)
         return plot.families(name, x, motions.t, dict(zip(coordinates.names(one), curves)))
 
-    def _panels(self, values, value):
+    def _panels(self, values: PyTree, value: str | Callable | None):
         if callable(value):
             chosen = {"value": np.asarray(value(values))}
         else:
@@ -272,7 +272,7 @@ class Sweep:
         return shown
 
 
-def _without_motion(part):
+def _without_motion(part: Any):
     return None if isinstance(part, Trajectory) else part
 
 
@@ -324,7 +324,7 @@ def open_sweep(
     return Sweep(axes, Stored(store, like), status, how, 0, 0.0, 0.0, opened)
 
 
-def opened(swept, run, indices):
+def opened(swept: Sweep, run: Callable | None, indices: np.ndarray):
     """Refuse to run points of an opened sweep again."""
     raise ValueError(
         "a sweep that was opened from its store does not know the function that ran it.\n"
@@ -332,7 +332,7 @@ def opened(swept, run, indices):
     )
 
 
-def of_store(swept, run, indices):
+def of_store(swept: Sweep, run: Callable | None, indices: np.ndarray):
     """Refuse to run points of a sweep in a store with another function."""
     raise ValueError(
         "the values in a store belong to the run that it was begun with.\n"

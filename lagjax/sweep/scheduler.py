@@ -5,15 +5,18 @@ import os
 import threading
 import time
 import warnings
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from itertools import islice
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.jaxtools.fuse_cpu import TOGETHER
-from lagjax.sweep.batch_program import program_for, raised
+from lagjax.sweep.axes import Axes
+from lagjax.sweep.batch_program import Program, program_for, raised
 
 # Each worker gets at least this many chunks, so that none waits long for the last one.
 CHUNKS_EACH = 4
@@ -35,7 +38,17 @@ class Engine:
     only when a point turns out to need it.
     """
 
-    def __init__(self, run, axes, chunk, workers, sort, layout, devices, progress):
+    def __init__(
+        self,
+        run: Callable,
+        axes: Axes,
+        chunk: int,
+        workers: int,
+        sort: bool | None,
+        layout: str,
+        devices: list,
+        progress: bool | None,
+    ):
         self.run, self.axes, self.chunk = run, axes, math.ceil(chunk / len(devices)) * len(devices)
         self.workers, self.sort, self.layout, self.devices = workers, sort, layout, devices
         self.progress = progress
@@ -47,7 +60,7 @@ class Engine:
         # Whether a point at which a callback raised was already told of.
         self._told = False
 
-    def seconds_since(self, started):
+    def seconds_since(self, started: float):
         """The seconds of compiling (including those before `started`) and of computing since `started`."""
         spent, (earlier, later) = time.perf_counter() - started, self._compiling
         self._compiling = [0.0, 0.0]
@@ -61,17 +74,17 @@ class Engine:
         of_workers = f"{self.workers} worker{'s' * (self.workers > 1)}"
         return f"{where}, {of_workers}, lanes {self.layout}, chunks of {self.chunk}"
 
-    def _program(self, robust, progress=False):
+    def _program(self, robust: bool, progress: bool | None = False):
         chunk, devices, layout = self.chunk, self.devices, self.layout
         return program_for(self.run, self.axes, chunk, devices, layout, self._patience, robust, progress)
 
-    def timed(self, indices):
+    def timed(self, indices: np.ndarray):
         """(seconds of computing, values, status) at no more than `chunk` indices."""
         started, (_, compiling) = time.perf_counter(), self._compiling
         results = self.first(indices)
         return time.perf_counter() - started - (self._compiling[1] - compiling), *results
 
-    def first(self, indices):
+    def first(self, indices: np.ndarray):
         """(values, status) at no more than `chunk` indices, before lanes that were given up are run alone."""
         if self.program.irregular.is_set():
             return self._robustly(indices)
@@ -82,10 +95,10 @@ class Engine:
             self.program.irregular.set()
         return _replaced((values, status), ~settled, self._robustly(indices[~settled]))
 
-    def _robustly(self, indices):
+    def _robustly(self, indices: np.ndarray):
         return self._call(self._robust_lanes, indices)[:2]
 
-    def _call(self, program, indices):
+    def _call(self, program: Program, indices: np.ndarray):
         """(values, status, settled) at no more than `chunk` indices; NaN at points where a callback raises.
 
         JAX drops a whole call if a function in it raises in one lane: the call is halved until those lanes are found.
@@ -101,7 +114,7 @@ class Engine:
         halves = [self._call(program, part) for part in np.array_split(indices, 2)]
         return jax.tree.map(lambda *x: np.concatenate(x), *halves)
 
-    def _raised(self, program, indices, message):
+    def _raised(self, program: Program, indices: np.ndarray, message: str):
         with self._lock:
             told, self._told = self._told, True
         if not told:
@@ -114,7 +127,7 @@ class Engine:
             )
         return *raised(program), np.ones(1, bool) if program.settles else None
 
-    def at(self, indices):
+    def at(self, indices: np.ndarray):
         """(values, status) at no more than `chunk` indices; lanes that were given up are run again alone."""
         values, status = self.first(indices)
         given_up = (status.result == MAX_STEPS) & (status.steps >= PATIENCE) & (self.layout == "vmap")
@@ -140,12 +153,12 @@ class Engine:
                 self._compiling[1] += seconds
         return self._robust_program
 
-    def over(self, indices):
+    def over(self, indices: np.ndarray):
         """Yield (positions among the indices, values, status) of chunks as they are finished, in any order."""
         chunk, order = self.chunk, self._order(indices)
         chunks = (order[start : start + chunk] for start in range(0, len(indices), chunk))
 
-        def task(positions):
+        def task(positions: np.ndarray):
             return positions, *self.at(indices[positions])
 
         if self.workers == 1:
@@ -163,7 +176,7 @@ class Engine:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _order(self, indices):
+    def _order(self, indices: np.ndarray):
         """The positions of the indices; sorted by steps, estimated from pilot points, if lanes wait for each other."""
         positions = np.arange(len(indices))
         sorting = self.layout == "vmap" and len(indices) >= 64 * PILOTS if self.sort is None else self.sort
@@ -176,7 +189,7 @@ class Engine:
         return np.argsort(np.interp(positions, pilots, steps), kind="stable")
 
 
-def _replaced(results, positions, others):
+def _replaced(results: PyTree, positions: np.ndarray, others: PyTree):
     """Values and statuses in which some positions are replaced by `others`."""
     results = jax.tree.map(np.array, results)
     for whole, new in zip(*map(jax.tree.leaves, (results, others))):

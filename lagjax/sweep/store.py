@@ -29,6 +29,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import ArrayLike, PyTree
 
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.batch_program import LOST, NOT_RUN, Program, Status
@@ -106,10 +107,10 @@ class Store:
                 unreadable.append(number)
         return found, unreadable
 
-    def _missing(self, marks):
+    def _missing(self, marks: np.ndarray):
         return np.flatnonzero(marks.reshape(len(self.blocks), -1).max(axis=1) == 0)
 
-    def write(self, number: int, values, status: Status):
+    def write(self, number: int, values: PyTree, status: Status):
         """Write a block, and then mark it."""
         shape = tuple(x.stop - x.start for x in self.blocks.region(number))
         flat = [x for _, x in named_leaves(values)] + list(status)
@@ -119,7 +120,7 @@ class Store:
         ]
         self._mark(number, marks)
 
-    def _mark(self, number, marks):
+    def _mark(self, number: int, marks: ArrayLike):
         write_chunk(self._file(MARKS, number), self._specs[MARKS], np.asarray([marks], np.uint64))
 
     def unmark(self, numbers: Iterable[int]):
@@ -154,14 +155,14 @@ class Store:
         found = [self._block(name, number) for name in self._values.values()]
         return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
 
-    def _block(self, name, number):
+    def _block(self, name: str, number: int):
         """The numbers of a block, in the shape of its region."""
         spec, here = self.arrays[name], self.blocks.region(number)
         shape = *(x.stop - x.start for x in here), *spec.shape[len(here) :]
         # Blocks at the end of an axis are filled up to their whole shape.
         return read_chunk(self._file(name, number), spec)[tuple(map(slice, shape))]
 
-    def _damage(self, number, mark, read):
+    def _damage(self, number: int, mark: np.ndarray, read: bool):
         for name, (length, checksum) in zip(self.arrays, mark.tolist()):
             if length == 0:
                 continue
@@ -185,7 +186,7 @@ class Store:
                 elif end != checksum:
                     yield f"{file} is not as it was written"
 
-    def _file(self, name, number):
+    def _file(self, name: str, number: int):
         """The file of a block; None for an empty array."""
         place = (number,) if name == MARKS else self.blocks.place(number)
         return chunk_file(self.path / name, self._specs[name], place)
@@ -198,7 +199,7 @@ class Store:
         names = tuple(self.about["names"])
         return Axes(names, tuple(map(self._axis, names)), self.about["paired"])
 
-    def _axis(self, name):
+    def _axis(self, name: str):
         place = self.about["places"]["axes"][name]
         folder, spec = self.path / place, self._specs[place]
         try:
@@ -225,7 +226,7 @@ class Store:
                 damaged.append(f"{self.path / place} was damaged")
         return damaged
 
-    def values(self, like=None) -> tuple[Any, dict[int, str]]:
+    def values(self, like: PyTree = None) -> tuple[Any, dict[int, str]]:
         """(the values of all points; the lost blocks: by number, what is wrong).
 
         Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
@@ -235,7 +236,7 @@ class Store:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
         return named, lost
 
-    def _read(self, places):
+    def _read(self, places: dict[str, str]):
         """(the arrays at some places, each (points, ...); the unmarked blocks; the lost blocks with what is wrong).
 
         Arrays have nothing in blocks that are unmarked or cannot be read.
@@ -327,7 +328,7 @@ def open_store(
     return store
 
 
-def _check_belongs(path, stored, here, accept):
+def _check_belongs(path: Path, stored: dict, here: dict, accept: bool):
     found = differences(stored, here)
     older = [line for line in found if line.startswith(("versions", "format"))]
     # Other versions may trace another program from the same function.

@@ -71,7 +71,7 @@ def tree_of(description: dict[str, Any], system: Any, path: Any, table: Table) -
         check_is_system(system)
     arrays, motions, mismatches, matching = {}, {}, [], []
 
-    def marked_value(role):
+    def marked_value(role: str):
         kind, _, number = role.partition(" ")
         if kind == LEAF:
             return jnp.zeros(())
@@ -147,19 +147,19 @@ def as_run_returns(run: Callable, axes: Axes, store: Store) -> PyTree:
     return like
 
 
-def _is_motion(x):
+def _is_motion(x: Any):
     return isinstance(x, Trajectory)
 
 
-def _in_numpy(x):
+def _in_numpy(x: Any):
     return np.asarray(x) if isinstance(x, jax.Array) else x
 
 
-def _in_json(x):
+def _in_json(x: Any):
     return {"dtype": x.dtype.str, "shape": list(x.shape), "base64": base64.b64encode(x.tobytes()).decode()}
 
 
-def _from_json(stored):
+def _from_json(stored: dict):
     dtype, data = np.dtype(stored["dtype"]), base64.b64decode(stored["base64"], validate=True)
     expected = math.prod(stored["shape"]) * dtype.itemsize
     if dtype.kind not in KINDS_OF_ARRAY or dtype.itemsize == 0 or expected != len(data):

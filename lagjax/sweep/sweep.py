@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import ArrayLike, PyTree
 
 from lagjax.display.progress import meter
-from lagjax.sweep.axes import axes_of
-from lagjax.sweep.batch_program import LAYOUTS, not_run
+from lagjax.sweep.axes import Axes, axes_of
+from lagjax.sweep.batch_program import LAYOUTS, Program, not_run
 from lagjax.sweep.fill_store import Filling, compare_versions, groups_of_blocks, new_store
 from lagjax.sweep.labels import labels_of, shapes_of
 from lagjax.sweep.metadata import check_file_names
@@ -120,7 +120,7 @@ def sweep(
     return _in_store(engine, grid, Path(store), part, accept_versions)
 
 
-def _in_memory(engine, indices, before):
+def _in_memory(engine: Engine, indices: np.ndarray, before: PyTree):
     started, axes = time.perf_counter(), engine.axes
     values, status = not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
     done = 0
@@ -147,7 +147,7 @@ class _Again:
     def __init__(self, settings: tuple[int, int, bool | None, str], engine: Engine | None = None):
         self._settings, self._engine = settings, engine
 
-    def __deepcopy__(self, memo):
+    def __deepcopy__(self, memo: dict):
         return self
 
     def __reduce__(self):
@@ -167,7 +167,7 @@ class _Again:
         return _again(swept, engine, which)
 
 
-def _again(swept, engine, which):
+def _again(swept: Sweep, engine: Engine, which: np.ndarray):
     lead = len(swept.axes.shape)
     flat = jax.tree.map(lambda x: x.reshape(swept.axes.size, *x.shape[lead:]), (swept.values, swept.status))
     there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)
@@ -179,7 +179,7 @@ def _again(swept, engine, which):
     return _in_memory(engine, which, flat)
 
 
-def _in_store(engine, axes, path, part, accept_versions):
+def _in_store(engine: Engine, axes: Axes, path: Path, part: tuple[int, int], accept_versions: bool):
     started = time.perf_counter()
     new = partial(new_store, engine, axes, CHUNKS_EACH * part[1])
     store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, new)
@@ -209,7 +209,7 @@ def _in_store(engine, axes, path, part, accept_versions):
     return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, of_store)
 
 
-def _check(layout, part, store):
+def _check(layout: str, part: tuple[int, int], store: Any):
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(map(repr, LAYOUTS))}, not {layout!r}.")
     k, n = part
@@ -222,7 +222,7 @@ def _check(layout, part, store):
         )
 
 
-def _check_memory(axes, program, workers, store, devices):
+def _check_memory(axes: Axes, program: Program, workers: int, store: Any, devices: list):
     """Raise `MemoryError` if the values would not fit."""
     on_host, free = devices[0].platform == "cpu", _free_memory()
     device_limit = None if on_host else (devices[0].memory_stats() or {}).get("bytes_limit")
@@ -252,9 +252,9 @@ def _free_memory():
     return fields.get("MemAvailable")
 
 
-def _tell_interrupted(done, total, then):
+def _tell_interrupted(done: int, total: int, then: str):
     warnings.warn(f"interrupted: {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
 
 
-def _meter(total, progress):
+def _meter(total: int, progress: bool | None):
     return meter(progress, total=total, unit=" points", unit_scale=True)

@@ -1,9 +1,11 @@
 """Sweeps as an `xarray.Dataset` or a `pandas.DataFrame`."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.sweep.batch_program import Status
@@ -37,7 +39,7 @@ def dataset(swept: Any):
     return xarray.Dataset(variables, coords, {"how": swept.how})
 
 
-def frame(swept: Any, of_values):
+def frame(swept: Any, of_values: Callable | None):
     """A sweep with one row per point: `Sweep.to_pandas`."""
     try:
         import pandas
@@ -62,12 +64,12 @@ def frame(swept: Any, of_values):
     return pandas.DataFrame(columns)
 
 
-def _labels(swept, values) -> Labels:
+def _labels(swept: Any, values: PyTree) -> Labels:
     lead = len(swept.axes.shape)
     return labels_of(swept.axes, jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[lead:], x.dtype), values))
 
 
-def _columns(name, x):
+def _columns(name: str, x: np.ndarray):
     """The columns of an array (points, ...), by name."""
     if x.ndim == 1:
         return {name: x}
@@ -75,7 +77,7 @@ def _columns(name, x):
     return {f"{name}[{', '.join(map(str, place))}]": x[(slice(None), *place)] for place in indices}
 
 
-def _check_rows(swept, values):
+def _check_rows(swept: Any, values: PyTree):
     """Raise `ValueError` unless each value has the sweep's axes in front and fits into a row."""
     lead, advice = swept.axes.shape, 'swept.to_pandas(lambda values: {"end": values.q[..., -1]})'
     motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
@@ -97,5 +99,5 @@ def _check_rows(swept, values):
             )
 
 
-def _is_motion(x):
+def _is_motion(x: Any):
     return isinstance(x, Trajectory)

@@ -72,7 +72,7 @@ def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")
     return found
 
 
-def _of_motion(name, motion, of_motion):
+def _of_motion(name: str, motion: Trajectory, of_motion: tuple[str, ...]):
     t, prefix = np.asarray(motion.t), f"{name}: " if name else ""
     parts = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers}
     for part in of_motion:
@@ -87,13 +87,13 @@ def _of_motion(name, motion, of_motion):
         yield Panel(prefix + label, "t", t, curves)
 
 
-def _real_parts(name, x):
+def _real_parts(name: str, x: np.ndarray):
     if np.iscomplexobj(x):
         return [(f"{name} (real)", x.real), (f"{name} (imaginary)", x.imag)]
     return [(name, x.astype(float))]
 
 
-def _add(found, name, x, times):
+def _add(found: Drawn, name: str, x: np.ndarray, times: Any):
     if x.ndim == 1:
         found.numbers[name] = x
         return
@@ -161,7 +161,7 @@ def page_of(
     return Page(f"Sweep over {', '.join(axes.names)}", page, f"Page of {axes.size:,} points, {dims}")
 
 
-def _axes(axes):
+def _axes(axes: Axes):
     """One slider per axis: its name, the labels of its positions, and their coordinates in a picture."""
     if axes.paired:
         labels = [axes.words(i) for i in range(axes.size)]
@@ -175,11 +175,11 @@ def _axes(axes):
     return sliders
 
 
-def _label(value, i):
+def _label(value: Any, i: int):
     return str(value) if np.ndim(value) == 0 else f"no. {i} of shape {np.shape(value)}"
 
 
-def _panel(panel, codes):
+def _panel(panel: Panel, codes: np.ndarray):
     ran = panel.x[codes != NOT_RUN]
     shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
     x = ran[0] if shared else panel.x
@@ -188,7 +188,7 @@ def _panel(panel, codes):
     return spec | {"x": encoded(x, _precision(x)), "curves": curves}
 
 
-def _precision(x):
+def _precision(x: np.ndarray):
     """Single precision, if it resolves the variation of the data."""
     finite = x[np.isfinite(x)]
     if finite.size == 0:
@@ -197,7 +197,7 @@ def _precision(x):
     return "f4" if (largest == 0 or 1e-30 < largest < 1e30) and not 0 < distance < 1e-3 * largest else "f8"
 
 
-def _check_size(axes, found: Drawn, megabytes):
+def _check_size(axes: Axes, found: Drawn, megabytes: float):
     curves = [y for panel in found.panels for y in panel.curves.values()]
     numbers = len(found.numbers) + sum(y.size for y in curves) // axes.size
     size = BASE64_FACTOR * (8 * axes.size * len(found.numbers) + sum(int(_precision(y)[1]) * y.size for y in curves))
@@ -209,7 +209,16 @@ def _check_size(axes, found: Drawn, megabytes):
         )
 
 
-def _film(axes, values, codes, positions, megabytes, seconds, rate, trail):
+def _film(
+    axes: Axes,
+    values: PyTree,
+    codes: np.ndarray,
+    positions: Callable,
+    megabytes: float,
+    seconds: float | None,
+    rate: float,
+    trail: float,
+):
     check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
     motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
     if len(motions) != 1:
@@ -235,5 +244,5 @@ def _film(axes, values, codes, positions, megabytes, seconds, rate, trail):
     return film(at, points, rate, kept)
 
 
-def _is_motion(x):
+def _is_motion(x: Any):
     return isinstance(x, Trajectory)

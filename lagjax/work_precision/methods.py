@@ -48,7 +48,7 @@ def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.Abst
     return named
 
 
-def _named(methods):
+def _named(methods: Any):
     named = {}
     for method in methods:
         name = type(method).__name__
@@ -57,7 +57,7 @@ def _named(methods):
     return named
 
 
-def _check(name, method, system, start):
+def _check(name: str, method: Any, system: System, start: State):
     if method is None:
         raise TypeError(f"method {name!r} is None.\nFix: leave methods out; the comparison then includes the default.")
     if isinstance(method, diffrax.AbstractSolver) and not isinstance(method, diffrax.AbstractAdaptiveSolver):
@@ -81,7 +81,7 @@ def _check(name, method, system, start):
         )
 
 
-def ladder(tolerances: Any, dtype) -> tuple[float, ...]:
+def ladder(tolerances: Any, dtype: Any) -> tuple[float, ...]:
     """The tolerances from loose to tight; raise if one is below round-off."""
     if tolerances is None:
         return LADDERS.get(np.dtype(dtype), (1e-1, 1e-2))
@@ -121,7 +121,7 @@ def as_code(method: Any) -> str:
     return f"{package}{method!r}"
 
 
-def _in_words(x):
+def _in_words(x: float):
     if isinstance(x, type):
         return f"the class {x.__name__}"
     return f"{x!r}" if isinstance(x, str) else f"one {type(x).__name__}"

@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, ArrayLike, PyTree
 from scipy import integrate
 
 MAX_STEPS = 2**20
 
 
-def usual_others(acceleration: Callable, q0, v0, params, ts) -> dict[str, Callable]:
+def usual_others(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: np.ndarray) -> dict[str, Callable]:
     """All alternatives by name."""
     motion = acceleration, q0, v0, params, np.asarray(ts)
     return {
@@ -29,14 +30,14 @@ def usual_others(acceleration: Callable, q0, v0, params, ts) -> dict[str, Callab
     }
 
 
-def bare_diffrax(acceleration, q0, v0, params, ts):
+def bare_diffrax(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: np.ndarray):
     """diffrax's Dopri8 and its own loop, compiled once."""
     start, params = jax.tree.map(lambda x: jnp.asarray(x, float), ((q0, v0), params))
     method = diffrax.Dopri8()
     stages = method.tableau.num_stages - method.tableau.fsal
 
     @jax.jit
-    def solve(tolerance, start, params):
+    def solve(tolerance: float, start: Array, params: PyTree):
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, params: (y[1], acceleration(t, *y, params))),
             method,
@@ -56,11 +57,11 @@ def bare_diffrax(acceleration, q0, v0, params, ts):
     return lambda tolerance: solve(jnp.asarray(tolerance), start, params)
 
 
-def dop853(acceleration, q0, v0, params, ts):
+def dop853(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: np.ndarray):
     """`scipy.integrate.solve_ivp` with DOP853."""
     field, y0, as_states = _flat_problem(acceleration, q0, v0, params)
 
-    def solve(tolerance):
+    def solve(tolerance: float):
         solution = integrate.solve_ivp(
             field, (ts[0], ts[-1]), y0, method="DOP853", t_eval=ts, rtol=tolerance, atol=tolerance
         )
@@ -69,11 +70,11 @@ def dop853(acceleration, q0, v0, params, ts):
     return solve
 
 
-def lsoda(acceleration, q0, v0, params, ts):
+def lsoda(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: np.ndarray):
     """`scipy.integrate.odeint`, which is LSODA."""
     field, y0, as_states = _flat_problem(acceleration, q0, v0, params)
 
-    def solve(tolerance):
+    def solve(tolerance: float):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", integrate.ODEintWarning)
             options = {"tfirst": True, "rtol": tolerance, "atol": tolerance, "mxstep": MAX_STEPS}
@@ -84,12 +85,12 @@ def lsoda(acceleration, q0, v0, params, ts):
     return solve
 
 
-def _flat_problem(acceleration, q0, v0, params):
+def _flat_problem(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree):
     """The vector field for flat vectors, the start as a vector, and a function from rows of vectors to (q, v)."""
     y0, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), (q0, v0)))
 
     @jax.jit
-    def rates(t, y):
+    def rates(t: ArrayLike, y: Array):
         q, v = unravel(y)
         return ravel_pytree((v, acceleration(t, q, v, params)))[0]
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.solve.backward_time import runs_backward
@@ -52,7 +53,7 @@ class TimedProgram:
         self.compile_seconds = 0.0
         self._compiled = self._compile(robust=False)
 
-    def __call__(self, tolerance, ts=None, q=None, v=None) -> Trajectory:
+    def __call__(self, tolerance: ArrayLike, ts: Array | None = None, q: PyTree = None, v: PyTree = None) -> Trajectory:
         """Solve; by default from the motion's start, with outputs at its own times."""
         args = self._arguments(tolerance, ts, q, v)
         trajectory, regular = self._compiled(args)
@@ -61,7 +62,7 @@ class TimedProgram:
             trajectory, _ = self._compiled(args)
         return jax.block_until_ready(trajectory)
 
-    def call(self, tolerance) -> Callable[[], Any]:
+    def call(self, tolerance: ArrayLike) -> Callable[[], Any]:
         """The bare call, for timing; the caller has to wait for the result."""
         args = self._arguments(tolerance)
         return lambda: self._compiled(args)
@@ -70,23 +71,23 @@ class TimedProgram:
         """The least time of a call of an empty program with the same arguments and results."""
         args = self._arguments(1e-3)
 
-        def zeros(args):
+        def zeros(args: Sequence[Array]):
             return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._returned)
 
         idle = jax.jit(zeros).lower(args).compile()
         return min(seconds_of(lambda: idle(args)) for _ in range(50))
 
-    def _arguments(self, tolerance, ts=None, q=None, v=None):
+    def _arguments(self, tolerance: ArrayLike, ts: Array | None = None, q: PyTree = None, v: PyTree = None):
         start = self._motion.start
         ts = self._motion.ts if ts is None else ts
         given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
         return [jnp.asarray(x) for x in hashable_partition((*given, start.params))[0]]
 
-    def _compile(self, robust):
+    def _compile(self, robust: bool):
         motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
         _, static = hashable_partition(given)
 
-        def solve(args):
+        def solve(args: Sequence[Array]):
             tolerance, ts, q, v, params = static.combine(args)
             # Decreasing times must be known at compile time.
             ts = motion.ts if runs_backward(motion.ts) else ts
@@ -94,7 +95,7 @@ class TimedProgram:
                 motion.system, q, v, params, ts=ts, method=self._method, throw=False, rtol=tolerance, **motion.options
             )
 
-        def program(args):
+        def program(args: Sequence[Array]):
             trajectory, _, regular = reporting(solve)(args)
             return trajectory, regular
 

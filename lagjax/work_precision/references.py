@@ -102,7 +102,7 @@ def other_events(found: Compared, right: Compared) -> str:
     return ""
 
 
-def scales_of(samples: Any, ts) -> ComparedScales:
+def scales_of(samples: Any, ts: np.ndarray) -> ComparedScales:
     """The units from states (q, v) during the motion, each leaf with a leading axis."""
     largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0)) or 1.0
     return ComparedScales(*jax.tree.map(largest, tuple(samples)), time=abs(float(ts[-1] - ts[0])))
@@ -157,7 +157,7 @@ class Reference:
 class KnownAnswer:
     """A reference answer: its states, their units, its origin, and its own error."""
 
-    def __init__(self, right: Compared, scales: ComparedScales, how: str, error: float, dtype):
+    def __init__(self, right: Compared, scales: ComparedScales, how: str, error: float, dtype: Any):
         self.right, self.scales, self.how, self.error, self._dtype = right, scales, how, error, dtype
 
     def distance(self, found: Compared) -> float:
@@ -234,7 +234,7 @@ def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgra
     return KnownAnswer(right, scales_of(samples, ts), how, 0.0, dtype)
 
 
-def _as_states(states, motion):
+def _as_states(states: Any, motion: ComparedMotion):
     """(q, v) in the structure and shapes of the start, each leaf with an axis of times in front."""
     if not (isinstance(states, (tuple, list)) and len(states) == 2):
         raise TypeError(
@@ -259,7 +259,7 @@ def _as_states(states, motion):
     return states
 
 
-def _check_trajectory(reference, motion):
+def _check_trajectory(reference: Trajectory, motion: ComparedMotion):
     if reference.t.ndim != 1:
         raise ValueError(
             f"the reference is a batch of shape {reference.t.shape[:-1]}.\n"

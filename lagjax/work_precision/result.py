@@ -1,6 +1,6 @@
 """The result of a comparison: points, the curve of each method with its measured order, tables, and a diagram."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -259,7 +259,7 @@ class WorkPrecision:
         """Error against evaluations, for `plot.work_precision`."""
         return self._drawn(title, "evaluations of the accelerations", lambda point: point.evaluations or np.nan)
 
-    def _drawn(self, title, label, work):
+    def _drawn(self, title: str, label: str, work: Callable):
         curves = {
             name: (
                 np.array([work(p) for p in curve.points], float),
@@ -294,30 +294,30 @@ def in_ms(seconds: float) -> str:
     return "-" if not np.isfinite(seconds) else f"{1e3 * seconds:.3g}"
 
 
-def _in_seconds(seconds):
+def _in_seconds(seconds: float):
     return "-" if not np.isfinite(seconds) else f"{seconds:.1f}"
 
 
-def _curve_cells(curve, i):
+def _curve_cells(curve: Curve, i: int):
     """Name, order and seconds of compiling, only in the first row of a method."""
     if i:
         return "", "", ""
     return curve.method, f"{curve.order:.1f}" if np.isfinite(curve.order) else "-", _in_seconds(curve.compile_seconds)
 
 
-def _point_cells(point):
+def _point_cells(point: Point):
     known = lambda count: "-" if count is None else f"{count}"
     error = f"{point.error:.1e}" if point.ended_well else "-"
     return f"{point.tolerance:.0e}", error, known(point.steps), known(point.evaluations), in_ms(point.seconds)
 
 
-def _remark(point):
+def _remark(point: Point):
     if not point.ended_well:
         return point.result
     return "" if point.trusted else "not to be trusted"
 
 
-def _reference_warning(reference):
+def _reference_warning(reference: Reference):
     return (
         f"errors below {reference.error:.0e} are unknown. Usual cause: amplified errors (chaos, a long span), "
         "a force that jumps or is narrow, a wrong reference. Fix: shorten ts, jump_ts=, max_step=, reference=."

@@ -156,7 +156,15 @@ class Solve(NamedTuple):
         return self.found is not None and all(np.isfinite(x).all() for x in jax.tree.leaves(self.found[1:3]))
 
 
-def _motion(system, q0, v0, params, ts, events, options):
+def _motion(
+    system: System,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    ts: np.ndarray,
+    events: Mapping[str, Crossing] | None,
+    options: dict[str, Any],
+):
     """The motion, with its start as arrays; raise if the arguments do not define one."""
     check_system(system, q0, v0, params)
     unknown = [name for name in options if name not in OPTIONS]
@@ -172,7 +180,7 @@ def _motion(system, q0, v0, params, ts, events, options):
     return ComparedMotion(system, start, arguments.times(ts, start.t.dtype), {**options, "events": events})
 
 
-def _check(reference, error, others, events):
+def _check(reference: Any, error: Any, others: Any, events: Mapping[str, Crossing] | None):
     if reference is not None and error is not None:
         raise ValueError("reference and error are two ways to define the error.\nFix: leave one of them out.")
     if reference is not None and not isinstance(reference, (Trajectory, tuple, list)) and not callable(reference):
@@ -184,7 +192,7 @@ def _check(reference, error, others, events):
         raise ValueError("others have no events to compare.\nFix: leave out events, or others.")
 
 
-def _solves_of_program(name, program, tolerances, patience):
+def _solves_of_program(name: str, program: TimedProgram, tolerances: Sequence[float], patience: float):
     """The solves of a method, from loose to tight."""
     solves, slow = [], ""
     for tolerance in tolerances:
@@ -199,7 +207,7 @@ def _solves_of_program(name, program, tolerances, patience):
     return solves
 
 
-def _solves_of_other(motion, name, solve, tolerances, patience):
+def _solves_of_other(motion: ComparedMotion, name: str, solve: Callable, tolerances: Sequence[float], patience: float):
     """The solves of another tool, after one call that lets it compile."""
     solves, slow = [], ""
     solve(tolerances[0])
@@ -219,11 +227,11 @@ def _solves_of_other(motion, name, solve, tolerances, patience):
     return solves
 
 
-def _too_slow(seconds, patience):
+def _too_slow(seconds: float, patience: float):
     return "" if seconds <= patience else f"not tried: the last took {seconds:.1f} s"
 
 
-def _all_failed(motion, solved, tolerances):
+def _all_failed(motion: ComparedMotion, solved: Any, tolerances: Sequence[float]):
     """The error to raise if every solve failed, with the message of `integrate` if that fails, too."""
     reasons = "; ".join(dict.fromkeys(f"{solve.method}: {solve.reason}" for solve in solved))
     cause = ""
@@ -234,7 +242,7 @@ def _all_failed(motion, solved, tolerances):
     return RuntimeError(f"no method reached the end of this motion at any tolerance. {reasons}{cause}")
 
 
-def _tightest(motion, solved) -> list[Compared]:
+def _tightest(motion: ComparedMotion, solved: Any) -> list[Compared]:
     """The tightest successful solves of two methods; the tightest two if there is only one method."""
     good = [solve for solve in solved if solve.ended_well and isinstance(solve.found, Trajectory)]
     good.sort(key=lambda solve: solve.tolerance)
@@ -244,7 +252,16 @@ def _tightest(motion, solved) -> list[Compared]:
     return [references.compared_of(solve.found, motion.options["events"]) for solve in chosen[:2]]
 
 
-def _points(motion, solvers, solved, known: KnownAnswer | None, judged: Reference | None, error, call_seconds, repeats):
+def _points(
+    motion: ComparedMotion,
+    solvers: Mapping[str, Any],
+    solved: Any,
+    known: KnownAnswer | None,
+    judged: Reference | None,
+    error: Any,
+    call_seconds: float,
+    repeats: int,
+):
     """The point of each solve; the successful ones are timed, in turn."""
     good = [solve for solve in solved if solve.ended_well]
     measured = interleaved_times([solve.call for solve in good], [solve.seconds for solve in good], repeats)
@@ -254,7 +271,16 @@ def _points(motion, solvers, solved, known: KnownAnswer | None, judged: Referenc
     ]  # fmt: skip
 
 
-def _point(motion, solve, times, solvers, known, judged, error, call_seconds):
+def _point(
+    motion: ComparedMotion,
+    solve: Solve,
+    times: Any,
+    solvers: Mapping[str, Any],
+    known: KnownAnswer,
+    judged: Reference,
+    error: Any,
+    call_seconds: float,
+):
     events, found, reason = motion.options["events"], solve.found, solve.reason
     ours, distance = isinstance(found, Trajectory), float("inf")
     if solve.ended_well and known is None:

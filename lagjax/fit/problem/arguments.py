@@ -1,16 +1,18 @@
 """Turn the user's arguments into the arrays of a fit, with errors in the user's words."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.fit.problem.initial_states import starts
-from lagjax.fit.problem.parameters import find, leaf_name
-from lagjax.fit.problem.records import KINDS, Record, channels, cut, spread
+from lagjax.fit.problem.parameters import FreeNumbers, find, leaf_name
+from lagjax.fit.problem.records import KINDS, Record, Windows, channels, cut, spread
 from lagjax.fit.problem.residuals import LOSSES, FitProblem, replace
 from lagjax.fit.result.result import FitWarning
 from lagjax.integrate.events.event import Crossing, traced_guard
@@ -19,15 +21,29 @@ from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_call, traced_system
+from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import OF_STATE
+from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import model_of
+from lagjax.system.system import System
 from lagjax.system.user_errors import Call
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}
 
 
-def problem_of(system, records, params, free, observe, bounds, priors, loss, window, options) -> FitProblem:
+def problem_of(
+    system: System | Hybrid,
+    records: Record | Sequence[Record],
+    params: PyTree,
+    free: str | Iterable[str] | None,
+    observe: Callable | None,
+    bounds: Mapping | None,
+    priors: Mapping | None,
+    loss: str,
+    window: float | None,
+    options: dict[str, Any],
+) -> FitProblem:
     """Check all arguments and make arrays of them."""
     check_system(system, records, params, phases=True)
     # A motion in phases starts in that of `start=`, which is no option of the motions.
@@ -72,13 +88,13 @@ def problem_of(system, records, params, free, observe, bounds, priors, loss, win
     )  # fmt: skip
 
 
-def _traced(observe, guess):
+def _traced(observe: Callable | None, guess: State):
     if observe is None:
         return None
     return traced_call(Call("observe", observe, OF_STATE), guess._asdict(), lambda call, value: None)
 
 
-def _with_traced_events(options, system, guess):
+def _with_traced_events(options: dict[str, Any], system: System, guess: State):
     events = options.get("events")
     if not isinstance(events, Mapping) or not all(isinstance(event, Crossing) for event in events.values()):
         return options
@@ -87,7 +103,7 @@ def _with_traced_events(options, system, guess):
     return options | {"events": traced}
 
 
-def _absolute(records, loss, priors):
+def _absolute(records: Sequence[Record], loss: str, priors: Mapping | None):
     """Whether the sizes of the errors are known; raise if they are needed and not given."""
     given = [record.sigma is not None for record in records]
     if any(given) and not all(given):
@@ -108,7 +124,7 @@ def _absolute(records, loss, priors):
     return False
 
 
-def _overrides(records, windows, found):
+def _overrides(records: Sequence[Record], windows: Windows, found: FreeNumbers):
     names = sorted({name for record in records for name in record.params})
     known = {leaf_name(path): x for path, x in jtu.tree_leaves_with_path(found.params)}
     fitted = {name.partition("[")[0] for name in found.names}
@@ -126,7 +142,7 @@ def _overrides(records, windows, found):
     return values
 
 
-def _check_kinds(records, observe, options):
+def _check_kinds(records: Sequence[Record], observe: Callable | None, options: dict[str, Any]):
     kinds = set(records[0].measured)
     for r, record in enumerate(records):
         structures = [jax.tree.structure(x.measured) for x in (records[0], record)]
@@ -148,7 +164,7 @@ def _check_kinds(records, observe, options):
         )
 
 
-def _gathered(windows, trees, kind):
+def _gathered(windows: Windows, trees: Sequence[PyTree], kind: str):
     if kind == "end":
         last = np.append(windows.record[1:] != windows.record[:-1], True)
         xp = numpy_of(trees)
@@ -160,7 +176,7 @@ def _gathered(windows, trees, kind):
     return jax.tree.map(lambda *x: windows.gather(x), *trees)
 
 
-def _check_anything_measured(measured):
+def _check_anything_measured(measured: PyTree):
     if not is_traced(measured) and all(np.all(np.isnan(x)) for x in jax.tree.leaves(measured)):
         raise ValueError(
             "all measurements are NaN.\nUsual cause: a column of a file that was not read as numbers.\n"
@@ -168,7 +184,7 @@ def _check_anything_measured(measured):
         )
 
 
-def _sigmas(records, windows, measured, absolute):
+def _sigmas(records: Sequence[Record], windows: Windows, measured: PyTree, absolute: bool):
     """Sigmas in the shape of the measurements, the spread of each channel, and the largest spread in sigmas."""
     spreads = jax.tree.map(_spread, measured)
     if not absolute:
@@ -184,7 +200,7 @@ def _sigmas(records, windows, measured, absolute):
     return sigma, spreads, xp.asarray(xp.max(xp.stack(ratios)))
 
 
-def _spread(x):
+def _spread(x: Array):
     """The standard deviation of a channel; its largest absolute value if that is 0; 1 if that is 0, too."""
     xp, deviation = numpy_of(x), spread(x)
     size = xp.max(xp.where(xp.isnan(x), 0.0, xp.abs(x)), initial=0.0)
@@ -192,7 +208,7 @@ def _spread(x):
     return xp.where(deviation > 0, deviation, 1.0)
 
 
-def _broadcast(record, kind):
+def _broadcast(record: Record, kind: str):
     sigma, tree = record.sigma, record.measured[kind]
     if isinstance(sigma, Mapping):
         if kind not in sigma:
@@ -202,8 +218,8 @@ def _broadcast(record, kind):
             )
         sigma = sigma[kind]
 
-    def like(s, part):
-        def one(x):
+    def like(s: ArrayLike, part: PyTree):
+        def one(x: Array):
             xp = numpy_of(s)
             given = xp.asarray(s, x.dtype)
             if xp is np and not np.all(given > 0):

@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, Bool, PyTree
 
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.problem.residuals import WHOLE, FitProblem
 from lagjax.integrate.integrate import integrate
 from lagjax.mechanics.diagnosis import listed
+from lagjax.numerics.windowed_least_squares import Unknowns
 from lagjax.system.model import model_of
 
 
@@ -21,7 +23,7 @@ def check_predicted(problem: FitProblem):
     q, v = (jax.eval_shape(problem.unflatten, x) for x in begin)
     t, params = jax.ShapeDtypeStruct((), problem.windows.ts.dtype), problem.found.params
 
-    def one_time(t, q, v, params):
+    def one_time(t: Array, q: PyTree, v: PyTree, params: PyTree):
         phases = model_of(problem.system, t, q, v, params).phases
         multipliers = {name: jnp.asarray(x) for phase in phases for name, x in phase.zero_multipliers().items()}
         values = {"q": q, "v": v, "multipliers": multipliers}
@@ -34,7 +36,7 @@ def check_predicted(problem: FitProblem):
         _check_match(kind, predicted[kind], tree, 1 if kind == "end" else 2)
 
 
-def _check_match(kind: str, predicted: Any, measured: Any, axes: int, path=()):
+def _check_match(kind: str, predicted: Any, measured: Any, axes: int, path: tuple[Any, ...] = ()):
     if isinstance(measured, dict) and isinstance(predicted, dict):
         for name, part in measured.items():
             if name not in predicted:
@@ -57,7 +59,7 @@ def _check_match(kind: str, predicted: Any, measured: Any, axes: int, path=()):
             )
 
 
-def check_motion(problem, well, u):
+def check_motion(problem: FitProblem, well: Bool[Array, " W"], u: Unknowns):
     """Raise if a motion fails, with the message of `integrate`."""
     failed = np.flatnonzero(~np.asarray(well))
     if not failed.size:

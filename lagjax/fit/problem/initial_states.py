@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.fit.problem.records import Record, Windows, spread
 from lagjax.integrate.integrate import integrate
@@ -57,7 +57,7 @@ class Chart(NamedTuple):
     along: Float[Array, "n k"]
     across: Float[Array, "n r"]
 
-    def at(self, s: Float[Array, " k"], residual: Callable, problem):
+    def at(self, s: Float[Array, " k"], residual: Callable, problem: PyTree):
         """The vector y with `residual(problem, y) = 0`, which is differentiable in `s` and in `problem`."""
         y = self.guess + self.along @ s
         if self.across.shape[-1] == 0:
@@ -86,7 +86,7 @@ class Starts(NamedTuple):
         """The number of unknowns in a window's start."""
         return self.q.along.shape[-1]
 
-    def vectors(self, s: Float[Array, " k"], r: Float[Array, " k"], model: Model, t):
+    def vectors(self, s: Float[Array, " k"], r: Float[Array, " k"], model: Model, t: Array):
         """Coordinates at `s` and velocities at `r` of one window, where `self` holds this window's entries."""
         x = self.q.at(s, lambda problem, x: constraints.position_residual(*problem, x), (model, t))
         return x, self.v.at(r, lambda problem, u: constraints.velocity_residual(*problem, u), (model, t, x))
@@ -128,7 +128,7 @@ def _stacked(charts: Sequence[Chart], before: int, k: int) -> Chart:
     return Chart(numpy_of(guesses).stack(guesses), along, across)
 
 
-def _state(t, q, v, params) -> State:
+def _state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     """A state; one made of numbers stays numbers, even while a program is traced."""
     if is_traced((q, v, params)):
         return coordinates.given_state(t, q, v, params)
@@ -137,21 +137,21 @@ def _state(t, q, v, params) -> State:
     return s._replace(q=jax.tree.map(np.asarray, s.q), v=jax.tree.map(np.asarray, s.v))
 
 
-def _vector(tree):
+def _vector(tree: PyTree):
     """All coordinates in one vector, a NumPy array unless they are traced."""
     xp = numpy_of(tree)
     return xp.concatenate([xp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
 @once
-def unflatten_of(of_kinds) -> Callable:
+def unflatten_of(of_kinds: tuple) -> Callable:
     """The function that turns a vector into coordinates of these `kinds`."""
     structure, *arrays = of_kinds
     with jax.ensure_compile_time_eval():
         return coordinates.flatten(jax.tree.unflatten(structure, [np.zeros(*array) for array in arrays]))[1]
 
 
-def _guess(system, record, r, params) -> State:
+def _guess(system: System, record: Record, r: int, params: PyTree) -> State:
     q, v = record.q0, record.v0
     if q is None or v is None:
         read_q, read_v = _state_from_samples(record, np.arange(len(record.t)))
@@ -182,11 +182,11 @@ def _guess(system, record, r, params) -> State:
     return guess
 
 
-def _state_from_samples(record, samples):
+def _state_from_samples(record: Record, samples: Int[np.ndarray, " m"]):
     """(q, v) at the first of some samples, from parabolas through the first measured ones; None if not measured."""
     t = record.t[samples] - record.t[samples[0]]
 
-    def parabolas(kind):
+    def parabolas(kind: str):
         tree = record.measured.get(kind)
         pairs = jax.tree.map(lambda x: _parabola(t.astype(x.dtype), x, samples), tree)
         return [jax.tree.map(lambda x, pair, i=i: pair[i], tree, pairs) for i in (0, 1)]
@@ -197,7 +197,7 @@ def _state_from_samples(record, samples):
     return q, slopes if v is None else v
 
 
-def _parabola(t, x, samples):
+def _parabola(t: Array, x: Array, samples: Int[np.ndarray, " m"]):
     """Value and slope at the first of some samples, at t = 0, of a parabola through the first that are not missing.
 
     Outliers do not count: among the parabolas through three samples each, the one nearest to most other samples decides
@@ -232,12 +232,12 @@ def _parabola(t, x, samples):
 
 
 @once
-def _threes(count):
+def _threes(count: int):
     """All choices of three among `count` samples."""
     return np.array(list(combinations(range(count), 3)))
 
 
-def _states_along_motion(system, first, ts, options):
+def _states_along_motion(system: System, first: State, ts: Array, options: dict[str, Any]):
     """The states at the starts of a record's later windows, along the motion from its guessed start."""
     known = {name: value for name, value in options.items() if name not in ("event", "events")}
     motion = integrate(system, first.q, first.v, first.params, ts=ts, **(known | {"throw": False}))
@@ -248,13 +248,13 @@ def _states_along_motion(system, first, ts, options):
     return [jax.tree.map(lambda x, i=i: x[i], (q, v)) for i in range(1, len(ts))]
 
 
-def _free(q, hold):
+def _free(q: PyTree, hold: bool | tuple[str, ...]):
     if isinstance(hold, bool):
         return np.full(len(coordinates.names(q)), not hold)
     return free_coordinates(q, hold)
 
 
-def _charts(system, s: State, free_q, free_v, r) -> Starts:
+def _charts(system: System, s: State, free_q: Bool[np.ndarray, " n"], free_v: Bool[np.ndarray, " n"], r: int) -> Starts:
     x, u = _vector(s.q), _vector(s.v)
     if not system.constraints:
         nothing = np.zeros((len(free_q), 0))
@@ -262,7 +262,7 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
     with jax.ensure_compile_time_eval():
         model = model_of(system, *s)
 
-        def charts(x, u, of_q, of_v):
+        def charts(x: Array, u: Array, of_q: Array, of_v: Array):
             return Starts(_chart(x, of_q, free_q), _chart(u, of_v, free_v))
 
         near = charts(x, u, *_rows(model, s.t, x, u))
@@ -279,7 +279,7 @@ def _charts(system, s: State, free_q, free_v, r) -> Starts:
         return charts(moved.x, moved.u, moved.of_q, moved.of_v)
 
 
-def _chart(y, rows, free):
+def _chart(y: Array, rows: Array, free: Bool[np.ndarray, " n"]):
     """The chart at y of equations with these rows; only free entries of y change."""
     rows = np.asarray(rows)[:, free]
     along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))
@@ -304,7 +304,7 @@ class Moved(NamedTuple):
 
 
 @partial(compiled, in_numpy=True)
-def _move_onto_constraints(near: Starts, model: Model, t) -> Moved:
+def _move_onto_constraints(near: Starts, model: Model, t: Array) -> Moved:
     nothing = (jnp.zeros(chart.along.shape[1], t.dtype) for chart in near)
     x, u = near.vectors(*nothing, model, t)
     holds = within(equations_of(model), t, model.tree(x), model.tree(u), OFF, OFF)
@@ -312,7 +312,7 @@ def _move_onto_constraints(near: Starts, model: Model, t) -> Moved:
 
 
 @partial(compiled, in_numpy=True)
-def _rows(model, t, x, u):
+def _rows(model: Model, t: Array, x: Array, u: Array):
     of_q = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
     of_v = jax.jacfwd(lambda u: constraints.velocity_residual(model, t, x, u))(u)
     return of_q, of_v

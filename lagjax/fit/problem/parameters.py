@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.diagnosis import listed
@@ -83,12 +83,12 @@ class FreeNumbers:
         parts = [jnp.ravel(x).astype(self.start.dtype) for x in jax.tree.leaves(tree)]
         return jnp.concatenate(parts or [jnp.zeros(0, self.start.dtype)])
 
-    def natural(self, z):
+    def natural(self, z: Array):
         """Numbers within their bounds from unbounded ones."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         below, above = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
 
-        def z_if(taken):
+        def z_if(taken: Bool[Array, " p"]):
             # Zeros in branches that are not taken: an overflow there would make derivatives NaN.
             return jnp.where(taken, z, 0.0)
 
@@ -96,7 +96,7 @@ class FreeNumbers:
         x = jnp.where(high & ~low, above - jnp.exp(-z_if(high & ~low)), x)
         return jnp.where(high & low, below + (above - below) * jax.nn.sigmoid(z_if(high & low)), x)
 
-    def free(self, x):
+    def free(self, x: Array):
         """The inverse of `natural`."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         share = (x - self.low) / jnp.where(low & high, self.high - self.low, 1.0)
@@ -105,7 +105,7 @@ class FreeNumbers:
         return jnp.where(high & low, jax.scipy.special.logit(jnp.where(high & low, share, 0.5)), z)
 
 
-def _replace_entries(old, places, new):
+def _replace_entries(old: Array, places: np.ndarray, new: Array):
     """All entries of `old` as a vector, some of them replaced."""
     if is_traced((old, new)):
         return jnp.ravel(old).at[places].set(new)
@@ -119,7 +119,7 @@ def find(
     free: str | Iterable[str] | None,
     bounds: Mapping[str, tuple[float | None, float | None]],
     priors: Mapping[str, tuple[float, float]],
-    dtype,
+    dtype: Any,
 ) -> FreeNumbers:
     """Determine the numbers to be fitted from `params`, names, bounds and priors."""
     if not is_traced(params):
@@ -137,7 +137,7 @@ def find(
     values = [xp.ravel(floating[name])[places].astype(dtype) for name, places in chosen.items()]
     start = xp.concatenate(values or [xp.zeros(0, dtype)])
 
-    def spread(given, default, what):
+    def spread(given: Mapping[str, tuple], default: tuple[float, float], what: str):
         by_leaf = [{name: np.full(len(places), value) for name, places in chosen.items()} for value in default]
         among = {name: floating[name] for name in chosen}
         for wanted, pair in given.items():
@@ -164,16 +164,18 @@ def find(
     return found
 
 
-def leaf_name(path) -> str:
+def leaf_name(path: tuple[Any, ...]) -> str:
     """The name of a leaf of `params` as a user writes it."""
     return jtu.keystr(path, simple=True, separator=".") or "params"
 
 
-def _entries(name, x):
+def _entries(name: str, x: Array):
     return [name + ("[" + ", ".join(map(str, i)) + "]" if i else "") for i in np.ndindex(x.shape)]
 
 
-def _matching(name: Any, among: Mapping[str, Array], argument: str, chosen=None) -> dict[str, Any]:
+def _matching(
+    name: Any, among: Mapping[str, Array], argument: str, chosen: Mapping[str, np.ndarray] | None = None
+) -> dict[str, Any]:
     """The leaves that a name stands for, each with the places of its entries: all, or that of one element, 'm[1]'."""
     found: dict[str, Any] = {leaf: slice(None) for leaf in among if leaf == name or leaf.startswith(f"{name}.")}
     leaf = str(name).partition("[")[0]
@@ -190,13 +192,13 @@ def _matching(name: Any, among: Mapping[str, Array], argument: str, chosen=None)
     return found
 
 
-def _check_pair(name, pair, what):
+def _check_pair(name: str, pair: Any, what: str):
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
         raise ValueError(f"{what} of '{name}' must be a pair, not {pair!r}.\nFix: {what}={example}.")
 
 
-def _check_start(found, low, high):
+def _check_start(found: FreeNumbers, low: np.ndarray, high: np.ndarray):
     if np.any(low >= high):
         i = int(np.argmax(low >= high))
         raise ValueError(f"the bounds of '{found.names[i]}' are ({low[i]}, {high[i]}): low must be below high.")

@@ -117,7 +117,7 @@ def channels(measured: Mapping[str, PyTree]) -> list[tuple[str, Array]]:
     return [(channel_name(kind, path), x) for kind, path, x in leaves]
 
 
-def channel_name(kind: str, path) -> str:
+def channel_name(kind: str, path: tuple[Any, ...]) -> str:
     """The name of a measured quantity as a user writes it."""
     name = jtu.keystr(path, simple=True, separator=".")
     if kind in ("q", "multipliers", "observed"):
@@ -125,7 +125,7 @@ def channel_name(kind: str, path) -> str:
     return f"{kind}.{name}" if name else kind
 
 
-def spread(x):
+def spread(x: Array):
     """The standard deviation of the values that are not missing; 0 if all are."""
     xp, known = numpy_of(x), ~numpy_of(x).isnan(x)
     count = xp.maximum(xp.sum(known), 1)
@@ -133,21 +133,21 @@ def spread(x):
     return xp.sqrt(xp.sum(xp.where(known, (x - mean) ** 2, 0.0)) / count)
 
 
-def _is_list_of_numbers(x):
+def _is_list_of_numbers(x: Any):
     return isinstance(x, list) and all(isinstance(y, int | float | np.number) for y in jax.tree.leaves(x))
 
 
-def _as_floats(x):
+def _as_floats(x: ArrayLike):
     return numpy_of(x).asarray(x, jnp.result_type(float))
 
 
-def _held(hold):
+def _held(hold: Any):
     if isinstance(hold, bool):
         return hold
     return (hold,) if isinstance(hold, str) else tuple(hold)
 
 
-def _times(t):
+def _times(t: ArrayLike):
     t = np.asarray(t, np.result_type(np.asarray(t).dtype, np.float32))
     if t.ndim != 1 or len(t) < 2:
         raise ValueError(f"the times of a record must be a vector of two or more, not of shape {t.shape}.")
@@ -164,7 +164,7 @@ def _times(t):
     return t
 
 
-def _check(name, x, count):
+def _check(name: str, x: Array, count: int):
     if not name.startswith("end") and (x.ndim == 0 or len(x) != count):
         raise ValueError(
             f"'{name}' has the shape {x.shape}, but the record has {count} times.\n"
@@ -227,7 +227,7 @@ def padded(t: Float[np.ndarray, " n"], length: int, step: float) -> Float[np.nda
     return np.concatenate([t, t[-1] + step * (1 + np.arange(length - len(t)))])
 
 
-def cut(records: Sequence[Record], window: float | None, dtype) -> Windows:
+def cut(records: Sequence[Record], window: float | None, dtype: Any) -> Windows:
     """Cut records into windows of a given length in time, or into one window each."""
     pieces = []
     for r, record in enumerate(records):

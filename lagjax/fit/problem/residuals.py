@@ -7,7 +7,7 @@
 If a motion does not reach a sample, the residual is a large constant, so that a bad guess still has a cost.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,13 +18,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from lagjax.fit.problem.initial_states import Starts
 from lagjax.fit.problem.parameters import FreeNumbers, leaf_name
 from lagjax.fit.problem.records import PADDING, Windows
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.trajectory.results import ended_well
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.compiled import compiled
 from lagjax.numerics.windowed_least_squares import Slopes, Unknowns, WindowedEquations
 from lagjax.system.model import model_of
@@ -103,36 +104,36 @@ class FitProblem:
         """Measurements and their sigmas."""
         return self.measured, self.sigma
 
-    def params(self, x, w) -> PyTree:
+    def params(self, x: Array, w: Int[Array, ""] | int) -> PyTree:
         """The parameters of window w."""
         params = self.found.into(x)
         if not self.overrides:
             return params
         return replace(params, {name: value[w] for name, value in self.overrides.items()})
 
-    def part(self, w, stage: Stage) -> Float[Array, ""]:
+    def part(self, w: Int[Array, ""] | int, stage: Stage) -> Float[Array, ""]:
         """The part of window w that counts."""
         return jnp.broadcast_to(stage.part, (self.windows.count,))[w]
 
-    def setting(self, x, s, w, stage: Stage):
+    def setting(self, x: Array, s: Array, w: Int[Array, ""] | int, stage: Stage):
         """Times, parameters, start and options of the motion of window w; times that do not count are squeezed."""
         ts = _squeezed(jnp.asarray(self.windows.ts)[w], jnp.asarray(self.windows.last)[w], self.part(w, stage))
         return ts, self.params(x, w), self.state(x, s, w), self.options
 
-    def state(self, x, s, w):
+    def state(self, x: Array, s: Array, w: Int[Array, ""] | int):
         """(q, v) from which the motion of window w starts."""
         starts, t = jax.tree.map(lambda a: a[w], self.starts), jnp.asarray(self.windows.ts)[w, 0]
         like = self.unflatten(starts.q.guess)
         model = model_of(self.first, t, like, like, self.params(x, w))
         return tuple(map(self.unflatten, starts.vectors(s, s, model, t)))
 
-    def motion(self, x, s, w, stage: Stage, adjoint=None):
+    def motion(self, x: Array, s: Array, w: Int[Array, ""] | int, stage: Stage, adjoint: Any = None):
         """The motion of window w, and the state it starts from."""
         ts, params, (q, v), options = self.setting(x, s, w, stage)
         options = {"max_steps": STEPS_EACH * ts.shape[0] + STEPS, "adjoint": adjoint} | options
         return integrate(self.system, q, v, params, ts=ts, throw=False, **options), (q, v)
 
-    def measurable(self, motion) -> dict[str, PyTree]:
+    def measurable(self, motion: Trajectory) -> dict[str, PyTree]:
         """Everything in a motion that can be measured."""
         values = {"q": motion.q, "v": motion.v, "multipliers": motion.multipliers, "end": motion.end._asdict()}
         observe = self.observe
@@ -140,7 +141,7 @@ class FitProblem:
             values["observed"] = jax.vmap(lambda t, q, v: observe(t, q, v, motion.params))(motion.t, motion.q, motion.v)
         return values
 
-    def predicted(self, motion) -> dict[str, PyTree]:
+    def predicted(self, motion: Trajectory) -> dict[str, PyTree]:
         """The measured quantities of a motion, in the structure of the measurements."""
         return selected(self.measurable(motion), self.measured)
 
@@ -157,8 +158,8 @@ def starts_at(problem: FitProblem, u: Unknowns, windows: Int[Array, " R"]):
     """(q, v) at the starts of some windows, and their slopes by the shared unknowns and by those of each window."""
     p = u.shared.size
 
-    def at(w):
-        def state(both):
+    def at(w: Int[Array, ""] | int):
+        def state(both: Array):
             return problem.state(both[:p], both[p:], w)
 
         both = jnp.concatenate([u.shared, u.local[w]])
@@ -167,7 +168,7 @@ def starts_at(problem: FitProblem, u: Unknowns, windows: Int[Array, " R"]):
     return jax.vmap(at)(windows)
 
 
-def replace(params, values):
+def replace(params: PyTree, values: Mapping[str, Any]):
     """`params` with some leaves replaced, by name; a leaf of an inner dictionary is called 'arm.length'."""
     return jtu.tree_map_with_path(lambda path, x: values.get(leaf_name(path), x), params)
 
@@ -180,7 +181,15 @@ class WindowPart(NamedTuple):
     end: Float[Array, " 2n"]
 
 
-def window_part(problem: FitProblem, x, s, w, stage: Stage, adjoint=None, loss: str | None = None):
+def window_part(
+    problem: FitProblem,
+    x: Array,
+    s: Array,
+    w: Int[Array, ""] | int,
+    stage: Stage,
+    adjoint: Any = None,
+    loss: str | None = None,
+):
     """The contribution of window `w` at natural shared and local unknowns, and whether its motion ended well."""
     motion, start = problem.motion(x, s, w, stage, adjoint)
     rows = residuals(problem, motion, w, stage, problem.loss if loss is None else loss)
@@ -194,7 +203,7 @@ def window_part(problem: FitProblem, x, s, w, stage: Stage, adjoint=None, loss: 
     return WindowPart(rows, _vector(start) / problem.unit, jnp.where(reached, end, NOT_REACHED) / problem.unit), well
 
 
-def _vector(tree):
+def _vector(tree: PyTree):
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
@@ -219,7 +228,7 @@ def assemble_slopes(problem: FitProblem, by_shared: WindowPart, by_local: Window
     )
 
 
-def prior_and_hold(problem, stage):
+def prior_and_hold(problem: FitProblem, stage: Stage):
     """The prior and the hold on the shared unknowns together: a mean, and the inverse of its standard deviation.
 
     The sum of their two squares is one square and a constant.
@@ -233,7 +242,7 @@ def prior_and_hold(problem, stage):
     return mean, jnp.sqrt(both)
 
 
-def hold_weights(problem, stage):
+def hold_weights(problem: FitProblem, stage: Stage):
     """The cost of a change of each shared unknown by the hold; 0 for a guess of 0, which has no size to be held by."""
     start = problem.found.start
     if stage.held is None:
@@ -241,7 +250,7 @@ def hold_weights(problem, stage):
     return jnp.where(start != 0, stage.held / jnp.abs(jnp.where(start != 0, start, 1.0)), 0.0)
 
 
-def _seam_weights(problem, stage):
+def _seam_weights(problem: FitProblem, stage: Stage):
     return jnp.where(problem.windows.seam, stage.joined, 0.0)[:, None]
 
 
@@ -261,12 +270,12 @@ def over_windows(function: Callable, problem: FitProblem, u: Unknowns):
     return one_by_one(lambda x: function(*x), (jnp.arange(problem.windows.count), u.local))
 
 
-def one_by_one(function: Callable, xs):
+def one_by_one(function: Callable, xs: PyTree):
     """`jax.vmap(function)(xs)`; on a CPU a loop, which compiles and runs faster than lanes."""
     return lax.map(function, xs) if jax.default_backend() == "cpu" else jax.vmap(function)(xs)
 
 
-def residuals(problem, motion, w, stage, loss):
+def residuals(problem: FitProblem, motion: Trajectory, w: Int[Array, ""] | int, stage: Stage, loss: str):
     """The residuals of one window in one vector; zero where nothing was measured or the sample does not count yet."""
     last = problem.windows.last[w]
     part = problem.part(w, stage)
@@ -289,18 +298,18 @@ def residuals(problem, motion, w, stage, loss):
     return jnp.concatenate(parts)
 
 
-def dampened(r, loss, ordinary=1.0):
+def dampened(r, loss: str, ordinary: ArrayLike = 1.0):
     """The residual whose square is the loss; `ordinary` is the size of an ordinary error."""
     constant, ratio = LOSSES[loss]
     return r * jnp.sqrt(ratio((r / (constant * ordinary)) ** 2))
 
 
-def _counts(t, last, part):
+def _counts(t: Array, last: Int[Array, ""], part: Array):
     """Which times count; for the whole window the last one is compared exactly, since rounding might exclude it."""
     return t <= jnp.where(part < 1, t[0] + part * (t[last] - t[0]), t[last])
 
 
-def _squeezed(t, last, part):
+def _squeezed(t: Array, last: Int[Array, ""], part: Array):
     """The times of a window; those beyond the part that counts are squeezed together, to cost next to nothing."""
     kept = jnp.sum(_counts(t, last, part))
     closest = jnp.maximum(PADDING * (t[1] - t[0]), 8 * jnp.finfo(t.dtype).eps * jnp.max(jnp.abs(t)))

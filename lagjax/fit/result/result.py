@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.display import plots as plot
 from lagjax.display.printable import by_line
@@ -39,7 +39,7 @@ from lagjax.system.coordinates import State
 from lagjax.system.signature import UnknownSystem, signature
 
 
-def lines_of(fit) -> list[str]:
+def lines_of(fit: "Fit") -> list[str]:
     """The lines of a fit's table."""
     how = "converged" if bool(fit.rested) else "NOT converged"
     how += ", but the residuals are NOT measurement errors," if bool(fit.misfit.any) else ""
@@ -84,7 +84,7 @@ def lines_of(fit) -> list[str]:
     return lines
 
 
-def _whiteness(fit):
+def _whiteness(fit: "Fit"):
     lag, count = fit.whiteness(), int(np.sum(np.asarray(fit.known())))
     worst = max(lag, key=lambda name: abs(np.nan_to_num(lag[name])))
     if abs(np.nan_to_num(lag[worst])) < 3 / np.sqrt(max(count / len(lag), 1)):
@@ -95,7 +95,7 @@ def _whiteness(fit):
     return [words + (f"; the ± are about {wider:.1f} times too small" if wider > 1.1 else "")]
 
 
-def _plus_minus(x, sd):
+def _plus_minus(x: float, sd: float):
     if not np.isfinite(sd):
         return f"{x:.6g} (not determined)"
     if sd == 0:
@@ -260,7 +260,7 @@ class Fit:
             joint = of_errors * xp.block([[of.shared, of.local_shared[w].T], [of.local_shared[w], of.local[w]]])
             known = xp.concatenate([determined.shared, determined.local[w]])
 
-            def sd(slopes, r=r, joint=joint, known=known):
+            def sd(slopes: Any, r: int = r, joint: Array = joint, known: Array = known):
                 with np.errstate(invalid="ignore"):
                     variance = xp.einsum("...i,ij,...j", slopes[r], joint, slopes[r])
                 unknown = xp.any(xp.where(known, 0.0, slopes[r]) != 0, axis=-1)
@@ -307,7 +307,7 @@ class Fit:
             return system.starts
         return starts_at(self.problem, self.unknowns, self.problem.windows.first)
 
-    def motion(self, record: int = 0, ts=None) -> Trajectory:
+    def motion(self, record: int = 0, ts: ArrayLike | None = None) -> Trajectory:
         """The fitted motion of a record from its start, at its times or at others from the same start."""
         windows = np.flatnonzero(np.asarray(self.problem.windows.record) == record)
         params, (q, v) = self.problem.params(self.unknowns.shared, int(windows[0])), self.starts()[record]
@@ -370,7 +370,7 @@ class Fit:
         """
         found, variance = self.problem.found, self.variance
 
-        def density(unknowns):
+        def density(unknowns: Mapping[str, Array]):
             known = self.sampling | dict(unknowns)
             x = jnp.stack([jnp.asarray(known[name]) for name in self.names] or [jnp.zeros(())])[: len(self.names)]
             values = equations(self.problem, Unknowns(x, jnp.asarray(known["starts"])), WHOLE)
@@ -385,7 +385,7 @@ class Fit:
         """`log_likelihood` with the fit's priors, up to a constant."""
         found, likelihood = self.problem.found, self.log_likelihood
 
-        def density(unknowns):
+        def density(unknowns: Mapping[str, Array]):
             known = self.sampling | dict(unknowns)
             off = [(known[name] - found.mean[i]) / found.sd[i] for i, name in enumerate(self.names)]
             return likelihood(unknowns) - 0.5 * sum((jnp.asarray(x) ** 2 for x in off), jnp.zeros(()))
@@ -459,7 +459,7 @@ class Fit:
         return by_line("\n".join(lines_of(self)))
 
 
-def _is_data(value):
+def _is_data(value: Any):
     try:
         Writer().down(value, "")
     except NotWritable:
@@ -467,7 +467,7 @@ def _is_data(value):
     return True
 
 
-def _known_of_system(fit) -> dict[str, Any]:
+def _known_of_system(fit: "Fit") -> dict[str, Any]:
     system = fit.problem.system
     if isinstance(system, UnknownSystem):
         return {name: getattr(system, name) for name in system.__dataclass_fields__}
@@ -487,7 +487,7 @@ def _rows(problem: FitProblem, u: Unknowns):
 
 
 @partial(compiled, in_numpy=True)
-def _robust_variance(r, known, loss):
+def _robust_variance(r: Array, known: Array, loss: str):
     """The variance of an M-estimate: Huber, *Robust Statistics*, Eq. (7.6.2)."""
     constant, _ = LOSSES[loss]
     slope = jax.grad(lambda r: 0.5 * dampened(r, loss) ** 2)

@@ -23,7 +23,7 @@ def caveats(fit: Fit) -> list[str]:
     return [caveat for caveat in words if caveat]
 
 
-def _search_caveat(fit):
+def _search_caveat(fit: Fit):
     if bool(fit.rested):
         return ""
     return (
@@ -33,7 +33,7 @@ def _search_caveat(fit):
     )
 
 
-def _astray_caveat(fit):
+def _astray_caveat(fit: Fit):
     guesses = zip(fit.names, np.asarray(fit.problem.found.start), np.asarray(fit.values))
     for name, guess, x in guesses:
         if guess and abs(x) > ASTRAY * abs(guess):
@@ -45,7 +45,7 @@ def _astray_caveat(fit):
     return ""
 
 
-def _parameters_caveat(fit):
+def _parameters_caveat(fit: Fit):
     if rank_of(np.asarray(fit.evaluation.singular_values)) == len(fit.names):
         return ""
     return (
@@ -55,7 +55,7 @@ def _parameters_caveat(fit):
     )
 
 
-def _motion_caveat(fit):
+def _motion_caveat(fit: Fit):
     failed = np.flatnonzero(~np.asarray(fit.evaluation.well))
     if not failed.size:
         return ""
@@ -66,7 +66,7 @@ def _motion_caveat(fit):
     )
 
 
-def _sigma_caveat(fit):
+def _sigma_caveat(fit: Fit):
     large = [name for name, large in zip(_channels(fit), np.asarray(fit.misfit.large)) if large]
     if not large:
         return ""
@@ -78,7 +78,7 @@ def _sigma_caveat(fit):
     )
 
 
-def _freedom_caveat(fit):
+def _freedom_caveat(fit: Fit):
     if float(fit.freedom) > 0:
         return ""
     return (
@@ -87,7 +87,7 @@ def _freedom_caveat(fit):
     )
 
 
-def _curve_caveat(fit):
+def _curve_caveat(fit: Fit):
     missed = [name for name, curved in zip(_channels(fit), np.asarray(fit.misfit.curved)) if curved]
     if not missed:
         return ""
@@ -98,7 +98,7 @@ def _curve_caveat(fit):
     )
 
 
-def _channels(fit):
+def _channels(fit: Fit):
     """The names of what was measured, in the order of a `Misfit`."""
     paths = {kind: jax.tree_util.tree_leaves_with_path(tree) for kind, tree in fit.problem.measured.items()}
     return [channel_name(kind, path) for kind, leaves in paths.items() for path, _ in leaves]

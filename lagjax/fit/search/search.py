@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.fit.problem.checks import check_predicted
 from lagjax.fit.problem.residuals import (
@@ -119,7 +119,7 @@ def misfit(problem: FitProblem, values: WindowedEquations) -> Misfit:
     return Misfit(times, large, curved, jnp.any(doubtful))
 
 
-def _channel(problem, left, ordered, r, known, sigma, spread):
+def _channel(problem: FitProblem, left: Array, ordered: bool, r: Array, known: Array, sigma: Array, spread: Array):
     """For one channel: times, whether too large, whether on a curve, whether doubtful."""
     count = jnp.sum(known)
     count = jnp.where(count > 0, count, 1).astype(r.dtype)
@@ -131,7 +131,7 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
         x, free = (OF_NORMAL * _undampened(half, problem.loss)) ** 2, EFFICIENCY * count * left
         largest = (OUTLIER_FACTOR * TOO_LARGE) ** 2
 
-    def above(z):
+    def above(z: float):
         return (left > 0) & (x > _exceeded_by_chance(jnp.maximum(free, 1e-3), z))
 
     lags, alike, squares = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
@@ -140,7 +140,7 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
         most = min(LAGS, r.shape[1] - 1)
         following = np.arange(1, most + 1)[:, None] + np.arange(r.shape[1])
 
-        def later(x):
+        def later(x: Array):
             return jnp.concatenate([x, jnp.zeros_like(x[:, :most])], axis=1)[:, following]
 
         each = (0, *range(2, r.ndim + 1))
@@ -151,7 +151,7 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
         squares = jnp.sum(pairs * correlations**2)
         alike = jnp.max(jnp.where(pairs > count / 2, jnp.abs(correlations), 0.0))
 
-    def follows(z):
+    def follows(z: float):
         return (lags > 0) & (squares > lags * _exceeded_by_chance(jnp.maximum(lags, 1), z))
 
     # The size of the curve, as a fraction of the data's spread.
@@ -165,12 +165,12 @@ def _channel(problem, left, ordered, r, known, sigma, spread):
     return jnp.sqrt(x), large, curved, above(DOUBT) | (follows(DOUBT) & (of_data > TRACE))
 
 
-def _exceeded_by_chance(n, z):
+def _exceeded_by_chance(n: ArrayLike, z: float):
     """The value that Σr²/n exceeds as rarely as a standard normal number exceeds `z`."""
     return jnp.maximum(1 - 2 / (9 * n) + z * jnp.sqrt(2 / (9 * n)), 0.0) ** 3
 
 
-def _undampened(r, loss):
+def _undampened(r: Array, loss: str):
     """The residual that `dampened` maps to `r`, which must not be negative."""
     constant, _ = LOSSES[loss]
     z = r / constant
@@ -256,8 +256,8 @@ def linearised(problem: FitProblem, u: Unknowns, stage: Stage, loss: str) -> Lin
     """All equations and their slopes, in natural numbers, from one pass over the motions."""
     p = u.shared.size
 
-    def at(w, s):
-        def of(both):
+    def at(w: Array, s: Array):
+        def of(both: Array):
             return window_part(problem, both[:p], both[p:], w, stage, diffrax.ForwardMode(), loss)
 
         both = jnp.concatenate([u.shared, s])
@@ -309,18 +309,18 @@ def evaluate(problem: FitProblem, u: Unknowns, stage: Stage) -> Evaluation:
     """What the data determine at `u`."""
     check_predicted(problem)
 
-    def at(problem, u, stage):
+    def at(problem: FitProblem, u: Unknowns, stage: Stage):
         return evaluation_from(problem, u, linearised(problem, u, stage, "squares"), stage)
 
     return in_turn(at, problem, u, stage)
 
 
-def _natural(problem, y: Unknowns) -> Unknowns:
+def _natural(problem: FitProblem, y: Unknowns) -> Unknowns:
     return Unknowns(problem.found.natural(y.shared), y.local)
 
 
 @eqx.filter_custom_jvp
-def _equations(y, problem, stage):
+def _equations(y: Unknowns, problem: FitProblem, stage: Stage):
     # Only so that JAX finds the cached trace again: it keeps one for no mesh and another for an empty mesh.
     with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
         linear = linearised(problem, _natural(problem, y), stage, problem.loss)
@@ -328,15 +328,15 @@ def _equations(y, problem, stage):
 
 
 @_equations.def_jvp
-def _equations_jvp(primals, tangents):
+def _equations_jvp(primals: tuple, tangents: tuple):
     (y, problem, stage), (dy, *_) = primals, tangents
     u, du = jax.jvp(lambda y: _natural(problem, y), (y,), (dy,))
     linear = linearised(problem, u, stage, problem.loss)
     return (linear.values, linear.well), (linear.slopes.along(du), None)
 
 
-def _least_squares(solver, problem, y, stage, limit, report):
-    def with_cost(y, args):
+def _least_squares(solver: Any, problem: FitProblem, y: Unknowns, stage: Stage, limit: int, report: Callable):
+    def with_cost(y: Unknowns, args: tuple):
         values, well = _equations(y, *args)
         report(_cost(values))
         return values, (values, well)
@@ -344,8 +344,8 @@ def _least_squares(solver, problem, y, stage, limit, report):
     return optx.least_squares(with_cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
 
 
-def _minimise(solver, problem, y, stage, limit, report):
-    def cost(y, args):
+def _minimise(solver: Any, problem: FitProblem, y: Unknowns, stage: Stage, limit: int, report: Callable):
+    def cost(y: Unknowns, args: tuple):
         problem, stage = args
         values = equations(problem, _natural(problem, y), stage)
         report(_cost(values))
@@ -355,7 +355,7 @@ def _minimise(solver, problem, y, stage, limit, report):
     return optx.minimise(cost, solver, y, (problem, stage), has_aux=True, max_steps=limit, throw=False)
 
 
-def _ordinary(problem, u, stage):
+def _ordinary(problem: FitProblem, u: Unknowns, stage: Stage):
     """The size of an ordinary error at `u`, in sigmas, from the median residual; at least one sigma."""
     rows = equations(problem, u, stage._replace(ordinary=jnp.asarray(jnp.inf))).rows
     # Residuals are zero where nothing was measured or the sample does not count yet.
@@ -367,7 +367,7 @@ def _cost(values: WindowedEquations):
     return 0.5 * sum(jnp.sum(x**2) for x in values)
 
 
-def _largest_change(tree):
+def _largest_change(tree: PyTree):
     """How far an iteration changed the predictions; unknowns that the data do not determine may drift."""
     return jnp.asarray(0.0) if isinstance(tree, Unknowns) else optx.max_norm(tree)
 
@@ -398,7 +398,7 @@ def listening(listener: Callable[[int, float], None]):
         _LISTENERS.remove(listener)
 
 
-def _call_listeners(stage, cost):
+def _call_listeners(stage: Array, cost: Array):
     for listener in _LISTENERS:
         listener(int(stage), float(cost))
 
@@ -410,7 +410,7 @@ def in_turn(function: Callable, *args):
     """
     live, static = eqx.partition(args, eqx.is_array)
 
-    def run(live):
+    def run(live: PyTree):
         with WATCHED(False), PATIENCE(None):
             return function(*eqx.combine(live, static))
 
@@ -431,12 +431,12 @@ class _Best(NamedTuple):
     misfit: Misfit
 
 
-def _search(problem, course, optimiser, limit, tell):
+def _search(problem: FitProblem, course: Course, optimiser: Any, limit: int, tell: bool):
     last = len(course.tolerances) - 1
     tries = course.count
     local = jnp.asarray(problem.start.local)
 
-    def one_stage(y, stage, tolerance, number):
+    def one_stage(y: Unknowns, stage: Stage, tolerance: Array, number: Array):
         report = partial(jax.debug.callback, _call_listeners, number) if tell else lambda cost: None
         if problem.loss != "squares":
             # Far from the truth every residual would look like an outlier, for which a robust loss has no slope.
@@ -456,16 +456,16 @@ def _search(problem, course, optimiser, limit, tell):
         end = _Best(solution.value, _cost(values), values, slopes, well, rested, misfit(problem, values))
         return end, solution.stats["num_steps"]
 
-    def begin(number):
+    def begin(number: Array):
         x = course.starts[jnp.minimum(number, tries - 1)]
         return Unknowns(problem.found.free(x), local), course.first[jnp.minimum(number, tries - 1)]
 
-    def go_on(state):
+    def go_on(state: tuple):
         turn, *_, best = state
         doubtful = best.misfit.doubtful | ~best.rested
         return (turn < tries) & ((turn < course.must) | doubtful)
 
-    def step(state):
+    def step(state: tuple):
         turn, number, y, taken, costs, best = state
         stage = jax.tree.map(lambda x: x[number], course.stages)
         stage = stage._replace(around=course.starts[turn])
@@ -498,11 +498,11 @@ def _search(problem, course, optimiser, limit, tell):
     return Searched(u, best.cost, steps, best.rested, best.misfit, costs), evaluation
 
 
-def _keeps_slopes(problem, optimiser):
+def _keeps_slopes(problem: FitProblem, optimiser: Any):
     return optimiser is None and problem.loss == "squares"
 
 
-def _no_end(problem, y, with_slopes):
+def _no_end(problem: FitProblem, y: Unknowns, with_slopes: bool):
     """A placeholder for the best end before there is one."""
     (p,), (windows, k), dtype = y.shared.shape, y.local.shape, y.shared.dtype
     m = sum(int(np.prod(x.shape[1:])) for x in jax.tree.leaves(problem.measured))

@@ -15,6 +15,7 @@ Source: Pukelsheim, *Optimal Design of Experiments*, ch. 2 (c-optimality, Elfvin
 Optimal Experiments* (exchange).
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -82,7 +83,7 @@ class NextMeasurements(NamedTuple):
     def best(self) -> Candidate:
         return self.candidates[0]
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str):
         """The candidate of this name."""
         if not isinstance(name, str):
             return tuple.__getitem__(self, name)
@@ -95,7 +96,17 @@ class NextMeasurements(NamedTuple):
         return by_line("\n".join(_lines(self)))
 
 
-def assess(name, t, rows, known, direction, values, sigma, least, one_time=False) -> Candidate:
+def assess(
+    name: str,
+    t: np.ndarray,
+    rows: np.ndarray,
+    known: np.ndarray,
+    direction: np.ndarray,
+    values: np.ndarray,
+    sigma: Mapping[str, float],
+    least: float,
+    one_time: bool = False,
+) -> Candidate:
     """A candidate with the standard deviations it would give, measured at all its times or at the best one.
 
     `values` (n,) are the unknowns at which the slopes were taken.
@@ -111,7 +122,7 @@ def assess(name, t, rows, known, direction, values, sigma, least, one_time=False
     return candidate._replace(sd=sd, alone=alone)
 
 
-def sd_of(direction, rows, least) -> float:
+def sd_of(direction: np.ndarray, rows: np.ndarray, least: float) -> float:
     """The standard deviation of a number from equations (r, n) with errors of size one; infinite if undetermined."""
     sizes, right, seen = seen_directions(rows, least)
     along = right @ direction
@@ -120,7 +131,7 @@ def sd_of(direction, rows, least) -> float:
     return float(np.sqrt(np.sum((along[seen] / sizes[seen]) ** 2)))
 
 
-def sd_after_each(direction, known, rows, least):
+def sd_after_each(direction: np.ndarray, known: np.ndarray, rows: np.ndarray, least: float):
     """The standard deviations (T,) after adding the equations (T, m, n) of each time alone to the known ones (r, n).
 
     With coordinates z of the determined directions (errors of size one) and u of the undetermined ones, a time adds the
@@ -144,14 +155,14 @@ def sd_after_each(direction, known, rows, least):
     return np.where(unseen > NEGLIGIBLE_SHARE * np.sum(direction**2), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def seen_directions(rows, least):
+def seen_directions(rows: np.ndarray, least: float):
     """Of equations (r, n): singular values (n,), directions by row (n, n), and which of these are determined."""
     _, sizes, right = np.linalg.svd(_triangle(rows), full_matrices=True)
     sizes = np.append(sizes, np.zeros(rows.shape[1] - len(sizes)))
     return sizes, right, sizes > least
 
 
-def eliminate_unknowns(by_unknown, by_others):
+def eliminate_unknowns(by_unknown: np.ndarray, by_others: np.ndarray):
     """Slopes (m, p) after eliminating the unknowns with the slopes (m, k): the part that these cannot reproduce."""
     lengths = np.sqrt(np.sum(by_others**2, axis=0))
     taken = by_others[:, lengths > 0] / lengths[lengths > 0]
@@ -161,12 +172,12 @@ def eliminate_unknowns(by_unknown, by_others):
     return _triangle(by_unknown - left @ (left.T @ by_unknown))
 
 
-def _triangle(rows):
+def _triangle(rows: np.ndarray):
     """Equivalent equations with at most as many rows as columns."""
     return rows if len(rows) <= rows.shape[1] else np.linalg.qr(rows, mode="r")
 
 
-def units_of(rows, values, least) -> Float[np.ndarray, " n"]:
+def units_of(rows: np.ndarray, values: np.ndarray, least: float) -> Float[np.ndarray, " n"]:
     """Units of the unknowns in which their slopes (r, n) have the size one; 0 for unknowns without effect on the data.
 
     An unknown has no effect if its relative change shows less than the round-off of the unknown that shows most.
@@ -178,7 +189,7 @@ def units_of(rows, values, least) -> Float[np.ndarray, " n"]:
     return np.where(seen, 1 / np.where(seen, sizes, 1.0), 0.0)
 
 
-def _exchange(candidate: Candidate, count):
+def _exchange(candidate: Candidate, count: int):
     """The indices of the best times found by exchanges, and the standard deviation with them."""
     rows, known = candidate.rows, _triangle(candidate.known)
     sd_with = lambda places: sd_of(candidate.direction, np.concatenate([known, *rows[places]]), candidate.least)
@@ -202,7 +213,7 @@ def _exchange(candidate: Candidate, count):
     return list(chosen), best
 
 
-def _initial_sets(candidate, count):
+def _initial_sets(candidate: Candidate, count: int):
     """Sets of times from which exchanges start: evenly spaced, and those with the largest weights of all times."""
     total = len(candidate.t)
     yield np.round(np.linspace(0, total - 1, count)).astype(int)
@@ -233,7 +244,7 @@ def _lines(found: NextMeasurements):
     return [line.rstrip() for line in lines]
 
 
-def _line_of_times(best, unit):
+def _line_of_times(best: Candidate, unit: str):
     """A line with the most informative times of the best run: one for each unknown of its start, one for the number."""
     of_start = np.any(best.rows != 0, axis=(0, 1)) & ~np.any(best.known != 0, axis=0)
     few = max(int(np.sum(of_start)) + 1, 2)

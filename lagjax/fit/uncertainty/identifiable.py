@@ -9,6 +9,7 @@ Source: Brun, Reichert & Künsch, *Water Resources Research* 37 (2001) 1015, Eqs
 Diagnostics*, §3.2.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import combinations
 
@@ -98,7 +99,7 @@ def rank_of(singular_values: np.ndarray) -> int:
     return int(np.sum(singular_values > floor * np.max(singular_values, initial=0.0)))
 
 
-def _simplest(rows):
+def _simplest(rows: np.ndarray):
     """A basis of the space of some orthonormal rows, each with as few entries as possible."""
     rank, p = rows.shape
     if rank in (0, p) or p > ENUMERATE_UP_TO:
@@ -120,11 +121,11 @@ def _simplest(rows):
     return rows
 
 
-def _members(row):
+def _members(row: np.ndarray):
     return [int(i) for i in np.flatnonzero(np.abs(row) > 1e-3 * np.max(np.abs(row)))]
 
 
-def _exponents(row, members):
+def _exponents(row: np.ndarray, members: np.ndarray):
     """The entries as small whole numbers, up to a common factor; None if there are none."""
     smallest = min((row[i] for i in members), key=abs)
     ratios = [Fraction(float(row[i] / smallest)).limit_denominator(LARGEST_DENOMINATOR) for i in members]
@@ -136,7 +137,7 @@ def _exponents(row, members):
     return [int(f * whole) for f in ratios]
 
 
-def _combination(names, row):
+def _combination(names: Sequence[str], row: np.ndarray):
     members = _members(row)
     exponents = _exponents(row, members)
     if exponents is None:
@@ -149,11 +150,11 @@ def _combination(names, row):
     return " ".join(up) + (f"/{below}" if down else "")
 
 
-def _power(e):
+def _power(e: float):
     return "" if e == 1 else f"^{e}"
 
 
-def _mixture(names, row):
+def _mixture(names: Sequence[str], row: np.ndarray):
     """A relative change of several parameters, without those that hardly take part."""
     row = np.asarray(row)
     members = sorted(np.flatnonzero(np.abs(row) > 0.1 * np.max(np.abs(row))), key=lambda i: -abs(row[i]))[:4]

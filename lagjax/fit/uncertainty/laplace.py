@@ -15,7 +15,7 @@ Source: MacKay, *Information Theory, Inference, and Learning Algorithms*, ch. 27
 10 (1982) 386 (S in the coordinates of J).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -57,14 +57,14 @@ def curvature(problem: FitProblem, u: Unknowns) -> Curvature:
     """The curvature of the sum of squares at `u`, window by window, by forward mode over forward mode."""
     p = u.shared.size
 
-    def at(w, s):
-        def rows(both):
+    def at(w: Array, s: Array):
+        def rows(both: Array):
             return window_part(problem, both[:p], both[p:], w, WHOLE, diffrax.ForwardMode())[0].rows
 
         both = jnp.concatenate([u.shared, s])
         here = rows(both)
 
-        def slopes(both):
+        def slopes(both: Array):
             jacobian = jax.jacfwd(rows)(both)
             return jacobian.T @ here, jacobian
 
@@ -213,7 +213,7 @@ def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:
     )
 
 
-def _together(problem, u, at, places):
+def _together(problem: FitProblem, u: Unknowns, at: Callable, places: Sequence):
     """Slopes (r, n) of all equations, including priors, the gradient (n,) and the term S (n, n)."""
     (windows, _, size), p = at.slopes.shape, len(u.shared)
     k = size - p
@@ -235,12 +235,12 @@ def _together(problem, u, at, places):
     return slopes, gradient[places], 0.5 * (term + term.T)
 
 
-def _prior_residuals(problem, u):
+def _prior_residuals(problem: FitProblem, u: Unknowns):
     """The residuals of the priors; zero for parameters without one."""
     return (np.asarray(u.shared) - np.asarray(problem.found.mean)) / np.asarray(problem.found.sd)
 
 
-def _log_density(problem, u, at):
+def _log_density(problem: FitProblem, u: Unknowns, at):
     """The logarithm of the normalised density of the measurements and the priors."""
     prior = np.asarray(problem.found.sd)
     prior = prior[np.isfinite(prior)]
@@ -252,7 +252,7 @@ def _log_density(problem, u, at):
     return -0.5 * squares - np.sum(np.log(errors)) - 0.5 * len(errors) * np.log(2 * np.pi)
 
 
-def _labels(problem):
+def _labels(problem: FitProblem):
     """The names (W k,) of the starts' unknowns, "" where a window has none, and the values that they deviate from."""
     windows, k = problem.windows.count, problem.starts.unknowns
     labels, values = np.full((windows, k), "", object), np.zeros((windows, k))
@@ -274,7 +274,7 @@ def _labels(problem):
     return labels.ravel(), values
 
 
-def _caveats(names, eigenvalues, directions, unseen, off):
+def _caveats(names: Sequence[str], eigenvalues: np.ndarray, directions: np.ndarray, unseen: np.ndarray, off: float):
     """The reservations about the approximation, in words, the most serious first."""
     words = [f"the data do not determine {_direction(names, row)}: no peak there." for row in unseen[:3]]
     for value, row in list(zip(eigenvalues, directions))[:3]:
@@ -289,7 +289,7 @@ def _caveats(names, eigenvalues, directions, unseen, off):
     return words
 
 
-def _direction(names, row):
+def _direction(names: Sequence[str], row):
     """The unknowns that take part in a direction, in words."""
     if len(names) == 1:
         return f"'{names[0]}'"

@@ -5,7 +5,7 @@ at the times of its record and for the same length of time after it. The slopes 
 and when, not on the measured values.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from lagjax.fit.problem.checks import check_predicted
 from lagjax.fit.problem.records import Record, Windows, channel_name, closest, padded
@@ -87,12 +87,12 @@ def next_measurements(
     return NextMeasurements(name, now, tuple(sorted(scaled, key=lambda c: c.sd)), problem.absolute)
 
 
-def _direction(problem, shrink):
+def _direction(problem: FitProblem, shrink: str | Callable):
     """The name of a number, and its slopes by the fitted parameters."""
     names, x = problem.found.names, jnp.asarray(problem.found.start)
     if callable(shrink):
 
-        def number(x):
+        def number(x: Array):
             return jnp.asarray(shrink(problem.found.into(x)))
 
         shape = jax.eval_shape(number, x).shape
@@ -117,7 +117,14 @@ def _direction(problem, shrink):
     return f"'{shrink}'", np.eye(len(names))[names.index(shrink)]
 
 
-def _candidate_runs(problem, candidates, known, direction, least, problem_for):
+def _candidate_runs(
+    problem: FitProblem,
+    candidates: Mapping[str, Record],
+    known: KnownMotion,
+    direction: np.ndarray,
+    least: float,
+    problem_for: Callable,
+):
     """Candidates that are other runs, each with its own unknown start."""
     if not candidates:
         raise ValueError("candidates is empty.\nFix: leave it out, or {'a longer run': lj.Record(...)}.")
@@ -158,7 +165,9 @@ def _one_window(problem: FitProblem, w: int) -> FitProblem:
     return replace(problem, **parts)
 
 
-def _candidate_run(name, record, parts, known, direction, least):
+def _candidate_run(
+    name: str, record: Record, parts: list[FitProblem], known: KnownMotion, direction: np.ndarray, least: float
+):
     """The candidate of one run, from its windows; quantities that are not measured have zero slopes."""
     slopes = []
     for part in parts:
@@ -181,7 +190,7 @@ def _candidate_run(name, record, parts, known, direction, least):
     return assess(name, record.t, stacked, held, along, values, _errors(parts), least)
 
 
-def _by_time(part, both):
+def _by_time(part: FitProblem, both: np.ndarray):
     """The indices of a window's times in its record, and the rows (m, n) of each; the last has those of `end`, too."""
     length, at, blocks, last = part.windows.ts.shape[1], 0, [], []
     for kind, tree in part.measured.items():
@@ -200,7 +209,7 @@ def _by_time(part, both):
     return part.windows.sample[0][real], each
 
 
-def _errors(parts):
+def _errors(parts: list[FitProblem]):
     """The typical error of each quantity."""
     errors = {}
     for kind, tree in parts[0].sigma.items():
@@ -209,7 +218,7 @@ def _errors(parts):
     return errors
 
 
-def _failure_reason(part):
+def _failure_reason(part: FitProblem):
     """Why a motion fails, in the message of `integrate`."""
     ts, params, (q, v), options = part.setting(part.start.shared, part.start.local[0], 0, WHOLE)
     try:
@@ -219,7 +228,9 @@ def _failure_reason(part):
     return "it stops early.\nFix: run it alone with lj.integrate."
 
 
-def _further_measurements(problem, records, at, known, direction, least) -> list[Candidate]:
+def _further_measurements(
+    problem: FitProblem, records: Sequence[Record], at: Survey, known: KnownMotion, direction: np.ndarray, least: float
+) -> list[Candidate]:
     """Candidates in the existing runs: one further measurement of each quantity, at its best time."""
     longer = _extended(problem, records)
     further, slopes = survey(longer, problem.start).linear.slopes, at.linear.slopes
@@ -284,7 +295,7 @@ def _extended(problem: FitProblem, records: list[Record]) -> FitProblem:
     return replace(problem, windows=longer, measured=measured, sigma=sigma, spread=ones)
 
 
-def _sigmas(problem: FitProblem, records: list[Record], length):
+def _sigmas(problem: FitProblem, records: list[Record], length: int):
     """Errors (W, T, ...) of all coordinates, velocities and measured quantities; infinite where none is known."""
     state = jax.eval_shape(problem.unflatten, problem.starts.q.guess[0])
     parts = {kind: jax.tree.map(lambda x: x[0, 0], tree) for kind, tree in problem.measured.items() if kind != "end"}
@@ -292,7 +303,7 @@ def _sigmas(problem: FitProblem, records: list[Record], length):
     sigmas = {}
     for kind in sorted(parts):
 
-        def of_leaf(path, x, kind=kind):
+        def of_leaf(path: tuple[Any, ...], x: Any, kind: str = kind):
             each = [_error(problem, records[r], w, kind, path, x.shape) for w, r in enumerate(problem.windows.record)]
             return np.stack([np.broadcast_to(s, (length, *x.shape)) for s in each]).astype(problem.windows.ts.dtype)
 
@@ -302,7 +313,7 @@ def _sigmas(problem: FitProblem, records: list[Record], length):
     return sigmas
 
 
-def _error(problem, record, w, kind, path, shape):
+def _error(problem: FitProblem, record: Record, w: int, kind: str, path: tuple[Any, ...], shape: tuple[int, ...]):
     """The error of a quantity: the median error of its measurements, else what `sigma` says for its whole kind."""
     measured = {p: (x, s) for (p, x), s in zip(
         jtu.tree_leaves_with_path(problem.measured.get(kind, {})), jax.tree.leaves(problem.sigma.get(kind, {}))
@@ -316,7 +327,7 @@ def _error(problem, record, w, kind, path, shape):
     return np.where(np.any(known, axis=0), np.ma.filled(each, np.inf), stated)
 
 
-def _stated_error(problem, record, kind, path):
+def _stated_error(problem: FitProblem, record: Record, kind: str, path: tuple[Any, ...]):
     if not problem.absolute:
         return jax.tree.leaves(problem.sigma)[0].ravel()[0] if kind in problem.measured else np.inf
     sigma = record.sigma
