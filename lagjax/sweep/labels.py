@@ -121,7 +121,7 @@ def _shown_arrays(like: PyTree) -> Iterable[_ShownArray]:
             yield _ShownArray(key, _flat(key), (), len(part.shape))
 
 
-def _of_motion(motion: Trajectory, prefix: str):
+def _of_motion(motion: Any, prefix: str):
     """The arrays that a trajectory shows, named as by its own `to_xarray`."""
     batch = inner_dims(f"{prefix}lane", len(motion.t.shape) - 1)
     dims = *batch, f"{prefix}{TIMES}"

@@ -87,7 +87,7 @@ def _of_motion(name: str, motion: Trajectory, of_motion: tuple[str, ...]):
         yield Panel(prefix + label, "t", t, curves)
 
 
-def _real_parts(name: str, x: np.ndarray):
+def _real_parts(name: str, x: Any):
     if np.iscomplexobj(x):
         return [(f"{name} (real)", x.real), (f"{name} (imaginary)", x.imag)]
     return [(name, x.astype(float))]

@@ -77,7 +77,7 @@ class TimedProgram:
         idle = jax.jit(zeros).lower(args).compile()
         return min(seconds_of(lambda: idle(args)) for _ in range(50))
 
-    def _arguments(self, tolerance: ArrayLike, ts: Array | None = None, q: PyTree = None, v: PyTree = None):
+    def _arguments(self, tolerance: ArrayLike, ts: Any = None, q: PyTree = None, v: PyTree = None):
         start = self._motion.start
         ts = self._motion.ts if ts is None else ts
         given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)

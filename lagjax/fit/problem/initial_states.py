@@ -197,7 +197,7 @@ def _state_from_samples(record: Record, samples: Int[np.ndarray, " m"]):
     return q, slopes if v is None else v
 
 
-def _parabola(t: Array, x: Array, samples: Int[np.ndarray, " m"]):
+def _parabola(t: Any, x: Array, samples: Int[np.ndarray, " m"]):
     """Value and slope at the first of some samples, at t = 0, of a parabola through the first that are not missing.
 
     Outliers do not count: among the parabolas through three samples each, the one nearest to most other samples decides
@@ -279,7 +279,7 @@ def _charts(system: System, s: State, free_q: Bool[np.ndarray, " n"], free_v: Bo
         return charts(moved.x, moved.u, moved.of_q, moved.of_v)
 
 
-def _chart(y: Array, rows: Array, free: Bool[np.ndarray, " n"]):
+def _chart(y: Array, rows: Any, free: Bool[np.ndarray, " n"]):
     """The chart at y of equations with these rows; only free entries of y change."""
     rows = np.asarray(rows)[:, free]
     along, across = np.zeros((len(free), int(free.sum()))), np.zeros((len(free), 0))

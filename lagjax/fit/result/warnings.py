@@ -5,6 +5,7 @@ import numpy as np
 
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.result.result import Fit
+from lagjax.fit.search.search import Evaluation
 from lagjax.fit.uncertainty.identifiable import rank_of
 from lagjax.mechanics.diagnosis import listed
 
@@ -16,7 +17,7 @@ def caveats(fit: Fit) -> list[str]:
     """What a user has to know about a fit, the most serious first."""
     words = [_search_caveat(fit), _astray_caveat(fit), _sigma_caveat(fit) or _curve_caveat(fit)]
     if fit.evaluation is not None:
-        words += [_parameters_caveat(fit), _motion_caveat(fit)]
+        words += [_parameters_caveat(fit, fit.evaluation), _motion_caveat(fit, fit.evaluation)]
         words += [] if fit.problem.absolute else [_freedom_caveat(fit)]
     if at := fit.at_bounds():
         words.append(f"{listed(at)} ended at a bound, where uncertainties mean nothing.")
@@ -45,8 +46,8 @@ def _astray_caveat(fit: Fit):
     return ""
 
 
-def _parameters_caveat(fit: Fit):
-    if rank_of(np.asarray(fit.evaluation.singular_values)) == len(fit.names):
+def _parameters_caveat(fit: Fit, at: Evaluation):
+    if rank_of(np.asarray(at.singular_values)) == len(fit.names):
         return ""
     return (
         f"the data do not determine all parameters.\n{fit.identifiability}\n"
@@ -55,8 +56,8 @@ def _parameters_caveat(fit: Fit):
     )
 
 
-def _motion_caveat(fit: Fit):
-    failed = np.flatnonzero(~np.asarray(fit.evaluation.well))
+def _motion_caveat(fit: Fit, at: Evaluation):
+    failed = np.flatnonzero(~np.asarray(at.well))
     if not failed.size:
         return ""
     record = int(fit.problem.windows.record[failed[0]])

@@ -213,7 +213,7 @@ def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:
     )
 
 
-def _together(problem: FitProblem, u: Unknowns, at: Callable, places: Sequence):
+def _together(problem: FitProblem, u: Unknowns, at: Curvature, places: Sequence):
     """Slopes (r, n) of all equations, including priors, the gradient (n,) and the term S (n, n)."""
     (windows, _, size), p = at.slopes.shape, len(u.shared)
     k = size - p
