@@ -1,7 +1,7 @@
 """The compiled program of a sweep: maps the axis values at some points to values and statuses.
 
 Lanes run together under `vmap`, each with its own steps; on a CPU `integrate` takes 256 of them at a time. `"map"` runs
-one after the other, which is slower in nearly all measurements (`benchmarks/speed/sweep.py`) and needs the least memory.
+one after the other, which is slower in nearly all measurements (`benchmarks/speed/sweep.py`) and needs less memory.
 
 A later sweep that computes the same over axes of the same kinds uses the program of an earlier one. What a sweep
 computes is the jaxpr of its function, which is traced for each sweep, so that no stale program is ever used.
