@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import Jaxpr
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, PyTree
 
@@ -31,7 +30,7 @@ from lagjax.integrate.solve.settings import PATIENCE
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.cache import program_of
-from lagjax.jaxtools.jaxpr import ClosedJaxpr, bodies
+from lagjax.jaxtools.jaxpr import ClosedJaxpr, Jaxpr, bodies
 from lagjax.jaxtools.jaxpr_identity import Meaning, content_of, meaning_of
 from lagjax.jaxtools.tracing import REGULAR_FIRST
 from lagjax.jaxtools.without_lapack_batches import one_by_one
