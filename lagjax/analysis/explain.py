@@ -1,7 +1,4 @@
-"""`explain`: what a system amounts to at one state, in words and numbers.
-
-What `lj.explain` says of a motion in phases: the graph of the phases, and each phase.
-"""
+"""`explain`: what a system amounts to at one state, in words and numbers; a motion in phases as a graph of them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, overload

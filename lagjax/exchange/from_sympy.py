@@ -7,11 +7,9 @@ A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("thet
 SymPy uses two signs of multipliers. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push
 along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, like all multipliers here.
 
-SymPy expressions as the source text of JAX functions.
-
-A `System` from SymPy contains this text: it can be read, compared, copied and pickled, and Python compiles it at its
-first call. Common subexpressions are computed once. Integer powers stay integers: JAX computes them, and their
-derivatives, by products.
+An expression becomes the source text of a JAX function. A `System` from SymPy contains this text: it can be read,
+compared, copied and pickled, and Python compiles it at its first call. Common subexpressions are computed once. Integer
+powers stay integers: JAX computes them, and their derivatives, by products.
 
 A `Piecewise` becomes `jnp.where`, which computes every branch. JAX's reverse mode multiplies the slope of a branch that
 is not taken by zero, and zero times an infinite slope or NaN is NaN: for example (-x)**1.5 for x < 0, 0 for x > 0.

@@ -1,6 +1,4 @@
-"""The parts of a test problem.
-
-Natural coordinates: a slender rod described by its two ends.
+"""What test problems are made of: a `Mechanism`, and slender rods in natural coordinates, the positions of their ends.
 
 A uniform rod of mass m from P to Q has the velocity (1 - s) Ṗ + s Q̇ at the fraction s of its length, so
 

@@ -2,9 +2,7 @@
 
 A change of a slider costs a call of the program (about a millisecond for a small system), another to write the lines,
 and the time the notebook takes to bring them to the screen. While a picture is made others wait, and only the last
-position of a slider is drawn next: dragging leaves no queue.
-
-The controls of a user: ranges, values and choices, and the widget for each. Needs ipywidgets.
+position of a slider is drawn next: dragging leaves no queue. Needs ipywidgets.
 """
 
 import html

@@ -17,10 +17,7 @@ which the accelerations at some times, for a state off the motion, repeat:
 There are more equations than unknowns if a conserved quantity makes some of them redundant. The flow carries tangents
 with respect to μ and `log T` together with those with respect to the state.
 
-Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Doedel, Keller & Kernévez, Int. J. Bifurcation
-Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of conservative systems).
-
-Along a branch of cycles two functions of the monodromy matrix N are monitored. With the rows Q of its trivial
+Along a branch two functions of the monodromy matrix N are monitored. With the rows Q of its trivial
 directions and P = 1 - QᵀQ,
 
     χ₊ = det (P (N - 1) P + QᵀQ),      χ₋ = det (P (N + 1) P + QᵀQ)
@@ -28,8 +25,9 @@ directions and P = 1 - QᵀQ,
 are the products of μ - 1 and μ + 1 over the nontrivial multipliers. χ₊ is zero at a fold and where other cycles branch
 off, χ₋ where cycles of twice the period branch off. Where multipliers meet, both remain as smooth as N.
 
-Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.6; Kuznetsov, *Elements of Applied Bifurcation
-Theory*, §10.2.
+Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.6; Doedel, Keller & Kernévez, Int. J. Bifurcation
+Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of conservative systems); Kuznetsov,
+*Elements of Applied Bifurcation Theory*, §10.2.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """How a cycle changes with a parameter: a branch of cycles, its folds, and where it becomes unstable.
 
-Critical points between two points of a branch of cycles: a multiplier passes 1 or -1, or a pair leaves.
+At a critical point a multiplier passes 1 or -1, or a pair leaves the unit circle.
 """
 
 from dataclasses import replace

@@ -6,8 +6,6 @@ as an equilibrium if its imbalance is negligible compared with the effect of a d
     |r_i| <= ε Σ_j |∂r_i/∂y_j| Y_j
 
 so that neither a minimum of |r| that is not a root nor a far point where forces have merely faded is taken for one.
-
-The inputs of a search for steady motions: starts, the coordinates that move in them, and integer parameters.
 """
 
 from collections.abc import Callable, Iterable

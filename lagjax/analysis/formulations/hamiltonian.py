@@ -3,16 +3,11 @@
     H(t, q, p) = p·v - L(t, q, v)        with v from p = ∂L/∂v
     q̇ = ∂H/∂p,    ṗ = -∂H/∂q + Q - ∂R/∂v
 
-H is the Jacobi integral as a function of momenta.
-
-Source: Goldstein, *Classical Mechanics*, Eq. (8.15), (8.18).
-
-Velocities from momenta: p = ∂L/∂v solved for v, numerically, for any regular L.
-
-If L is quadratic in the velocities, p is linear in them and one solve with M = ∂²L/∂v∂v is exact; the program of L
-shows whether this is so. Otherwise Newton's method finds v, with steps shortened until L is finite and the residual
-falls. The derivatives of v, of any order and in both modes, are those of the implicit function:
-dv = M⁻¹ (dp - d(∂L/∂v) at fixed v).
+H is the Jacobi integral as a function of momenta. p = ∂L/∂v is solved for v numerically, for any regular L: if L is
+quadratic in the velocities, p is linear in them and one solve with M = ∂²L/∂v∂v is exact; the program of L shows
+whether this is so. Otherwise Newton's method finds v, with steps shortened until L is finite and the residual falls.
+The derivatives of v, of any order and in both modes, are those of the implicit function: dv = M⁻¹ (dp - d(∂L/∂v) at
+fixed v).
 
 Source: Goldstein, *Classical Mechanics*, Eq. (8.15)-(8.18); Arnold, *Mathematical Methods of Classical Mechanics*, §14.
 """

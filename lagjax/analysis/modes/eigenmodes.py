@@ -9,14 +9,8 @@ where m, M_c, g are the blocks of M and G of the eliminated coordinates. A conse
 if K_e is singular. A mode that oscillates with ω contributes to the quadratic energy E₂ = ½ ξ̇ᵀ M ξ̇ + ½ ξᵀ K ξ with
 the sign of xᴴ (ω² M + K) x; if this is negative, damping makes the mode grow.
 
-Source: Goldstein, *Classical Mechanics*, §8.3 (Routh); Krein's signature and Kelvin-Tait-Chetaev's theorem: Kirillov,
-*Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5; Merkin, *Introduction to the Theory of Stability*,
-§6.
-
-Characteristic roots with their vectors and derivatives: of `K x = s M x`, and of `A x = λ E x`.
-
-LAPACK's roots and vectors of A have errors of the round-off of the largest root. With left vectors z and right vectors
-x the error of the quotient
+The roots are those of `K x = s M x` at rest, and of `A x = λ E x` otherwise. LAPACK's roots and vectors of A have
+errors of the round-off of the largest root. With left vectors z and right vectors x the error of the quotient
 
     λ = z A x / z E x
 
@@ -27,8 +21,10 @@ order, and hence the quotient to third.
 For double roots c is undefined and left out; each of them then gets the derivative of their mean. A root with too few
 vectors (a defective root) gets no derivative. `Roots` reports both cases.
 
-Source: Golub & Van Loan, *Matrix Computations*, §7.2.2 (condition of a root), §8.7 (symmetric-definite problems);
-Magnus, Econometric Theory 1 (1985) 179 (derivatives).
+Source: Goldstein, *Classical Mechanics*, §8.3 (Routh); Krein's signature and Kelvin-Tait-Chetaev's theorem: Kirillov,
+*Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5; Merkin, *Introduction to the Theory of Stability*,
+§6; Golub & Van Loan, *Matrix Computations*, §7.2.2 (condition of a root), §8.7 (symmetric-definite problems); Magnus,
+Econometric Theory 1 (1985) 179 (derivatives).
 """
 
 from typing import NamedTuple

@@ -4,8 +4,6 @@
 gyroscopic and does no work, and a symmetric part, which damps. The matrix that multiplies positions has a symmetric
 part, the stiffness, and an antisymmetric part, the circulatory one, whose forces can feed in energy without limit.
 
-Whether a state is an equilibrium or in steady motion, and whether its linear equations hold at all times.
-
 In a steady motion x = x₀ + u₀ t without acceleration, and the matrices of small motions do not depend on t. Both are
 checked numerically: the accelerations at the state, and the matrices there and some way along the motion.
 """

@@ -1,13 +1,8 @@
 """Normal modes: how a system moves near an equilibrium or a steady motion, and whether it stays there.
 
-Neutral directions: shifts to another equilibrium, and other speeds of a steady motion.
-
-They are the vectors y = (positions, velocities) with A y = 0. LAPACK returns an arbitrary basis of them. Here it is
-reduced until each vector has an entry that is zero in all others.
-
-The stability verdict and the modes in words.
-
-Pictures of modes: their roots in the plane of growth and frequency, their shapes, and films of their motion.
+`eigenmodes.py` has the roots and shapes; here they get a verdict in words, pictures and films. Neutral directions,
+shifts to another equilibrium and other speeds of a steady motion, are the vectors y = (positions, velocities) with
+A y = 0. LAPACK returns an arbitrary basis of them; it is reduced until each has an entry that is zero in all others.
 """
 
 from collections.abc import Callable

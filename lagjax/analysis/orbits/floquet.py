@@ -13,8 +13,6 @@ A loss of stability is classified by where a multiplier leaves the unit circle: 
 -1 (a motion of twice the period begins), or as a complex pair between.
 
 Source: Coddington & Levinson, *Theory of ODEs*, §3.5; Guckenheimer & Holmes, *Nonlinear Oscillations*, §1.5 and §3.5.
-
-A picture of multipliers in the complex plane.
 """
 
 import equinox as eqx

@@ -1,18 +1,17 @@
 """The monodromy matrix of a motion, and its eigenvalues, with the trivial ones (1 for a known reason) deflated.
 
-With an orthonormal basis B of the tangent space of the constraints, and orthonormal rows Q of the trivial directions
-(see below), the motion takes B w to B N w. The eigenvalues of
+With an orthonormal basis B of the tangent space of the constraints, and orthonormal rows Q of the trivial directions,
+the motion takes B w to B N w. The eigenvalues of
 
     (1 - QᵀQ) N (1 - QᵀQ) + QᵀQ
 
 are the nontrivial multipliers, and exactly 1 for each row of Q. For a motion in several parts, from node to node, N is
 the product of their matrices.
 
-The trivial multipliers of a cycle, which are 1 for a known reason, and their directions.
-
-A cycle of a system without explicit time can start at any of its states: a displacement along the motion f returns
-unchanged. A coordinate c on which nothing depends can be shifted: a displacement along it returns unchanged, too. If a
-function h of the state is conserved, dh of any displacement returns unchanged. For the monodromy matrix M this means
+The trivial directions: a cycle of a system without explicit time can start at any of its states: a displacement along
+the motion f returns unchanged. A coordinate c on which nothing depends can be shifted: a displacement along it returns
+unchanged, too. If a function h of the state is conserved, dh of any displacement returns unchanged. For the monodromy
+matrix M this means
 
     M f = f,    M e_c = e_c,    dh M = dh.
 

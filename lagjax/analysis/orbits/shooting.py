@@ -17,13 +17,11 @@ The step is that of Levenberg and Marquardt with a damping proportional to the r
 also to orbits that are not isolated (Yamashita & Fukushima, *Computing Suppl.* 15 (2001) 239). A step that does not
 reduce the residual is repeated with more damping.
 
+The first candidate comes from the guess, followed with low accuracy for a period, and for two more if the period is
+unknown. If it is not near its start after the given period, the time at which it comes nearest is taken instead.
+
 Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1
 (families of conservative systems); Stoer & Bulirsch, §7.3.5 (multiple shooting).
-
-What a guess shows of an orbit: its size, its approximate period, and the turns of its angles.
-
-The guess is followed for a period, and for two more if the period is unknown, with low accuracy. If it is not near its
-start after the given period, the time at which it comes nearest is taken as the period instead.
 """
 
 from functools import partial

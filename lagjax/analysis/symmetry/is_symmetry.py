@@ -11,8 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.analysis.precision import precision_of
-from lagjax.analysis.symmetry.charge_rates import Affine, rates
+from lagjax.analysis.symmetry.charge_rates import Affine, precision_of, rates
 from lagjax.analysis.symmetry.random_states import draws
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.accelerations import accelerations_at

@@ -1,7 +1,6 @@
 """The result of a search for symmetries: a mapping of names to charges, with a printed summary.
 
-Numbers in words: a ratio of two coefficients as a whole number, a parameter of the user's, or a pitch over 2π.
-
+A ratio of two coefficients is written as a whole number, a parameter of the user's, or a pitch over 2π where it is one:
 `h p_z + 2π L_z with h = 0.5` says more than `0.0795774715 p_z + L_z`. A number is recognised if it agrees to round-off.
 The recognised form is only a guess, so it is displayed but never used in computations.
 """

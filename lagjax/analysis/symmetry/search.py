@@ -6,26 +6,19 @@ which only the span matters; it is projected out. A combination that vanishes in
 Symmetries without t are found first, so that a momentum across a uniform force is not hidden in two that grow with
 time.
 
-Scalings that multiply L by a factor are found separately.
+Scalings x to s^a x, t to s^b t that multiply L by a factor map motions to motions, and conserve nothing; they are found
+separately. Under a combined scaling, L dt changes at a rate that is linear in the exponents. If this rate is c L dt at
+every state, L is multiplied by s^(c - b). With c = 0 the scaling is a Noether symmetry and listed among these instead.
+
+A combination that vanishes is a vector of the null space of a matrix with round-off. Singular values below a tolerance
+count as zero, and the gap to the next one shows how reliable that is. A null space has no preferred basis; the one with
+the most zeros is the most readable, and elimination finds it: each vector gets an entry that is zero in all others,
+starting with the first entries. Small entries are not used as pivots, so that round-off is not magnified. Each vector
+is then computed again from the columns of its nonzero entries alone.
 
 Source: Noether, Nachr. Ges. Wiss. Göttingen (1918) 235, §2; Olver, *Applications of Lie Groups to Differential
-Equations*, §4.4.
-
-Scalings x to s^a x, t to s^b t that multiply L by a factor: they map motions to motions, and conserve nothing.
-
-Under a combined scaling, L dt changes at a rate that is linear in the exponents. If this rate is c L dt at every state,
-L is multiplied by s^(c - b). With c = 0 the scaling is a Noether symmetry and listed among these instead.
-
-Source: Landau & Lifshitz, *Mechanics*, §10.
-
-Linear combinations of columns that vanish: a sparse basis of the null space of a matrix with round-off.
-
-Singular values below a tolerance count as zero, and the gap to the next one shows how reliable that is. A null space
-has no preferred basis; the one with the most zeros is the most readable, and elimination finds it: each vector gets an
-entry that is zero in all others, starting with the first entries. Small entries are not used as pivots, so that
-round-off is not magnified. Each vector is then computed again from the columns of its nonzero entries alone.
-
-Source: Golub & Van Loan, *Matrix Computations*, §5.5.8 (numerical rank), §3.4 (elimination).
+Equations*, §4.4; Landau & Lifshitz, *Mechanics*, §10 (scalings); Golub & Van Loan, *Matrix Computations*, §5.5.8
+(numerical rank), §3.4 (elimination).
 """
 
 from collections.abc import Iterable, Mapping
@@ -34,9 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax.analysis.precision import Precision, precision_of
 from lagjax.analysis.symmetry.ansatz import Basis, Clock, Combination, Gauge, gauges, motions
-from lagjax.analysis.symmetry.charge_rates import Affine, Rates, rates
+from lagjax.analysis.symmetry.charge_rates import Affine, Precision, Rates, precision_of, rates
 from lagjax.analysis.symmetry.is_symmetry import AT_LEAST, STATES, too_few
 from lagjax.analysis.symmetry.random_states import draws
 from lagjax.analysis.symmetry.result import Found, Scaling, Symmetries, Words, in_words, named_parameters
