@@ -11,7 +11,7 @@ from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.trajectory.error_report import account_of, warning_of
 from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import AccuracyWarning
+from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Trajectory
 from lagjax.jaxtools.cache import once
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.mechanics.projection import departures
@@ -163,7 +163,7 @@ def vector_of_times(ts: Any):
     return ts
 
 
-def times(ts: Any, dtype):
+def times(ts: Any, dtype: np.dtype):
     """Return a vector of times in `dtype`; raise unless it increases or decreases throughout."""
     ts = ts.astype(dtype)
     if not is_traced(ts):
@@ -191,7 +191,7 @@ def times(ts: Any, dtype):
     return ts
 
 
-def step_length(value: Any, name: str, dtype):
+def step_length(value: Any, name: str, dtype: np.dtype):
     """Return `dt0` or `max_step` as a number of `dtype`, or None if not given; raise unless it is positive."""
     if value is None:
         return None
@@ -205,7 +205,7 @@ def step_length(value: Any, name: str, dtype):
     return numpy_of(value).asarray(value, dtype)
 
 
-def jumps(jump_ts: Any, dtype):
+def jumps(jump_ts: Any, dtype: np.dtype):
     """Return the times at which a force jumps, (J,) of `dtype`, or None without any; raise unless they are a vector."""
     if jump_ts is None:
         return None
@@ -221,7 +221,7 @@ def jumps(jump_ts: Any, dtype):
     return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
 
 
-def _is_number(value):
+def _is_number(value: Any):
     return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
 
 
@@ -229,7 +229,7 @@ def _holds_traced(times):
     return isinstance(times, (list, tuple)) and is_traced(times)
 
 
-def tolerance(value: Any, name: str, dtype):
+def tolerance(value: Any, name: str, dtype: np.dtype):
     """Return the tolerances of coordinates and of velocities, (2,) of `dtype`; raise if `dtype` cannot reach them."""
     dtype = np.dtype(dtype)
     value = DEFAULT_TOLERANCE.get(dtype, 1e-2) if value is None else value
@@ -248,13 +248,13 @@ def tolerance(value: Any, name: str, dtype):
 
 
 @once
-def _tolerance(value, name, dtype):
+def _tolerance(value: Any, name: str, dtype: np.dtype):
     _check_tolerance(np.min(value), name, dtype)
     _check_tolerance(np.max(value), name, dtype)
     return np.full(2, value, dtype)
 
 
-def _check_tolerance(value, name, dtype):
+def _check_tolerance(value: Any, name: str, dtype: np.dtype):
     if value == np.inf:
         raise ValueError(
             f"{name} is infinite, which allows any error in a step: nothing would choose the steps.\n"
@@ -304,7 +304,7 @@ def off_constraints(model: Model, s: State, rtol, atol) -> str:
     )
 
 
-def warn_of_inaccuracy(trajectory):
+def warn_of_inaccuracy(trajectory: Trajectory):
     """Warn if the error, or the change of a constant of the motion, exceeds what the tolerance lets expect."""
     if float(trajectory.scaled_error) <= 1:
         return
@@ -313,7 +313,7 @@ def warn_of_inaccuracy(trajectory):
     warn(words, AccuracyWarning)
 
 
-def _of_drift(trajectory):
+def _of_drift(trajectory: Trajectory):
     drift, rtol = float(trajectory.drift()), float(trajectory.tolerance[0][0])
     span, steps = abs(float(trajectory.end.t - trajectory.t[0])), int(trajectory.stats["num_accepted_steps"])
     dtype, how = np.asarray(trajectory.t).dtype, trajectory.static.how.steps

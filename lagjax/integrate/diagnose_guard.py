@@ -101,7 +101,7 @@ def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:
     return names, "", "shift the level of the guard a little; or make the motion take shorter steps, max_step="
 
 
-def _called(of, name):
+def _called(of, name: str):
     return f"the switch {of}" if name == SWITCHES else f"event '{of}'"
 
 

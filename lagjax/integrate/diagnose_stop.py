@@ -21,6 +21,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
 from lagjax.integrate.jumps.find import found as jumps_found
@@ -38,6 +39,7 @@ from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.mechanics.equations import equations_of
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
+from lagjax.system.model import Model
 
 # The number of steps that are examined, and the first of these, which only find their length.
 LOOKED_AT, SETTLED = 160, 40
@@ -79,7 +81,7 @@ class Steps(NamedTuple):
         return np.flatnonzero(self.accepted)[1:]
 
 
-def stopped_early(trajectory, settings, guards: str = "") -> str:
+def stopped_early(trajectory: Trajectory, settings: Settings, guards: str = "") -> str:
     """Say where and why an integration stopped before its last output; `guards`: these, in words."""
     end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
     share = 100 * (float(end.t) - t0) / (t1 - t0)
@@ -107,12 +109,12 @@ def stopped_early(trajectory, settings, guards: str = "") -> str:
     )
 
 
-def _with_cause(said, found):
+def _with_cause(said: str, found):
     cause, fix = found
     return f"{said}\nCause: {cause}." + (f"\nFix: {fix}." if fix else "")
 
 
-def _used_up(trajectory, settings, guards):
+def _used_up(trajectory: Trajectory, settings: Settings, guards: str):
     """The rate of progress, what keeps the steps short, and what to do."""
     end, taken = trajectory.end, int(trajectory.stats["num_steps"])
     if settings.controller is not None or not taken:
@@ -141,7 +143,7 @@ def _used_up(trajectory, settings, guards):
     return _with_cause(said, (found[0], fix))
 
 
-def _of_controller(trajectory, settings):
+def _of_controller(trajectory: Trajectory, settings: Settings):
     """The fix for steps of a user's controller: whether a shorter one can be taken from where it failed."""
     if settings.dt0 is None or not isinstance(settings.controller, diffrax.ConstantStepSize):
         return "leave stepsize_controller out: failed steps are then repeated, shorter"
@@ -154,13 +156,13 @@ def _of_controller(trajectory, settings):
     return f"leave stepsize_controller out: there even a step of dt0 / 32 = {float(settings.dt0) / 32:.3g} fails"
 
 
-def _rounded_up(count):
+def _rounded_up(count: int):
     """A count rounded up to two digits."""
     unit = 10 ** max(0, int(np.log10(count)) - 1)
     return int(-(-count // unit) * unit)
 
 
-def _attempts(trajectory, settings):
+def _attempts(trajectory: Trajectory, settings: Settings):
     """`attempt(t0, t1, y)` -> (state, error), its order, where the motion ended, and the direction of time."""
     model, params, end = trajectory.model, trajectory.params, trajectory.end
     method = method_alone(settings, method_of(settings, model))
@@ -170,14 +172,14 @@ def _attempts(trajectory, settings):
     at_start = _on_path(model, first.t, (first.q, first.v), 0.0)
     tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
 
-    def attempt(t0, t1, y):
+    def attempt(t0, t1, y: PyTree):
         return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)
 
     order = float(method.error_order(terms))
     return attempt, order, (float(end.t), (end.q, end.v)), np.sign(float(trajectory.t[-1] - end.t))
 
 
-def last_steps(trajectory, settings) -> Steps:
+def last_steps(trajectory: Trajectory, settings: Settings) -> Steps:
     """Continue the motion from where it ended, and return each step."""
     attempt, order, (t, y), direction = _attempts(trajectory, settings)
     last = float(trajectory.t[-1])
@@ -201,11 +203,11 @@ def last_steps(trajectory, settings) -> Steps:
 
 
 @jitted
-def _attempt(method, terms, t0, t1, y, params, tolerance):
+def _attempt(method: diffrax.AbstractSolver, terms: diffrax.AbstractTerm, t0, t1, y: PyTree, params: PyTree, tolerance):
     """One step, and its error in units of the tolerance."""
     after, error, _, _, result = method.step(terms, t0, t1, y, params, method.init(terms, t0, t1, y, params), True)
 
-    def rows(tree):
+    def rows(tree: PyTree):
         return jnp.abs(coordinates.flatten(tree)[0]).reshape(2, -1)
 
     allowed = of_a_step(jnp.maximum(rows(y), rows(after)), tolerance)
@@ -216,7 +218,7 @@ def _attempt(method, terms, t0, t1, y, params, tolerance):
 class _Path:
     """Velocities and accelerations along the motion and along the parabola through a state."""
 
-    def __init__(self, trajectory):
+    def __init__(self, trajectory: Trajectory):
         self.model, self.names = trajectory.model, trajectory.model.names
         self.in_dict = isinstance(trajectory.end.q, dict)
         t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
@@ -228,19 +230,19 @@ class _Path:
         pace = max(u, np.sqrt(a * moved), moved / span if span > 0 else 0.0)
         self.usual = pace, max(a, pace**2 / max(np.max(np.abs(x)), moved, 1e-300))
 
-    def at(self, t, y, s):
+    def at(self, t, y: PyTree, s):
         """The acceleration at t + s, q + s v + s² a/2, v + s a."""
         return np.asarray(_on_path(self.model, jnp.asarray(t), y, jnp.asarray(s, dtype=float)))
 
-    def velocity(self, y):
+    def velocity(self, y: PyTree):
         """The velocities of a state, (n,)."""
         return np.asarray(coordinates.flatten(y[1])[0])
 
-    def rates(self, t, y):
+    def rates(self, t, y: PyTree):
         """The eigenvalues of d(v, a)/d(q, v)."""
         return np.linalg.eigvals(np.asarray(_jacobian(self.model, jnp.asarray(t), y)))
 
-    def largest(self, steps):
+    def largest(self, steps: Steps):
         """What is large at the last of the steps, in words."""
         a, v = np.abs(self.at(steps.t[-1], steps.y[-1], 0.0)), np.abs(self.velocity(steps.y[-1]))
         if not a.size or not np.all(np.isfinite(a)):
@@ -253,7 +255,7 @@ class _Path:
 
 
 @jitted
-def _on_path(model, t, y, s):
+def _on_path(model: Model, t, y: PyTree, s):
     q, v = y
     a, _ = equations_of(model).accelerations(t, q, v)
     place = jax.tree.map(lambda q, v, a: q + s * v + 0.5 * s**2 * a, q, v, a)
@@ -262,8 +264,8 @@ def _on_path(model, t, y, s):
 
 
 @jitted
-def _jacobian(model, t, y):
-    def rates(z):
+def _jacobian(model: Model, t, y: PyTree):
+    def rates(z: PyTree):
         u = z[model.n :]
         a, _ = equations_of(model).accelerations(t, model.tree(z[: model.n]), model.tree(u))
         return jnp.concatenate([u, model.vector(a)])
@@ -271,7 +273,7 @@ def _jacobian(model, t, y):
     return jax.jacfwd(rates)(jnp.concatenate(model.vectors(*y)))
 
 
-def _singularity(path, steps):
+def _singularity(path: _Path, steps: Steps):
     """Velocities or accelerations that have grown without bound, or that grow while steps shrink."""
     kept = steps.kept if steps.kept.size else np.array([0])
 
@@ -303,7 +305,7 @@ def _singularity(path, steps):
     )
 
 
-def _event(path, i, usual):
+def _event(path: _Path, i, usual):
     """An event where a velocity has grown a hundred times, in the user's names."""
     name = path.names[i]
     if not (path.in_dict and name.isidentifier() or name == "q" or name.startswith("q[")):
@@ -328,7 +330,7 @@ def _jump(trajectory: Trajectory, settings: Settings, steps: Steps) -> tuple[str
     )
 
 
-def _undefined(path, steps):
+def _undefined(path: _Path, steps: Steps):
     """Accelerations that are not finite just beyond the last state."""
     t, y, h = steps.t[-1], steps.y[-1], float(steps.h[-1])
     beyond = path.at(t, y, h)
@@ -342,7 +344,7 @@ def _undefined(path, steps):
     )
 
 
-def _fast(path, steps, implicit):
+def _fast(path: _Path, steps: Steps, implicit: bool):
     """Find eigenvalues that are large compared with one over a step; decay does not limit an implicit method."""
     kept = steps.kept
     if not kept.size:

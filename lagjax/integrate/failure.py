@@ -5,12 +5,14 @@ Failures raised at run time, including those of an empty batch.
 Equinox raises the largest code of the lanes that fail, and an empty batch has no largest code.
 """
 
+from collections.abc import Sequence
 from typing import NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate import arguments
 from lagjax.integrate.diagnose_guard import of_guards
@@ -27,6 +29,7 @@ from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.diagnosis import describe, explain_failure
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
+from lagjax.system.hybrid import Hybrid
 
 
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
@@ -36,7 +39,7 @@ def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
     return result.error_if(trajectory, ~ended_well(result))
 
 
-def _batched(operands, axes):
+def _batched(operands: Sequence, axes: Sequence):
     (code,), (axis,) = operands, axes
     if code.shape[axis] == 0:
         return jnp.full(code.shape[:axis] + code.shape[axis + 1 :], RESULTS.successful._value), None
@@ -66,7 +69,7 @@ def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guar
     _raise(trajectory, start, settings, about_guards)
 
 
-def _raise(trajectory, start, settings, about_guards, where="") -> NoReturn:
+def _raise(trajectory, start: State, settings: Settings, about_guards: str, where="") -> NoReturn:
     result = trajectory.result
     model, start = trajectory.model, coordinates.as_arrays(start, start.t.dtype)
     if is_among(result, [RESULTS.start_off_constraints]):
@@ -78,7 +81,7 @@ def _raise(trajectory, start, settings, about_guards, where="") -> NoReturn:
     raise RuntimeError(where + stopped_early(trajectory, settings, about_guards))
 
 
-def _raise_in_phase(trajectory, start, settings, about_guards) -> NoReturn:
+def _raise_in_phase(trajectory, start: State, settings: Settings, about_guards: str) -> NoReturn:
     hybrid, switches, result = trajectory.system, trajectory.switches, trajectory.result
     if is_among(result, [RESULTS.too_many_switches]):
         raise RuntimeError(_too_many(trajectory))
@@ -107,7 +110,7 @@ def _raise_in_phase(trajectory, start, settings, about_guards) -> NoReturn:
     }
     names = hybrid.systems[phase].constraints
 
-    def of_phase(tree):
+    def of_phase(tree: PyTree):
         return {name: tree[name] for name in names}
 
     fields["end"] = fields["end"]._replace(multipliers=of_phase(fields["end"].multipliers))
@@ -174,7 +177,7 @@ def _no_state_after(trajectory):
     )
 
 
-def _not_seen(trajectory, settings):
+def _not_seen(trajectory, settings: Settings):
     """The guards that are below zero at the end of the last phase, which is integrated without them."""
     hybrid, end, i = trajectory.system, trajectory.end, trajectory.last_phase()
     ts = np.array([end.t, trajectory.t[-1]], np.asarray(trajectory.t).dtype)
@@ -196,7 +199,7 @@ def _phases_along(trajectory):
     return [int(hybrid.first), *map(int, np.asarray(switches.to)[: len(switches)])]
 
 
-def _below_zero(hybrid, start):
+def _below_zero(hybrid: Hybrid, start: State):
     first, found = int(hybrid.first), []
     system = hybrid.systems[first]
     multipliers = accelerations(system, *start)[1] if system.constraints else {}

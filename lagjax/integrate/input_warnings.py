@@ -7,11 +7,13 @@ has an even and an odd part.
 """
 
 import weakref
+from collections.abc import Callable
 from types import FunctionType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.jaxtools.tracing import is_traced
 from lagjax.system import coordinates
@@ -24,7 +26,7 @@ ROUND_OFFS = 100
 _in_order = weakref.WeakSet()
 
 
-def warn_of_odd_dissipation(dissipation, state: State) -> None:
+def warn_of_odd_dissipation(dissipation: Callable | None, state: State) -> None:
     """Warn if R changes its sign with the velocities. Nothing is checked if the values are traced."""
     known = isinstance(dissipation, FunctionType) and dissipation in _in_order
     if dissipation is None or known or is_traced(state):
@@ -52,7 +54,7 @@ def warn_of_odd_dissipation(dissipation, state: State) -> None:
         _in_order.add(dissipation)
 
 
-def _without_zeros(v):
+def _without_zeros(v: PyTree):
     """The velocities, each zero replaced by an irregular number."""
     flat, unflatten = coordinates.flatten(v)
     usual = np.max(np.abs(flat)) or 1.0

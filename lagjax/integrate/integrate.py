@@ -7,6 +7,7 @@ batched and differentiated.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
@@ -32,6 +33,7 @@ from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.tracing import SILENT, WATCHED, is_traced
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import by_name, check_system
+from lagjax.system.coordinates import State
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.system import System
 
@@ -195,7 +197,7 @@ def integrate(
     return trajectory
 
 
-def _raise_or_warn(trajectory, start, settings, guards):
+def _raise_or_warn(trajectory: Trajectory, start: State, settings: Settings, guards: Any):
     """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
     if is_traced(trajectory):
         # A caller that watches learns the result from the report.

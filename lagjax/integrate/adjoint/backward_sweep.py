@@ -6,7 +6,7 @@ once, so that the cotangents of shared arrays are summed inside matrix products.
 each begins with its own last one, and idles when it has finished.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ class Lanes(NamedTuple):
     count: int
     batched: tuple[bool, ...]
 
-    def each(self, function, more=0):
+    def each(self, function: Callable, more=0):
         """Map `function` over the lanes; it takes the operands and `more` arguments that are all batched."""
         return jax.vmap(function, [0 if b else None for b in self.batched] + [0] * more, axis_size=self.count)
 
@@ -59,7 +59,7 @@ class BackwardMotion:
     # The structure of the record, filled when it has been traced.
     found: list
 
-    def problem(self, leaves) -> StepProblem:
+    def problem(self, leaves: Sequence) -> StepProblem:
         """The problem with these arrays."""
         return eqx.combine(jtu.tree_unflatten(self.structure, [leaves[i] for i in self.places]), self.static)
 
@@ -100,7 +100,9 @@ class BackwardSweep(NamedTuple):
     output: Int[Array, ""]
 
 
-def swept_back(leaves, found: Recorded, asked, *, motion: BackwardMotion, moved, lanes: Lanes | None):
+def swept_back(
+    leaves: Sequence, found: Recorded, asked, *, motion: BackwardMotion, moved: Sequence, lanes: Lanes | None
+):
     """The cotangents of the arrays with indices `moved`, from those of the outputs, the last time and the last state.
 
     The first of several outputs at one time has the cotangents of all of them: see `together`.
@@ -121,7 +123,7 @@ def swept_back(leaves, found: Recorded, asked, *, motion: BackwardMotion, moved,
     return total
 
 
-def together(leaves, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
+def together(leaves: Sequence, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
     """The cotangents of outputs, with those of all outputs at one time added to the first of these."""
     _, first = _outputs(leaves, motion, lanes)
 
@@ -132,7 +134,7 @@ def together(leaves, motion: BackwardMotion, lanes: Lanes | None, of_outputs):
     return jax.tree.map(lambda ct: summed(first, ct), of_outputs)
 
 
-def filled(leaves, moved, chosen):
+def filled(leaves: Sequence, moved: Sequence, chosen):
     """The arrays, with those at the indices `moved` replaced by `chosen`."""
     every = list(leaves)
     for i, x in zip(moved, chosen):
@@ -177,10 +179,10 @@ class _Way:
         """Whether the i-th array has a row for each lane."""
         return self.lanes is not None and self.lanes.batched[i]
 
-    def at(self, tree, i):
+    def at(self, tree: PyTree, i):
         """The i-th rows."""
 
-        def of(tree, i):
+        def of(tree: PyTree, i):
             return jax.tree.map(lambda x: x[i], tree)
 
         return of(tree, i) if self.lanes is None else jax.vmap(of)(tree, i)
@@ -193,7 +195,7 @@ class _Way:
 
         return of if self.lanes is None else self.lanes.each(of, more)
 
-    def safe(self, tree):
+    def safe(self, tree: PyTree):
         """Values per lane; lanes without steps get the longest lane's, since zero times their own may be NaN."""
         if self.lanes is None:
             return tree
@@ -207,17 +209,17 @@ class _Way:
         ct = jnp.sum(ct, axis=0) if self.lanes is not None and not self.is_lane(i) else ct
         return [x + ct if j == i else x for j, x in zip(self.moved, total)]
 
-    def at_time(self, t, ct):
+    def at_time(self, t: Array, ct):
         """The cotangent of a time as that of the equal end of a step."""
 
-        def of(ts, t, ct):
+        def of(ts: Array, t: Array, ct):
             return jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
 
         ends = self.where.controller.ts
         of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
         return of(self.leaves[ends], t, ct)
 
-    def pulled(self, t0, t1, y, ct):
+    def pulled(self, t0: Array, t1: Array, y: PyTree, ct):
         """The cotangents of the arrays, of both times (None if not wanted) and of the state at a step's start."""
         leaves = [self.safe(x) if self.is_lane(i) else x for i, x in enumerate(self.leaves)]
         chosen = [leaves[i] for i in self.moved]
@@ -236,7 +238,7 @@ class _Way:
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
-    def copied(self, solver: ProjectedSolver, t0, t1, y) -> ProjectedSolver:
+    def copied(self, solver: ProjectedSolver, t0: Array, t1: Array, y: PyTree) -> ProjectedSolver:
         """The solver with its right-hand side copied to each stage, if that is worthwhile."""
         method = solver.solver
         if solver.fast is not None or not isinstance(method, Nystrom | ExplicitRungeKutta):
@@ -261,7 +263,7 @@ class _Way:
         time = self.at(self.ts, output)
         hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
 
-        def only(condition, tree):
+        def only(condition: Callable, tree: PyTree):
             return jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
 
         ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
@@ -291,7 +293,7 @@ class _Way:
         return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
 
 
-def _outputs(leaves, motion, lanes):
+def _outputs(leaves: Sequence, motion, lanes):
     """The output times, and the first output at each of them, for one lane or for all."""
 
     def of(*leaves):

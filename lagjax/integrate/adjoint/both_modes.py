@@ -17,9 +17,10 @@ along each of their axes. Those by many numbers are in `second_order.py`. So `ja
 `grad(grad)`, `jacrev(jacrev)` and the other orders all work; third derivatives by many numbers are refused.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -53,12 +54,12 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     leaves, structure = jtu.tree_flatten((x, fixed))
     shapes = {}
 
-    def solve_flat(adjoint, differentiated, *leaves):
+    def solve_flat(adjoint: Any, differentiated, *leaves):
         found = solve(*jtu.tree_unflatten(structure, leaves), adjoint, differentiated)
         shapes["y"], shapes[type(adjoint)] = map(jtu.tree_structure, found)
         return tuple(jtu.tree_leaves(part) for part in found)
 
-    def outputs(adjoint, *operands):
+    def outputs(adjoint: Any, *operands):
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
             adjoint = replace(adjoint, record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
@@ -92,7 +93,7 @@ class _Solve:
     size: int
     axes: tuple | None = None
 
-    def without_refused(self, leaves, record):
+    def without_refused(self, leaves: Sequence, record):
         """Return the arrays, without derivatives if the motion was refused, as these may be infinite."""
         if not record:
             return leaves
@@ -106,10 +107,10 @@ class _Solve:
         own = [i < self.size and (self.axes is None or self.axes[i] == 0) for i in range(len(leaves))]
         return [still(x) if m else x for x, m in zip(leaves, own)]
 
-    def in_lanes(self, axes, count):
+    def in_lanes(self, axes, count: int):
         """Return the same for lanes, whose axis comes first in the results."""
 
-        def outputs(adjoint, *operands):
+        def outputs(adjoint: Any, *operands):
             more = [0] * (len(operands) - len(axes))
             return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
 
@@ -117,19 +118,19 @@ class _Solve:
         return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
 
 
-def _solved(*leaves, program, rules):
+def _solved(*leaves, program: Any, rules: _Solve):
     return jaxpr_as_fun(program)(*leaves)
 
 
-def _solved_shapes(*leaves, program, rules):
+def _solved_shapes(*leaves, program: Any, rules: _Solve):
     return program.out_avals
 
 
-def _solved_jvp(primals, tangents, *, program, rules):
+def _solved_jvp(primals: Sequence, tangents: Sequence, *, program: Any, rules: _Solve):
     # Arrays without a tangent are constants: a tangent of zeros would be carried through every step.
     moved = [i for i in range(rules.size) if not isinstance(tangents[i], ad.Zero)]
 
-    def zero(y):
+    def zero(y: PyTree):
         return ad.Zero(jax.typeof(y).to_tangent_aval())
 
     if rules.recorded is None or not moved or _are_few(primals[i] for i in moved):
@@ -144,7 +145,7 @@ def _solved_jvp(primals, tangents, *, program, rules):
     order = moved + [i for i in range(len(leaves)) if i not in moved]
     place = [order.index(i) for i in range(len(leaves))]
 
-    def outputs(adjoint, *operands):
+    def outputs(adjoint: Any, *operands):
         operands = [operands[i] for i in place]
         leaves, record = operands[: len(primals)], operands[len(primals) :]
         return rules.outputs(adjoint, *rules.without_refused(leaves, record), *record)
@@ -155,7 +156,7 @@ def _solved_jvp(primals, tangents, *, program, rules):
     return values, [next(dy) if _is_float(y) else zero(y) for y in values]
 
 
-def _solved_batched(operands, axes, *, program, rules):
+def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
     operands, batched, count = front(operands, axes)
     axes = [0 if b else None for b in batched]
     lanes = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(program), axes, axis_size=count))(*operands)
@@ -163,7 +164,7 @@ def _solved_batched(operands, axes, *, program, rules):
     return found, [0] * len(found)
 
 
-def _are_few(leaves):
+def _are_few(leaves: Sequence):
     return sum(a.size for a in leaves) <= PUSH_UP_TO
 
 
@@ -177,25 +178,25 @@ def _is_float(x):
 # result.
 
 
-def _split(operands, size):
+def _split(operands: Sequence, size: int):
     return tuple(operands[:size]), tuple(operands[size:-size]), tuple(operands[-size:])
 
 
-def _tangent(points, dx, *, outputs, shapes, size, many):
+def _tangent(points: Sequence, dx: Sequence, *, outputs: Callable, shapes: tuple, size: int, many: bool):
     x, fixed = points[:size], points[size:]
 
-    def along(dx):
+    def along(dx: Sequence):
         return jax.jvp(lambda *x: outputs(diffrax.ForwardMode(), *x, *fixed), x, dx)[1]
 
     return jax.vmap(along)(dx) if many else along(dx)
 
 
-def _tangent_shapes(*operands, shapes, size, many, **params):
+def _tangent_shapes(*operands, shapes: tuple, size: int, many: bool, **params):
     lead = operands[-1].shape[:1] if many else ()
     return [ShapedArray((*lead, *shape), dtype) for shape, dtype in shapes]
 
 
-def _tangent_jvp(primals, tangents, **params):
+def _tangent_jvp(primals: Sequence, tangents: Sequence, **params):
     x, fixed, dx = _split(primals, params["size"])
     values = _tangent_p.bind(*primals, **params)
     if _are_few(x):
@@ -208,7 +209,7 @@ def _tangent_jvp(primals, tangents, **params):
     axes = [None] * count + [0] * len(dx)
     moving = [t for t in tangents if moves(t)]
 
-    def along(primals, moving):
+    def along(primals: Sequence, moving):
         moving = iter(moving)
         each = [
             next(moving) if moves(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
@@ -218,7 +219,7 @@ def _tangent_jvp(primals, tangents, **params):
     return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if moves(t)]))(list(primals), moving)
 
 
-def _linear(function, points, tangents, values):
+def _linear(function: Callable, points: Sequence, tangents: Sequence, values):
     """Return `values`, and the derivative of `function` along `tangents`, as a linear map that can be transposed."""
     moved = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, ad.Zero)]
     if not moved:
@@ -236,32 +237,32 @@ def _linear(function, points, tangents, values):
     return values, derivative
 
 
-def _pushed(points, directions, *, along, size):
+def _pushed(points: Sequence, directions, *, along: Callable, size: int):
     return along(*points, *directions)
 
 
-def _pushed_shapes(*operands, along, size):
+def _pushed_shapes(*operands, along: Callable, size: int):
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands]
     return [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(along, *like)]
 
 
-def _pushed_jvp(primals, tangents, *, along, size):
+def _pushed_jvp(primals: Sequence, tangents: Sequence, *, along: Callable, size: int):
     return _linear(along, primals, tangents, _pushed_p.bind(*primals, along=along, size=size))
 
 
-def _pushed_transpose(points, like, wanted, cotangents, *, along, size):
+def _pushed_transpose(points: Sequence, like, wanted: Sequence, cotangents: Sequence, *, along: Callable, size: int):
     push = jax.vmap(partial(along, *points))
     return _along_axes(like, wanted, push, [ad.instantiate_zeros(ct) for ct in cotangents])
 
 
-def _pushed_batched(operands, axes, *, along, size):
+def _pushed_batched(operands: Sequence, axes, *, along: Callable, size: int):
     operands, batched, lanes = front(operands, axes)
     operands = [x if b else jnp.broadcast_to(x, (lanes, *x.shape)) for x, b in zip(operands, batched)]
     found = _pushed_p.bind(*operands, along=jax.vmap(along), size=size)
     return found, [0] * len(found)
 
 
-def _along_axes(like, wanted, push, cotangents):
+def _along_axes(like, wanted: Sequence, push, cotangents: Sequence):
     """Push along the axes of all wanted arrays, and return the products of these derivatives with the cotangents."""
     sizes = [a.size if w else 0 for a, w in zip(like, wanted)]
     starts, total = np.cumsum([0, *sizes]), sum(sizes)
@@ -279,7 +280,17 @@ def _along_axes(like, wanted, push, cotangents):
     return [slopes[i : i + n].reshape(a.shape).astype(a.dtype) for i, n, a, w in zip(starts, sizes, like, wanted) if w]
 
 
-def _tangent_transpose(points, dx, wanted, cotangents, *, outputs, shapes, size, many):
+def _tangent_transpose(
+    points: Sequence,
+    dx: Sequence,
+    wanted: Sequence,
+    cotangents: Sequence,
+    *,
+    outputs: Callable,
+    shapes: tuple,
+    size: int,
+    many: bool,
+):
     x, fixed = points[:size], points[size:]
     if _are_few(a for a, w in zip(x, wanted) if w):
         params = dict(outputs=outputs, shapes=shapes, size=size)
@@ -292,18 +303,18 @@ def _tangent_transpose(points, dx, wanted, cotangents, *, outputs, shapes, size,
     return jax.vmap(along)(cotangents) if many else along(cotangents)
 
 
-def _pull_by_pushing(x, fixed, wanted, cotangents, **params):
+def _pull_by_pushing(x, fixed: Sequence, wanted: Sequence, cotangents: Sequence, **params):
     """Push along the axes of all wanted arrays, and return the products of these derivatives with the cotangents."""
     push = partial(_tangent_p.bind, *x, *fixed, many=True, **params)
     return _along_axes(x, wanted, push, cotangents)
 
 
-def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
+def _tangent_batched(operands: Sequence, axes, *, outputs: Callable, shapes: tuple, size: int, many: bool):
     operands, batched, lanes = front(operands, axes)
     x, fixed, dx = _split(operands, size)
     batched_x, batched_fixed, batched_dx = _split(batched, size)
 
-    def widen(leaves, have):
+    def widen(leaves: Sequence, have):
         return [leaf if here else jnp.broadcast_to(leaf, (lanes, *leaf.shape)) for leaf, here in zip(leaves, have)]
 
     params = dict(outputs=outputs, shapes=shapes, size=size, many=many)
@@ -320,7 +331,7 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     per_lane = [many or a or b for a, b in zip(batched_x, batched_dx)]
     x, dx = (widen(y, [b or not a for b, a in zip(have, per_lane)]) for y, have in ((x, batched_x), (dx, batched_dx)))
 
-    def along(dx):
+    def along(dx: Sequence):
         return _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params)
 
     if many:
@@ -332,11 +343,11 @@ def _tangent_batched(operands, axes, *, outputs, shapes, size, many):
     return dy, [0] * len(dy)
 
 
-def _lanes(x, fixed, dx, per_lane, batched_fixed, lanes, params):
+def _lanes(x, fixed: Sequence, dx: Sequence, per_lane, batched_fixed, lanes, params: PyTree):
     in_axes = [0 if here else None for here in (*per_lane, *batched_fixed)]
     outputs, shapes = params["outputs"], params["shapes"]
 
-    def lane_outputs(adjoint, *operands):
+    def lane_outputs(adjoint: Any, *operands):
         return jax.vmap(partial(outputs, adjoint), in_axes, axis_size=lanes)(*operands)
 
     shapes = tuple(((lanes, *shape), dtype) for shape, dtype in shapes)

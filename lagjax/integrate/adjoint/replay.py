@@ -14,6 +14,7 @@ but outputs and jumps are ends of steps, and the cotangents of these ends belong
 back the transpose of its linear derivative; both have rules for lanes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -102,27 +103,27 @@ def replayed(problem: StepProblem, max_steps: int | None, checked: bool, adjoint
 # with indices `moved`; its results are the tangents of the floating-point arrays of the record.
 
 
-def _run(*leaves, motion, lanes, same_run=False):
+def _run(*leaves, motion: BackwardMotion, lanes, same_run: bool = False):
     return motion.results(*leaves) if lanes is None else lanes.each(motion.results)(*leaves)
 
 
-def _run_shapes(*leaves, motion, lanes, same_run):
+def _run_shapes(*leaves, motion: BackwardMotion, lanes, same_run: bool):
     like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
     found = jax.eval_shape(lambda *leaves: _run(*leaves, motion=motion, lanes=lanes), *like)
     return [ShapedArray(x.shape, x.dtype) for x in found]
 
 
-def _known(*operands, motion, lanes):
+def _known(*operands, motion: BackwardMotion, lanes):
     return list(operands[motion.size :])
 
 
-def _known_jvp(primals, tangents, *, motion, lanes):
+def _known_jvp(primals: Sequence, tangents: Sequence, *, motion: BackwardMotion, lanes):
     # The known values belong to the given arrays, so only the tangents of these matter, not those of the values.
     values, leaves = _known_p.bind(*primals, motion=motion, lanes=lanes), primals[: motion.size]
     return values, _derivative(leaves, values, tangents[: motion.size], motion, lanes)
 
 
-def _known_batched(operands, axes, *, motion, lanes):
+def _known_batched(operands: Sequence, axes: Sequence, *, motion: BackwardMotion, lanes):
     operands, batched, count = front(operands, axes)
     leaves, values = operands[: motion.size], operands[motion.size :]
     values = [x if b else jnp.broadcast_to(x, (count, *x.shape)) for x, b in zip(values, batched[motion.size :])]
@@ -136,14 +137,14 @@ def _known_batched(operands, axes, *, motion, lanes):
     return found, [0] * len(found)
 
 
-def _run_jvp(primals, tangents, *, motion, lanes, same_run):
+def _run_jvp(primals: Sequence, tangents: Sequence, *, motion: BackwardMotion, lanes, same_run: bool):
     if same_run:
         return _pushed(primals, tangents, motion, lanes)
     values = _run_p.bind(*primals, motion=motion, lanes=lanes, same_run=motion.bent)
     return values, _derivative(primals, values, tangents, motion, lanes)
 
 
-def _pushed(leaves, tangents, motion, lanes):
+def _pushed(leaves: Sequence, tangents: Sequence, motion: BackwardMotion, lanes):
     """Values and tangents of one run; it is no linear map, so it cannot be transposed."""
     moved, moving = _moving(tangents)
     run = partial(_run, motion=motion, lanes=lanes)
@@ -152,7 +153,7 @@ def _pushed(leaves, tangents, motion, lanes):
     return values, [d if _is_float(x) else _zero(x) for x, d in zip(values, found)]
 
 
-def _derivative(leaves, values, tangents, motion, lanes):
+def _derivative(leaves: Sequence, values, tangents: Sequence, motion: BackwardMotion, lanes):
     moved, moving = _moving(tangents)
     if not moved:
         return [_zero(x) for x in values]
@@ -160,7 +161,7 @@ def _derivative(leaves, values, tangents, motion, lanes):
     return [next(found) if _is_float(x) else _zero(x) for x in values]
 
 
-def _moving(tangents):
+def _moving(tangents: Sequence):
     """The indices of the operands that have tangents, and these tangents."""
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
     return moved, [tangents[i] for i in moved]
@@ -170,7 +171,7 @@ def _zero(x):
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
-def _run_batched(operands, axes, *, motion, lanes, same_run):
+def _run_batched(operands: Sequence, axes: Sequence, *, motion: BackwardMotion, lanes, same_run: bool):
     operands, batched, count = front(operands, axes)
     if lanes is None:
         found = _run_p.bind(*operands, motion=motion, lanes=Lanes(count, batched), same_run=same_run)
@@ -180,7 +181,7 @@ def _run_batched(operands, axes, *, motion, lanes, same_run):
     return [x.reshape(count, lanes.count, *x.shape[1:]) for x in found], [0] * len(found)
 
 
-def _lanes_of_lanes(leaves, batched, lanes, count):
+def _lanes_of_lanes(leaves: Sequence, batched, lanes, count: int):
     """Flatten a batch of batches into one batch."""
     flat = []
     for x, b, inner in zip(leaves, batched, lanes.batched):
@@ -193,7 +194,7 @@ def _lanes_of_lanes(leaves, batched, lanes, count):
 
 
 # The points are the arrays of the problem and those of the record.
-def _moved(points, moving, *, motion, lanes, moved):
+def _moved(points: Sequence, moving: Sequence, *, motion: BackwardMotion, lanes, moved: Sequence):
     leaves = points[: motion.size]
 
     def of_moved(*chosen):
@@ -203,29 +204,38 @@ def _moved(points, moving, *, motion, lanes, moved):
     return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))[1]
 
 
-def _moved_shapes(*operands, motion, lanes, moved):
+def _moved_shapes(*operands, motion: BackwardMotion, lanes, moved: Sequence):
     values = split(operands, len(moved))[0][motion.size :]
     return [ShapedArray(x.shape, x.dtype) for x in values if _is_float(x)]
 
 
-def _moved_jvp(primals, tangents, **params):
+def _moved_jvp(primals: Sequence, tangents: Sequence, **params):
     # Forward over forward: the result cannot be transposed.
     tangents = [ad.instantiate_zeros(t) for t in tangents]
     return jax.jvp(partial(_moved_at, **params), primals, tuple(tangents))
 
 
-def _moved_at(*operands, moved, **params):
+def _moved_at(*operands, moved: Sequence, **params):
     return _moved(*split(operands, len(moved)), moved=moved, **params)
 
 
-def _moved_batched(operands, axes, **params):
+def _moved_batched(operands: Sequence, axes: Sequence, **params):
     # Many directions at once, in forward mode.
     count = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     found = jax.vmap(partial(_moved_at, **params), axes, axis_size=count)(*operands)
     return found, [0] * len(found)
 
 
-def _moved_transpose(points, moving, wanted, cotangents, *, motion, lanes, moved):
+def _moved_transpose(
+    points: Sequence,
+    moving: Sequence,
+    wanted: Sequence,
+    cotangents: Sequence,
+    *,
+    motion: BackwardMotion,
+    lanes,
+    moved: Sequence,
+):
     leaves, values = points[: motion.size], points[motion.size :]
     given = iter(cotangents)
     given = jtu.tree_unflatten(motion.found[0][0], [next(given) if _is_float(x) else None for x in values])

@@ -10,7 +10,7 @@ the transpose takes w to H[c, w], by forward mode along w, and to J w, a push. T
 is transposed in the same way, to H[c, dx], the pull's derivative along dx, and Jᵀ c.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,7 @@ from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, split
 
 
 @eqx.filter_custom_jvp
-def pull(x, fixed, cotangents, *, which, outputs):
+def pull(x, fixed: Sequence, cotangents: Sequence, *, which: tuple, outputs: Callable):
     """The cotangents of some of x, from the cotangents of some of `outputs(adjoint, *x, *fixed)`.
 
     `which`: for each of x whether its cotangent is wanted, and for each output whether it has one in `cotangents`.
@@ -35,7 +35,7 @@ def pull(x, fixed, cotangents, *, which, outputs):
 
 
 @pull.def_jvp
-def _pull_jvp(primals, tangents, *, which, outputs):
+def _pull_jvp(primals: Sequence, tangents: Sequence, *, which: tuple, outputs: Callable):
     values = pull(*primals, which=which, outputs=outputs)
     points = [a for part in primals for a in part]
     along = [None if part is None else d for part in tangents for d in part]
@@ -45,7 +45,7 @@ def _pull_jvp(primals, tangents, *, which, outputs):
     return values, type(values)(ad.instantiate_zeros(d) for d in derivative)
 
 
-def _pulled(x, fixed, cotangents, which, outputs, bent=False):
+def _pulled(x, fixed: Sequence, cotangents: Sequence, which: tuple, outputs: Callable, bent=False):
     wanted, asked = which
 
     def of_wanted(*chosen):
@@ -56,7 +56,9 @@ def _pulled(x, fixed, cotangents, which, outputs, bent=False):
     return jax.vjp(of_wanted, *[a for a, w in zip(x, wanted) if w])[1](tuple(cotangents))
 
 
-def _pull_tangent(x, fixed, cotangents, which, outputs, at, direction):
+def _pull_tangent(
+    x, fixed: Sequence, cotangents: Sequence, which: tuple, outputs: Callable, at: Sequence, direction: Sequence
+):
     """The derivative of a pull with respect to the x at the indices `at`, along a direction."""
 
     def of_moved(*chosen):
@@ -65,7 +67,7 @@ def _pull_tangent(x, fixed, cotangents, which, outputs, at, direction):
     return jax.jvp(of_moved, tuple(x[i] for i in at), tuple(direction))[1]
 
 
-def _pushed(x, fixed, outputs, at, direction):
+def _pushed(x, fixed: Sequence, outputs: Callable, at: Sequence, direction: Sequence):
     """The derivative of the outputs with respect to the x at the indices `at`, along a direction."""
     return jax.jvp(
         lambda *chosen: outputs(diffrax.ForwardMode(), *filled(x, at, chosen), *fixed),
@@ -83,10 +85,10 @@ class Pull:
     which: tuple
     outputs: Callable
 
-    def _split(self, points):
+    def _split(self, points: Sequence):
         return points[: self.size], points[self.size : self.size + self.fixed], points[self.size + self.fixed :]
 
-    def forward(self, points, moved, moving):
+    def forward(self, points: Sequence, moved: Sequence, moving: Sequence):
         """The derivative along directions `moving` of the points with indices `moved`."""
 
         def of_moved(*chosen):
@@ -94,7 +96,7 @@ class Pull:
 
         return jax.jvp(of_moved, tuple(points[i] for i in moved), tuple(moving))[1]
 
-    def backward(self, points, moved, w):
+    def backward(self, points: Sequence, moved: Sequence, w):
         """The transpose: the cotangents of the directions of the `moved` points."""
         x, fixed, cotangents = self._split(points)
         wanted, asked = self.which
@@ -116,10 +118,10 @@ class Push:
     size: int
     outputs: Callable
 
-    def _split(self, points):
+    def _split(self, points: Sequence):
         return points[: self.size], points[self.size : -self.size], points[-self.size :]
 
-    def forward(self, points, moved, moving):
+    def forward(self, points: Sequence, moved: Sequence, moving: Sequence):
         """The derivative along directions `moving` of the points with indices `moved`."""
 
         def of_moved(*chosen):
@@ -128,7 +130,7 @@ class Push:
 
         return jax.jvp(of_moved, tuple(points[i] for i in moved), tuple(moving))[1]
 
-    def backward(self, points, moved, w):
+    def backward(self, points: Sequence, moved: Sequence, w):
         """The transpose: the cotangents of the directions of the `moved` points."""
         x, fixed, dx = self._split(points)
         offset = len(points) - self.size
@@ -148,21 +150,21 @@ class _OverLanes:
     moving: tuple
     count: int
 
-    def forward(self, points, moved, moving):
+    def forward(self, points: Sequence, moved: Sequence, moving: Sequence):
         return jax.vmap(
             lambda points, moving: self.one.forward(points, moved, moving),
             (list(self.points), list(self.moving)),
             axis_size=self.count,
         )(points, moving)
 
-    def backward(self, points, moved, w):
+    def backward(self, points: Sequence, moved: Sequence, w):
         found = jax.vmap(
             lambda points, w: self.one.backward(points, moved, w), (list(self.points), 0), axis_size=self.count
         )(points, w)
         return [x if axis == 0 else jnp.sum(x, axis=0) for x, axis in zip(found, self.moving)]
 
 
-def turned(map, points, tangents, shapes):
+def turned(map, points: Sequence, tangents: Sequence, shapes: tuple):
     """The derivative `map` at these points along these tangents, as a linear map that JAX can transpose."""
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
     if not moved:
@@ -170,23 +172,25 @@ def turned(map, points, tangents, shapes):
     return _turned_p.bind(*points, *(tangents[i] for i in moved), map=map, moved=moved, shapes=shapes)
 
 
-def _turned(points, moving, *, map, moved, shapes):
+def _turned(points: Sequence, moving: Sequence, *, map, moved: Sequence, shapes: tuple):
     return map.forward(list(points), moved, list(moving))
 
 
-def _turned_jvp(primals, tangents, **params):
+def _turned_jvp(primals: Sequence, tangents: Sequence, **params):
     raise NotImplementedError(
         "a third derivative of a motion by many numbers, two of them in reverse mode, is not available.\n"
         "Fix: jax.jvp of jax.jvp of jax.jvp, along each direction that is wanted, or differences of second derivatives."
     )
 
 
-def _turned_transpose(points, moving, wanted, cotangents, *, map, moved, shapes):
+def _turned_transpose(
+    points: Sequence, moving: Sequence, wanted: Sequence, cotangents: Sequence, *, map, moved: Sequence, shapes: tuple
+):
     found = map.backward(list(points), moved, [ad.instantiate_zeros(ct) for ct in cotangents])
     return [x for x, w in zip(found, wanted) if w]
 
 
-def _turned_batched(operands, axes, *, map, moved, shapes):
+def _turned_batched(operands: Sequence, axes: Sequence, *, map, moved: Sequence, shapes: tuple):
     operands, batched, count = front(operands, axes)
     lanes = _OverLanes(map, *split([0 if b else None for b in batched], len(moved)), count)
     shapes = tuple(((count, *shape), dtype) for shape, dtype in shapes)

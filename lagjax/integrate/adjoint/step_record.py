@@ -123,7 +123,7 @@ def with_room(problem: StepProblem, memory: float | None) -> StepProblem:
     if memory is None:
         return problem._replace(room=Room(ROWS, PLACES))
 
-    def size(tree):
+    def size(tree: PyTree):
         return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
     place = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, _first(problem)))

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate.contacts.impacts import Impact, Opening
 from lagjax.integrate.solve.phases import OfPhases, Plastic
@@ -28,7 +28,7 @@ class Touches(eqx.Module):
     gap: Callable
     reset: OfPhases
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         return self.gap(t, q, params)
 
 
@@ -113,7 +113,7 @@ class Releases(eqx.Module):
     def reset(self):
         return Opening(self.contact)
 
-    def __call__(self, t, q, v, multipliers, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree):
         return _multiplier(multipliers, self.contact)
 
 
@@ -144,7 +144,7 @@ class Slips(eqx.Module):
     coefficient: Callable | ArrayLike
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
-    def __call__(self, t, q, v, multipliers, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree):
         mu = self.coefficient(params) if callable(self.coefficient) else self.coefficient
         force = jnp.ravel(_multiplier(multipliers, self.held, many=True))
         size = self.side * force[0] if self.side else _length(force)
@@ -183,7 +183,7 @@ class Sticks(eqx.Module):
     def takes(self):
         return OF_STATE
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         return self.sliding(t, q, v, params)
 
 
@@ -203,7 +203,7 @@ def sticks(sliding: Callable) -> Sticks:
     return Sticks(sliding)
 
 
-def _multiplier(multipliers, name, many=False):
+def _multiplier(multipliers: dict[str, Array], name: str, many=False):
     if name not in multipliers:
         raise ValueError(
             f"there is no constraint '{name}' in this phase; there {'are ' if multipliers else 'is '}"

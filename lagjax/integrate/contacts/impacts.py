@@ -36,7 +36,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate.solve.phases import OfPhases
 from lagjax.jaxtools.cache import shape_of
@@ -68,7 +68,7 @@ class Impact(OfPhases):
     def mapped(self, on: Callable) -> "Impact":
         """Return the same with `on(role, function, takes)` in place of each function."""
 
-        def part(role, f, *takes):
+        def part(role: str, f, *takes):
             return on(role, f, takes) if callable(f) else f
 
         return Impact(
@@ -88,7 +88,7 @@ class _Rebound(eqx.Module):
     before: System
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         gap, e = self.impact.gap, self.impact.restitution
         _, opening = jax.jvp(lambda t, q: gap(t, q, params), (t, q), (jnp.ones_like(t), v))
         # A contact that is opening receives no impulse.
@@ -103,7 +103,7 @@ class _Rebound(eqx.Module):
         along, independent = self._unit(both, t, q, v, params)
         return _moved(after, self._friction_change(t, q, v, params, jump, by_gap, along, independent), along)
 
-    def _unit(self, contact, t, q, v, params):
+    def _unit(self, contact, t: Array, q: PyTree, v: PyTree, params: PyTree):
         """Return the least change of the velocities that changes the residual of the last entry of `contact` by one,
         but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
         before = self.before
@@ -115,7 +115,9 @@ class _Rebound(eqx.Module):
         off = jnp.abs(rows @ d - change) > DEPENDENT * (change + jnp.abs(rows) @ jnp.abs(d))
         return found, ~jnp.any(off)
 
-    def _friction_change(self, t, q, v, params, jump, by_gap, along, independent):
+    def _friction_change(
+        self, t: Array, q: PyTree, v: PyTree, params: PyTree, jump, by_gap, along: Callable, independent
+    ):
         """Return σ, the change of the sliding velocity by friction."""
         mu, sliding = self.impact.friction, self.impact.sliding
         assert sliding is not None
@@ -155,7 +157,7 @@ class _Opened(eqx.Module):
     contact: str = eqx.field(static=True)
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         model = model_of(self.before, t, q, v, params)
         x, u = model.vectors(q, v)
         sizes = jnp.abs(constraints.jacobian(model, t, x, u)) @ jnp.abs(u)
@@ -166,11 +168,11 @@ class _Opened(eqx.Module):
         return _moved(v, 1.0, velocity_change(model, t, q, v, change))
 
 
-def _moved(v, size, along):
+def _moved(v: PyTree, size: int, along: Callable):
     return jax.tree.map(lambda x, d: x + size * d, v, along)
 
 
-def _check_sliding(sliding, t, q, v, params):
+def _check_sliding(sliding, t: Array, q: PyTree, v: PyTree, params: PyTree):
     """Raise if a sliding velocity is not one number, or not linear in v."""
     found = shape_of(sliding, t, q, v, params)
     shape = getattr(found, "shape", () if isinstance(found, float | int) else None)

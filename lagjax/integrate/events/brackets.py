@@ -124,7 +124,7 @@ class Pieces(NamedTuple):
     doubt: list
 
 
-def pieces_of(begin: GuardValue, inner, off, end: GuardValue, h, touches, at_zero, close) -> Pieces:
+def pieces_of(begin: GuardValue, inner, off, end: GuardValue, h: Array, touches, at_zero, close) -> Pieces:
     """The pieces of an interval of length h between exact ends; `off`: the errors of the inner nodes (value, rate).
 
     A piece that comes nearer to zero than `touches` is not clear; nor is one longer than `close` to an end whose rate
@@ -175,7 +175,7 @@ def pieces_of(begin: GuardValue, inner, off, end: GuardValue, h, touches, at_zer
     return Pieces(g, rate, known, sign[1:], doubt)
 
 
-def without_rest(pieces: Pieces, begin: GuardValue, end: GuardValue, inner, h) -> Pieces:
+def without_rest(pieces: Pieces, begin: GuardValue, end: GuardValue, inner, h: Array) -> Pieces:
     """The same, without doubts where the guard is zero all along, to round-off."""
     noise = jnp.maximum(begin.noise, end.noise)
     rests = jnp.asarray(True)
@@ -184,7 +184,7 @@ def without_rest(pieces: Pieces, begin: GuardValue, end: GuardValue, inner, h) -
     return pieces._replace(doubt=[doubt & ~rests for doubt in pieces.doubt])
 
 
-def _bend(g, rate, h):
+def _bend(g, rate, h: Array):
     """How far a guard and its rate at the inner nodes are from the cubic through both ends."""
     off = jnp.zeros_like(h)
     ends = g[0], h * rate[0], h * rate[-1], g[-1]
@@ -199,7 +199,7 @@ def _bend(g, rate, h):
     return off
 
 
-def between(left: Node, right: Node, h):
+def between(left: Node, right: Node, h: Array):
     """(state, acceleration) at the inner nodes, by the quintic, and by the cubics through (q, v) and (v, a)."""
     (q0, v0), (q1, v1), a0, a1 = left.y, right.y, left.a, right.a
     inverse = 1 / jnp.where(h > 0, h, 1.0)
@@ -282,7 +282,7 @@ class Next(NamedTuple):
     turns_right: tuple[Bool[Array, ""], ...]
 
 
-def next_node(left_end: Node, right_end: Node, times, of_guards, resolution) -> Next:
+def next_node(left_end: Node, right_end: Node, times, of_guards, resolution: Array) -> Next:
     """Where to look next for the first guard in doubt, in its first piece in doubt: at the extremum, or halfway."""
     none, halfway = jnp.asarray(False), left_end.t + 0.5 * (right_end.t - left_end.t)
     found = Next(jnp.asarray(True), halfway, jnp.asarray(-1), jnp.ones_like(halfway), (), ())
@@ -326,12 +326,12 @@ class Sight(eqx.Module):
     motion: ProjectedSolver
     resolution: Float[Array, ""]
 
-    def value(self, t, y, args):
+    def value(self, t: Array, y: PyTree, args: PyTree):
         """The value of each guard at one state."""
         multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
-    def sample(self, left: Node, right: Node, args):
+    def sample(self, left: Node, right: Node, args: PyTree):
         """The guards at `right`; the ends of the pieces between the two nodes; and each guard at the inner ones, by the
         quintic and by the cubics."""
         h = right.t - left.t
@@ -364,7 +364,7 @@ class Sight(eqx.Module):
         )
         return values, times, [[(x[i], dx[i]) for x, dx in found] for i in range(len(values))]
 
-    def _along(self, places, directions, args):
+    def _along(self, places, directions, args: PyTree):
         """The guards at places (t, y), and their derivatives along one direction for each place: pairs of tuples."""
 
         def push(place, direction):
@@ -388,7 +388,7 @@ class Sight(eqx.Module):
             tuple(finite(x, 0.0) if rests else x for x, rests in zip(rate, may_rest)),
         )
 
-    def unseen(self, t) -> Node:
+    def unseen(self, t: Array) -> Node:
         """A node at which nothing is known yet."""
         zero, no = jnp.zeros_like(t), jnp.asarray(False)
         return Node(t, None, None, (GuardValue(zero, zero, zero, no, no),) * len(self.guards.kinds))
@@ -435,7 +435,7 @@ class Sight(eqx.Module):
         return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
 
 
-def uneven(y):
+def uneven(y: PyTree):
     """The state with each number times a different factor near one, so that sums of parts do not cancel."""
     leaves, structure = jtu.tree_flatten(y)
     scaled = []

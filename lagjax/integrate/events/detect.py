@@ -28,6 +28,7 @@ Source: Farouki & Rajan, Comput. Aided Geom. Des. 4 (1987) 191 (hulls); Hairer &
 output by Hermite's formula); Shampine & Thompson, Appl. Math. Comput. 39 (2000) 43s (crossings inside a step).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ import equinox.internal as eqxi
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.events.brackets import (
     Followed,
@@ -126,7 +127,7 @@ class EventController(diffrax.AbstractStepSizeController):
         """The same for time in this direction, which is always forward."""
         return EventController(self.controller.wrap(direction), self.sight, self.last)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1, y0: PyTree, dt0, args: PyTree, func, error_order):
         """The first step."""
         t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         t, (_, v) = stop_gradient((t0, y0))
@@ -141,7 +142,17 @@ class EventController(diffrax.AbstractStepSizeController):
         a, values = jtu.tree_map(jnp.zeros_like, v), self.sight.unseen(t).values
         return t1, (inner, Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part))
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(
+        self,
+        t0: Array,
+        t1,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: PyTree,
+        error_order,
+        controller_state: PyTree,
+    ):
         """Whether to keep a step, or a part of one, and the next."""
         inner, watched = controller_state
         parted, resolution = watched.part.parted, self.resolution
@@ -179,7 +190,7 @@ class EventController(diffrax.AbstractStepSizeController):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _follow(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
+    def _follow(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
         """Whether a part is taken, where the next one ends, whether the motion ends now, and the new `Watched`."""
         fixed, part = stop_gradient(self), watched.part
         known = stop_gradient((t0, t1, y0, y1, args, watched._replace(y=None), until))
@@ -195,16 +206,16 @@ class EventController(diffrax.AbstractStepSizeController):
 
         def with_new():
             here = lax.stop_gradient(t1), y1
-            return jtu.tree_map(lambda x, all: jnp.where(like(new, all), x, all), here, (watched.t, watched.y))
+            return jtu.tree_map(lambda x, all: jnp.where(like(new, all), x[None], all), here, (watched.t, watched.y))
 
         t, y = lax.cond(eqxi.unvmap_any(jnp.any(new)), with_new, lambda: (watched.t, watched.y))
         followed = tuple(f._replace(count=f.count + c) for f, c in zip(move.followed, crossed))
         begins = keep & ~watched.begun
 
-        def known(values, turns):
+        def with_turns(values, turns):
             return tuple(v._replace(turns=v.turns | x) for v, x in zip(values, turns))
 
-        here, at_left = known(values, move.turns), known(watched.values, move.turns_left)
+        here, at_left = with_turns(values, move.turns), with_turns(watched.values, move.turns_left)
         a, values = _where(takes | begins, (a, here), (watched.a, at_left))
         later = Watched(watched.begun | keep, a, values, followed, t, y, move.part)
 
@@ -214,7 +225,7 @@ class EventController(diffrax.AbstractStepSizeController):
         later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
         return takes, move.at, ended, later
 
-    def _move(self, keep, t0, t1, y0, y1, args, watched: Watched, until):
+    def _move(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
         """The decision about a step from t0 to t1; and the acceleration and the guards at its end."""
         part, begins, kinds = watched.part, ~watched.begun, self.kinds
         # The first step is used to evaluate the guards at the start, and then taken again.
@@ -384,10 +395,10 @@ def _chosen(i, values):
     return found
 
 
-def _grown(t0, t1, until):
+def _grown(t0: Array, t1, until):
     """The end of the part of a step after one from t0 to t1."""
     return jnp.minimum(until, t1 + GROWS * (t1 - t0))
 
 
-def _where(condition, a, b):
+def _where(condition: Callable, a, b):
     return jtu.tree_map(lambda a, b: jnp.where(condition, a, b), a, b)

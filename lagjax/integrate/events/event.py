@@ -110,11 +110,11 @@ class Crossings(eqx.Module):
     count: Int[Array, ""]
     uncertain: Bool[Array, ""]
 
-    def with_states(self, q, v) -> "Crossings":
+    def with_states(self, q: PyTree, v: PyTree) -> "Crossings":
         """Return the same with q and v in another structure."""
         return Crossings(self.t, q, v, self.multipliers, self.count, self.uncertain)
 
-    def none_where(self, condition) -> "Crossings":
+    def none_where(self, condition: Callable) -> "Crossings":
         """Return the same without any crossing where `condition` holds."""
         rows = self.t, self.q, self.v, self.multipliers
         rows = jax.tree.map(lambda x: jnp.where(condition, jnp.nan, x), rows)
@@ -199,7 +199,9 @@ class Guards(eqx.Module):
         """Return the same for states that are tuples of numbers."""
         return Guards(self.functions, self.kinds, lambda numbers: tree(jnp.stack(numbers)))
 
-    def __call__(self, t, q, v, multipliers, params) -> tuple[Float[Array, ""], ...]:
+    def __call__(
+        self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree
+    ) -> tuple[Float[Array, ""], ...]:
         """Return the value of each guard; true counts as one, false as minus one."""
         q, v = (q, v) if self.together is None else (self.together(q), self.together(v))
         more = [(multipliers, params) if kind.takes_multipliers else (params,) for kind in self.kinds]
@@ -211,11 +213,11 @@ class Condition(eqx.Module):
 
     condition: Callable
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         return self.condition(t, (q, v), params)
 
 
-def _number(value, t):
+def _number(value: Any, t: Array):
     value = jnp.asarray(value)
     value = jnp.where(value, 1.0, -1.0) if jnp.issubdtype(value.dtype, jnp.bool_) else value
     return value.astype(t.dtype)
@@ -293,7 +295,7 @@ def traced_guard(name: str, guard: Callable, given: Mapping[str, Any]) -> Traced
     return traced_call(call, given, _check, "the arguments of a condition of diffrax, (t, y, args)")
 
 
-def _check(call, value):
+def _check(call: Call, value: Any):
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value)))
     if shape != () or not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)):
         raise ValueError(

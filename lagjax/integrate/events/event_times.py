@@ -11,6 +11,7 @@ Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.6 (event location); Ch
 App. A (its derivative).
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -49,7 +50,7 @@ def locate(watching: EventController, watched: Watched) -> Located:
     sight = watching.sight
     equations, guards = sight.motion.equations, sight.guards
 
-    def exact(owner, row):
+    def exact(owner: Array, row):
         t, y = _exact((guards, equations), *row, owner, sight.resolution, _flow)
         return t, y, equations.multipliers(t, *y)
 
@@ -58,7 +59,9 @@ def locate(watching: EventController, watched: Watched) -> Located:
     return Located(t, y, multipliers, counts, uncertain)
 
 
-def at_known_times(guards: Guards, equations: Equations, resolution, located: Located, y, bent: bool) -> Located:
+def at_known_times(
+    guards: Guards, equations: Equations, resolution: Array, located: Located, y: PyTree, bent: bool
+) -> Located:
     """Return the same with the derivatives of the states `y` (S, ...) at the known times, for reverse mode.
 
     `bent`: these derivatives may be differentiated again.
@@ -67,7 +70,7 @@ def at_known_times(guards: Guards, equations: Equations, resolution, located: Lo
     y = jtu.tree_map(lambda root, y: root + (y - lax.stop_gradient(y)), located.y, y)
     flow = _flow_twice if bent else _flow
 
-    def exact(owner, known):
+    def exact(owner: Array, known):
         t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution, flow)
         return t, y, equations.accelerations(t, *y)[1]
 
@@ -75,7 +78,7 @@ def at_known_times(guards: Guards, equations: Equations, resolution, located: Lo
     return located._replace(t=t, y=y, multipliers=multipliers)
 
 
-def _each(function, guards, there, rows):
+def _each(function: Callable, guards, there, rows):
     """Return `function(owner, row)` for each place with a crossing, and NaN for the others."""
     owners = jnp.asarray(guards.owners)
     shapes = jax.eval_shape(function, owners[0], jtu.tree_map(lambda x: x[0], rows))
@@ -89,12 +92,12 @@ def _each(function, guards, there, rows):
     return lax.map(one, (owners, there, rows))
 
 
-def first_end(guards: Guards, t):
+def first_end(guards: Guards, t: Array):
     """Return the first time in `t` (S,) at which a terminal guard is zero; infinite if there is none."""
     return jnp.min(jnp.where(guards.terminal[guards.owners] & jnp.isfinite(t), t, jnp.inf))
 
 
-def end_of(guards: Guards, located: Located, t, y):
+def end_of(guards: Guards, located: Located, t: Array, y: PyTree):
     """Return the end of the motion, (1,): the first terminal crossing, or else the given `t` and `y`."""
     ends = jnp.where(guards.terminal[guards.owners] & jnp.isfinite(located.t), located.t, jnp.inf)
     first = jnp.argmin(ends)
@@ -123,38 +126,38 @@ def by_name(guards: Guards, located: Located, end, valid) -> dict[str, Crossings
     return found
 
 
-def _exact(live, t, y, owner, resolution, flow):
+def _exact(live: PyTree, t: Array, y: PyTree, owner: Array, resolution: Array, flow: Callable):
     """Return a time and a state on a guard unchanged, with the derivatives that follow from staying on it."""
     z = lax.stop_gradient(t), y
     return flow(live, _wait(live, z, owner, resolution, flow=flow), z, rate=_rate)
 
 
-def _rate(live, z):
+def _rate(live: PyTree, z: PyTree):
     t, y = z
     return jnp.ones_like(t), (y[1], live[1].accelerations(t, *y)[0])
 
 
-def _guard(live, z, owner):
+def _guard(live: PyTree, z: PyTree, owner: Array):
     (guards, equations), (t, y) = live, z
     return jnp.stack(guards(t, *y, equations.accelerations(t, *y)[1], equations.model.params))[owner]
 
 
 @eqx.filter_custom_jvp
-def _flow(live, tau, z, *, rate):
+def _flow(live: PyTree, tau: Array, z: PyTree, *, rate):
     """Follow `dz/dtau = rate(live, z)` from z for a time tau of zero: return z, with all derivatives."""
     return z
 
 
 @_flow.def_jvp
-def _flow_jvp(primals, tangents, *, rate):
+def _flow_jvp(primals: Sequence, tangents: Sequence, *, rate):
     (live, tau, z), (moves, dtau, dz) = primals, tangents
 
-    def filled(z, dz):
+    def filled(z: PyTree, dz):
         return jtu.tree_map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, z, dz, is_leaf=lambda x: x is None)
 
     dz = filled(z, dz)
 
-    def of_both(live, z):
+    def of_both(live: PyTree, z: PyTree):
         value, change = eqx.filter_jvp(rate, (live[0], z[0]), (live[1], z[1]))
         return value, filled(value, change)
 
@@ -163,7 +166,7 @@ def _flow_jvp(primals, tangents, *, rate):
     return z, dz if dtau is None else jtu.tree_map(lambda x, dx: x + dx * dtau, dz, rate(live, z))
 
 
-def _flow_twice(live, tau, z, *, rate):
+def _flow_twice(live: PyTree, tau: Array, z: PyTree, *, rate):
     """The same up to second derivatives, by Taylor's polynomial; the first derivatives may be transposed."""
     once = rate(live, z)
     _, twice = jax.jvp(lambda z: rate(live, z), (z,), (once,))
@@ -171,18 +174,18 @@ def _flow_twice(live, tau, z, *, rate):
 
 
 @eqx.filter_custom_jvp
-def _wait(live, z, owner, resolution, *, flow):
+def _wait(live: PyTree, z: PyTree, owner: Array, resolution: Array, *, flow: Callable):
     """Return the time until a state on a guard reaches it: zero, with derivatives."""
     # Under vmap the value must be batched, as its derivative is.
     return jnp.where(z[0] > 0, 0.0, jnp.zeros_like(z[0]))
 
 
 @_wait.def_jvp
-def _wait_jvp(primals, tangents, *, flow):
+def _wait_jvp(primals: Sequence, tangents: Sequence, *, flow: Callable):
     (live, z, owner, resolution), (moves, dz, *_) = primals, tangents
     tau = _wait(live, z, owner, resolution, flow=flow)
 
-    def after(live, tau, z):
+    def after(live: PyTree, tau: Array, z: PyTree):
         return _guard(live, flow(live, tau, z, rate=_rate), owner)
 
     g, rate = jax.jvp(lambda tau: after(live, tau, z), (tau,), (jnp.ones_like(tau),))
@@ -196,7 +199,7 @@ def _wait_jvp(primals, tangents, *, flow):
     return tau, -dg / jnp.where(jumps, none, rate)
 
 
-def _terms(live, z, owner):
+def _terms(live: PyTree, z: PyTree, owner: Array):
     """Return the size of the terms whose sum is the guard."""
     t, y = z
     _, change = jax.jvp(lambda t, y: _guard(live, (t, y), owner), (t, y), (t, uneven(y)))

@@ -11,7 +11,7 @@ and the derivatives. The times become ends of steps.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -96,11 +96,11 @@ class OpenedFunction:
     # For each jump in t alone, the first of its results in the program, and what is known of it.
     of_time: tuple[tuple[int, Timed], ...]
 
-    def zeros(self, dtype):
+    def zeros(self, dtype: np.dtype):
         """Zero multipliers by name."""
         return {name: jnp.zeros(shape, dtype) for name, shape in self.multipliers}
 
-    def no_modes(self, dtype):
+    def no_modes(self, dtype: np.dtype):
         """Modes that do not count, since the comparisons are free."""
         return jnp.zeros(self.program.in_avals[-2].shape, dtype), jnp.asarray(True)
 
@@ -146,7 +146,7 @@ class Jumps:
         """The system as a function of `Given` in place of its parameters."""
         return system.map(self._smooth)
 
-    def _smooth(self, function, role):
+    def _smooth(self, function: Callable, role: str):
         if role not in self.traced:
             return OfParams(function)
         traced = self.traced[role]
@@ -231,7 +231,7 @@ def _traced(function: Callable, given: dict[str, Any]) -> _Program:
     return _Program(program, inputs, shapes[0], takes, multipliers)
 
 
-def _opened(traced: _Program, role, table, mode):
+def _opened(traced: _Program, role: str, table, mode: Callable):
     """Walk over a program on shapes: the walk."""
     walks = []
 
@@ -244,7 +244,7 @@ def _opened(traced: _Program, role, table, mode):
     return walks[-1]
 
 
-def _with_modes(traced: _Program, role, table, starts, count, defined) -> OpenedFunction:
+def _with_modes(traced: _Program, role: str, table, starts: dict[str, int], count: int, defined) -> OpenedFunction:
     dtype = next(x.dtype for x in traced.program.in_avals if jnp.issubdtype(x.dtype, jnp.floating))
     places, of_time = [], []
 
@@ -279,7 +279,7 @@ def _with_modes(traced: _Program, role, table, starts, count, defined) -> Opened
     return OpenedFunction(program, traced.shape, traced.takes, tuple(places), traced.multipliers, tuple(of_time))
 
 
-def leaves_of(function, arguments):
+def leaves_of(function: Callable, arguments):
     """The arrays in a function and its arguments."""
     return jtu.tree_leaves(eqx.filter((function, arguments), eqx.is_array))
 
@@ -300,7 +300,7 @@ class Results(NamedTuple):
     changes_at: Array
 
 
-def with_jumps_in_time(jumps: Jumps, jump_ts, system, q, v, params, ts):
+def with_jumps_in_time(jumps: Jumps, jump_ts, system: System, q: PyTree, v: PyTree, params: PyTree, ts: Array):
     """The times of the jumps that the user named, and of those that were found, in no order; and whether there are too
     many of the latter, which are then left out."""
     found, sought, too_many = [] if jump_ts is None else [jump_ts], [], jnp.asarray(False)
@@ -315,7 +315,7 @@ def with_jumps_in_time(jumps: Jumps, jump_ts, system, q, v, params, ts):
     return jnp.concatenate([x.astype(ts.dtype) for x in found]), too_many
 
 
-def _at(t, outputs, traced: OpenedFunction, function, arguments):
+def _at(t: Array, outputs, traced: OpenedFunction, function: Callable, arguments):
     """Some results of the program at a time; jumps in t alone do not depend on the rest of the state."""
     if not outputs:
         return []
@@ -324,7 +324,7 @@ def _at(t, outputs, traced: OpenedFunction, function, arguments):
     return run(outputs_of(traced.program, outputs), [*leaves_of(function, state), modes, free])
 
 
-def _results(roles, t, before=None, after=None) -> Results:
+def _results(roles: Sequence, t: Array, before=None, after=None) -> Results:
     """All comparisons of all roles at a time, and where those whose modes are `before` and `after` it change."""
     modes, x, at, start = [], [], [], 0
     for traced, function, arguments in roles:
@@ -343,7 +343,7 @@ def _results(roles, t, before=None, after=None) -> Results:
     return Results(*(jnp.concatenate(y).astype(t.dtype) for y in (modes, x, at)))
 
 
-def _between(rule, before, after, table):
+def _between(rule: str, before, after, table):
     """The number at which a mode changes."""
     if rule == "above":
         return jnp.zeros_like(before)
@@ -358,11 +358,11 @@ def _between(rule, before, after, table):
     return jnp.where(jnp.abs(after) > jnp.abs(before), after, before)
 
 
-def _sought(roles, ts):
+def _sought(roles: Sequence, ts: Array):
     fixed = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, (roles, ts))
     roles_fixed, (first, last) = fixed[0], (fixed[1][0], fixed[1][-1])
 
-    def modes_at(t):
+    def modes_at(t: Array):
         return _results(roles_fixed, t).modes
 
     grid = first + (last - first) * jnp.linspace(0.0, 1.0, SAMPLES + 1, dtype=ts.dtype)
@@ -391,11 +391,11 @@ def _sought(roles, ts):
     low, high = lax.fori_loop(0, BISECTIONS, halve, (low, high))
     before, after = each(low), each(high)
 
-    def difference(t, component, before, after):
+    def difference(t: Array, component, before, after):
         found = _results(roles, t, before, after)
         return (found.x - found.changes_at)[component]
 
-    def along(t, *rest):
+    def along(t: Array, *rest):
         return jax.jvp(lambda t: difference(t, *rest), (t,), (jnp.ones_like(t),))
 
     t = high

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.jumps.find import Given, Jumps, Smooth
 from lagjax.mechanics.lagrangian import applied_force, mass_and_forcing
 from lagjax.numerics.linalg import dense
 from lagjax.system import constraints, coordinates
 from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 # A force is evaluated once more for each jump along which a motion could slide.
@@ -65,14 +65,14 @@ class Sliding(eqx.Module):
     differences: tuple[Smooth, ...]
     which: tuple[int, ...] = eqx.field(static=True)
 
-    def mixture(self, t, q, v, given: Given) -> Mixture:
+    def mixture(self, t: Array, q: PyTree, v: PyTree, given: Given) -> Mixture:
         """Solve for the shares."""
         model = model_of(self.system, t, q, v, given)
         x, u = model.vectors(q, v)
         a, solve = self._accelerations(model, t, x, u)
         changes = [solve(self._change(i, t, q, v, given)) for i in self.which]
 
-        def difference(t, x, u):
+        def difference(t: Array, x, u):
             return jnp.stack([f(t, model.tree(x), model.tree(u), given) for f in self.differences])
 
         _, rates = jax.jvp(difference, (t, x, u), (jnp.ones_like(t), u, a))
@@ -88,7 +88,7 @@ class Sliding(eqx.Module):
         total = [rates[i] + sum(share * pushes[j][i] for j, share in enumerate(shares)) for i in range(count)]
         return Mixture(shares, total)
 
-    def _accelerations(self, model, t, x, u):
+    def _accelerations(self, model: Model, t: Array, x, u):
         """The accelerations without sliding, and the function that gives those of one more force."""
         linear = mass_and_forcing(model, t, x, u)
         if model.n == 1 and not model.m:
@@ -98,16 +98,16 @@ class Sliding(eqx.Module):
         still = jnp.zeros_like(rows.gamma)
         return solver.solve(linear.forcing, rows.gamma)[0], lambda force: solver.solve(force, still)[0]
 
-    def _change(self, i, t, q, v, given):
+    def _change(self, i, t: Array, q: PyTree, v: PyTree, given):
         """How the generalized force changes on the other side of jump i, as a vector."""
         beyond = given._replace(modes=given.modes.at[i].set(1 - given.modes[i]))
         return self._force(t, q, v, beyond) - self._force(t, q, v, given)
 
-    def _force(self, t, q, v, given):
+    def _force(self, t: Array, q: PyTree, v: PyTree, given):
         model = model_of(self.system, t, q, v, given)
         return applied_force(model, t, *model.vectors(q, v))
 
-    def extra(self, t, q, v, given):
+    def extra(self, t: Array, q: PyTree, v: PyTree, given):
         """The force that is added to that of the system, as a vector."""
         shares = self.mixture(t, q, v, given).shares
         found = [share * self._change(i, t, q, v, given) for i, share in zip(self.which, shares)]
@@ -122,7 +122,7 @@ class Mixed(eqx.Module):
     sliding: Sliding
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
-    def __call__(self, t, q, v, given):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, given):
         extra = coordinates.like(q, self.sliding.extra(t, q, v, given))
         if self.force is None:
             return extra

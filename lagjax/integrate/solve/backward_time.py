@@ -47,7 +47,7 @@ class Reflected(eqx.Module):
     def takes(self):
         return takes_of(self.function)
 
-    def __call__(self, t, q, *rest):
+    def __call__(self, t, q: PyTree, *rest):
         if self.of_velocities:
             v, *rest = rest
             rest = (_negative(v), *rest)
@@ -60,7 +60,7 @@ class ReflectedCondition(eqx.Module):
 
     condition: Callable
 
-    def __call__(self, t, y, args, **kwargs):
+    def __call__(self, t, y: PyTree, args: PyTree, **kwargs):
         q, v = y
         return self.condition(-t, (q, _negative(v)), args, **kwargs)
 
@@ -103,7 +103,7 @@ def reflect_snapshot(snapshot: Snapshot) -> Snapshot:
     return snapshot._replace(t=-snapshot.t, v=_negative(snapshot.v))
 
 
-def _reflect_settings(settings):
+def _reflect_settings(settings: Settings):
     controller, event, jump_ts = settings.controller, settings.event, settings.jump_ts
     return replace(
         settings,
@@ -118,5 +118,5 @@ def _reflect_event(event):
     return diffrax.Event(conditions)
 
 
-def _negative(tree):
+def _negative(tree: PyTree):
     return jax.tree.map(lambda x: -x, tree)

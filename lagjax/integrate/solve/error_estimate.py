@@ -14,12 +14,15 @@ Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.4 (global error by a s
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array
 
 from lagjax.integrate.trajectory.error_report import Errors, columns, scaled_error
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, is_among
@@ -55,7 +58,7 @@ def steps_to_repeat(estimate: bool | None, controller, progress: bool) -> np.nda
     return np.asarray(limits[None if estimate is None else bool(estimate)], np.int32)
 
 
-def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
+def with_errors(run: Callable, first: Trajectory, settings, ts: Array) -> Trajectory:
     """Return the trajectory with its errors by `run(settings)`, if it is short enough; not while JAX is tracing."""
     if not is_among(first.result, ENDED_WELL):
         return _unknown(first, first.result)
@@ -65,7 +68,7 @@ def with_errors(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
     return _compared(np, first, run(_closer(np, settings, steps, np.asarray(first.end.t), ts)), ts)
 
 
-def with_errors_inside(run: Callable, first: Trajectory, settings, ts) -> Trajectory:
+def with_errors_inside(run: Callable, first: Trajectory, settings, ts: Array) -> Trajectory:
     """Do the same in a traced program, without derivatives of the errors."""
     if not _can_be_closer(settings):
         return _unknown(first)
@@ -84,7 +87,7 @@ def _can_be_closer(settings):
     return settings.controller is None or _fixed(settings.controller) and settings.dt0 is not None
 
 
-def _closer(xp, settings, steps, end, ts):
+def _closer(xp: ModuleType, settings, steps: Any, end: Any, ts: Array):
     """Return the settings of the second run, after a first one of `steps` steps to the time `end`."""
     if settings.controller is not None:
         return replace(settings, dt0=settings.dt0 / 2)
@@ -99,7 +102,7 @@ def _closer(xp, settings, steps, end, ts):
     return replace(settings, rtol=rtol, atol=atol, max_step=longest, shares=shares)
 
 
-def _compared(xp, first, second, ts) -> Trajectory:
+def _compared(xp: ModuleType, first, second, ts: Array) -> Trajectory:
     """Return the first trajectory with its errors: the difference of the two, plus the least effect of round-off."""
     steps = xp.asarray(second.stats["num_accepted_steps"])
     share = ROUND_OFF * np.finfo(ts.dtype).eps * xp.sqrt(1.0 + steps)
@@ -132,7 +135,7 @@ def _unknown(first, result=RESULTS.not_estimated) -> Trajectory:
     return replace(first, error=Errors(*nothing, times, result, np.zeros((), int)))
 
 
-def _columns(xp, of):
+def _columns(xp: ModuleType, of):
     """Return coordinates, velocities and multipliers as columns, one row for each instant."""
     return columns(xp, (of.q, of.v, of.multipliers), rows=np.size(of.t))
 
@@ -144,6 +147,6 @@ def _like_trajectory(errors, first):
     return jax.tree.unflatten(structure, parts)
 
 
-def _of_times(xp, first, second, share):
+def _of_times(xp: ModuleType, first, second, share: Any):
     found = xp.where(xp.isnan(second), np.inf, abs(first - second) + share * abs(first))
     return xp.where(xp.isnan(first), np.nan, found).astype(first.dtype)

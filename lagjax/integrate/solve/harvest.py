@@ -4,7 +4,7 @@
 While it traces the function, `integrate` passes every trajectory through `report`, a primitive that does nothing.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -83,7 +83,7 @@ def reporting(function: Callable) -> Callable:
         program, structure = watched(function, *args)
         program, marks = poisoned(program), []
 
-        def collect(equation, operands):
+        def collect(equation: Any, operands: Sequence):
             if equation.primitive is _report_p:
                 kind = equation.params["kind"]
                 marks.append(kind(*operands[-len(kind._fields) :]))
@@ -127,12 +127,12 @@ _has_report = anywhere(lambda equation: equation.primitive is _report_p)
 _says_settled = anywhere(lambda equation: equation.primitive is _report_p and equation.params["kind"] is Settled)
 
 
-def _reports(equation):
+def _reports(equation: Any):
     return any(map(_has_report, bodies(equation)))
 
 
 @once_per_program
-def _hides(jaxpr):
+def _hides(jaxpr: Any):
     """Whether a motion assumed regular is in a part of the program that the interpreter does not enter."""
     entered = [(equation, stands_for(equation)) for equation in jaxpr.eqns]
     return any(
@@ -141,7 +141,7 @@ def _hides(jaxpr):
     )
 
 
-def _together(reports):
+def _together(reports: Sequence):
     if not reports:
         return None
     # The motions inside a derivative are batched: the worst lane counts.
@@ -153,15 +153,15 @@ def _together(reports):
     return Report(result, jnp.sum(steps), scaled_error, jnp.nanmax(residuals))
 
 
-def _batched(operands, axes, kind):
+def _batched(operands: Sequence, axes: Sequence, kind: type):
     return _report_p.bind(*operands, kind=kind), axes
 
 
-def _jvp(primals, tangents, kind):
+def _jvp(primals: Sequence, tangents: Sequence, kind: type):
     return _report_p.bind(*primals, kind=kind), list(tangents)
 
 
-def _same(*operands, kind):
+def _same(*operands, kind: type):
     return list(operands)
 
 

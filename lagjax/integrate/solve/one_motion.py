@@ -6,6 +6,7 @@ ends within a few rejected steps, and the lane keeps the reason in its result.
 """
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -130,7 +131,7 @@ class Start(NamedTuple):
     scales: Scales | None
 
 
-def _start(equations: Equations, q, v, ts, settings, sizes_so_far) -> Start:
+def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Settings, sizes_so_far) -> Start:
     """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     if settings.drift == "project":
@@ -215,7 +216,18 @@ def _loop(
         reached = jnp.where(found.reached, ts, jnp.inf)
         return Solution(reached, found.outputs, end, found.stats, found.result, None, found)
 
-    def solve(terms, solver, t0, t1, dt0, y0, args, saveat, controller, event):
+    def solve(
+        terms: diffrax.AbstractTerm,
+        solver,
+        t0: Array,
+        t1: Array,
+        dt0,
+        y0: PyTree,
+        args: PyTree,
+        saveat,
+        controller: Any,
+        event: Any,
+    ):
         solution = diffrax.diffeqsolve(
             terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
             event=event, max_steps=settings.max_steps, throw=False, progress_meter=_progress_meter(settings.progress),
@@ -277,7 +289,7 @@ class Outputs(NamedTuple):
     sound: Bool[Array, " T"]
 
 
-def _outputs(equations, start, solution, ts, settings) -> Outputs:
+def _outputs(equations: Equations, start: Start, solution: Solution, ts: Array, settings: Settings) -> Outputs:
     # Outputs not reached get the start state and are masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(solution.reached) & ~start.refused
     states = jax.tree.map(lambda x, x0: jnp.where(like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
@@ -289,7 +301,7 @@ def _outputs(equations, start, solution, ts, settings) -> Outputs:
     return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached, sound)
 
 
-def _result(equations, start, solution, outputs, guards, settings):
+def _result(equations: Equations, start: Start, solution: Solution, outputs, guards, settings: Settings):
     """The fields of the trajectory: NaN at outputs that it did not reach, and the reason."""
     (motion, reached, sound), located = outputs, solution.located
     result = RESULTS.promote(solution.result)
@@ -325,7 +337,7 @@ def _result(equations, start, solution, outputs, guards, settings):
     }
 
 
-def _absolute(states, scales, settings):
+def _absolute(states, scales, settings: Settings):
     """The given `atol`; or, if tolerances follow the motion's own size, what was as good as zero on it, (2, n)."""
     if scales is None:
         return settings.atol
@@ -333,7 +345,7 @@ def _absolute(states, scales, settings):
     return rounding(shared(scales, jnp.stack(sizes)))
 
 
-def _scaled_error(equations, t, q, v, stats, settings):
+def _scaled_error(equations: Equations, t: Array, q: PyTree, v: PyTree, stats: dict[str, Array], settings: Settings):
     """The change of quantities that must stay constant, at the outputs, in units of what the tolerance lets expect.
 
     An error of the Jacobi integral that grows steadily shifts the phase by about its size per radian, so over very
@@ -355,7 +367,9 @@ def _among(result, others):
     return jnp.any(jnp.stack([result == other for other in others]))
 
 
-def _user_calls_python(equations, terms, start, guards, settings, controller):
+def _user_calls_python(
+    equations: Equations, terms: diffrax.AbstractTerm, first: State, guards, settings: Settings, controller: Any
+):
     """Whether the user's functions, method or controller may call Python at run time, if only to check something.
 
     If not, only diffrax's checks are left. They concern the times and the first step, which `solve` examines itself.
@@ -363,7 +377,7 @@ def _user_calls_python(equations, terms, start, guards, settings, controller):
     parts = (settings.method, settings.controller)
     if any(part is not None and type(part).__module__.split(".")[0] not in CHECKED_PACKAGES for part in parts):
         return True
-    (t, q, v, params), written = start, equations.written
+    (t, q, v, params), written = first, equations.written
     if written is None:
         traced = [jax.make_jaxpr(lambda t, y: terms.vf(t, y, params))(t, (q, v))]
     else:
@@ -381,12 +395,12 @@ def _user_calls_python(equations, terms, start, guards, settings, controller):
     return any(calls_host(program.jaxpr) for program in traced)
 
 
-def method_alone(settings, method):
+def method_alone(settings: Settings, method):
     """Return a method as it steps a motion on equations that are not written out."""
     return _in_a_loop(_with_root_finder(replace(settings, method=method), None), diffrax.ForwardMode())
 
 
-def _with_root_finder(settings, scales):
+def _with_root_finder(settings: Settings, scales):
     """An implicit method with diffrax's default root finder gets ours; all get the solve's tolerances."""
     method, tolerances = settings.method, (settings.rtol[0], settings.atol[0])
     if scales is not None and isinstance(method, Radau5):
@@ -398,7 +412,7 @@ def _with_root_finder(settings, scales):
     return with_tolerances(method, *tolerances)
 
 
-def _solver(equations, fast, feedback, refused, settings, adjoint):
+def _solver(equations: Equations, fast, feedback, refused, settings: Settings, adjoint: Any):
     return ProjectedSolver(
         solver=_in_a_loop(settings.method, adjoint),
         equations=equations,
@@ -413,7 +427,7 @@ def _solver(equations, fast, feedback, refused, settings, adjoint):
     )
 
 
-def _in_a_loop(method, adjoint):
+def _in_a_loop(method, adjoint: Any):
     """Return the method with a loop over its stages, of the kind that the derivative needs."""
     if isinstance(method, Nystrom) or isinstance(method, ExplicitRungeKutta) and isinstance(adjoint, Replay):
         return replace(method, in_a_loop=True)
@@ -425,12 +439,12 @@ def _in_a_loop(method, adjoint):
     return eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None) if ours else method
 
 
-def _arriving(settings):
+def _arriving(settings: Settings):
     # A user's controller chooses its steps itself; a condition for diffrax may read the controller's tolerances.
     return settings.controller is None and settings.event is None
 
 
-def _controller(equations, ts, settings, scales, bare, repeated):
+def _controller(equations: Equations, ts: Array, settings: Settings, scales, bare: bool, repeated: bool):
     if settings.controller is not None:
         return settings.controller
     # A step that small no longer moves t: the solution is singular there, or was NaN from the start.
@@ -450,23 +464,23 @@ def _controller(equations, ts, settings, scales, bare, repeated):
     return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
 
 
-def resolution(ts):
+def resolution(ts: Array):
     """Return the smallest difference of two times that can be told apart."""
     return 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
 
 
-def _by_position(event):
+def _by_position(event: Any):
     """Return the user's event with `args` by position: diffrax passes it by name, but a user may call it `params`."""
     if event is None:
         return None
 
-    def by_position(condition):
+    def by_position(condition: Callable):
         return lambda t, y, args, **kwargs: condition(t, y, args, **kwargs)
 
     return diffrax.Event(jax.tree.map(by_position, event.cond_fn, is_leaf=callable))
 
 
-def _progress_meter(progress):
+def _progress_meter(progress: bool | None):
     if not progress:
         return diffrax.NoProgressMeter()
     if importlib.util.find_spec("tqdm") is None:

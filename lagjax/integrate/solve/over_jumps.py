@@ -42,13 +42,15 @@ from lagjax.integrate.solve.segments import (
     unknown,
     with_those_of,
 )
+from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
+from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.fuse_cpu import apart
 from lagjax.jaxtools.open_jumps import IN_TIME
 from lagjax.jaxtools.trees import like, stop_gradient, where
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 from lagjax.system.warn import warn
 
@@ -73,13 +75,13 @@ def warn_of_missed(missed: Sequence[str]):
     )
 
 
-def with_lost(stats, too_many):
+def with_lost(stats, too_many: Array):
     """The statistics of a motion, with jumps in time that were too many to be followed."""
     known = {"num_jumps": jnp.asarray(0), "lost_jumps": jnp.asarray(False)} | stats
     return known | {"lost_jumps": known["lost_jumps"] | too_many}
 
 
-def warn_of_lost(trajectory):
+def warn_of_lost(trajectory: Trajectory):
     """Say that a motion could not be followed across all its jumps."""
     if "lost_jumps" in trajectory.stats and bool(trajectory.stats["lost_jumps"]):
         count = int(trajectory.stats["num_jumps"])
@@ -104,7 +106,7 @@ class ModeGuard(eqx.Module):
     sliding: Sliding | None
     number: int = eqx.field(static=True)
 
-    def __call__(self, t, q, v, given: Given):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, given: Given):
         value = self.guard(t, q, v, given)
         if self.sliding is not None:
             share = self.sliding.mixture(t, q, v, given).shares[self.sliding.which.index(self.number)]
@@ -161,7 +163,17 @@ class ModeWay(NamedTuple):
     result: Any
 
 
-def solved_over_jumps(jumps: Jumps, system: System, q0, v0, params, ts, guards, settings, adjoint):
+def solved_over_jumps(
+    jumps: Jumps,
+    system: System,
+    q0: PyTree,
+    v0: PyTree,
+    params: PyTree,
+    ts: Array,
+    guards,
+    settings: Settings,
+    adjoint: Any,
+):
     """Return the fields of the trajectory, like `one_motion.solved`."""
     model = model_of(system, ts[0], q0, v0, params)
     small = model.n + model.m <= 24
@@ -203,7 +215,7 @@ def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
     return Guards((*piecewise.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
 
 
-def _first(model, q0, v0, ts, guards, modes, settings) -> ModeWay:
+def _first(model: Model, q0: PyTree, v0: PyTree, ts: Array, guards, modes: Array, settings: Settings) -> ModeWay:
     dtype, many = ts.dtype, ts.shape[0]
     multipliers = unknown(model.zero_multipliers())
     rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, many)
@@ -221,7 +233,16 @@ def _first(model, q0, v0, ts, guards, modes, settings) -> ModeWay:
     )  # fmt: skip
 
 
-def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, ts, settings, adjoint) -> ModeWay:
+def _leg(
+    piecewise: Piecewise,
+    guards: Guards,
+    recorded,
+    way: ModeWay,
+    params: PyTree,
+    ts: Array,
+    settings: Settings,
+    adjoint: Any,
+) -> ModeWay:
     """Return the way after one more leg."""
     # Past outputs would cost a step each: those ahead come first, padded with the last.
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
@@ -263,7 +284,7 @@ def _leg(piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params, t
     return where(here, further, way)
 
 
-def _next(jump_ts, t, resolution):
+def _next(jump_ts, t: Array, resolution: Array):
     """The next of the times of jumps."""
     return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
 
@@ -279,7 +300,9 @@ class ModeEnding(NamedTuple):
     result: Any
 
 
-def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay, given, ts, settings) -> ModeEnding:
+def _ending(
+    piecewise, guards: Guards, result, end: Snapshot, when: Array, way: ModeWay, given, ts: Array, settings: Settings
+) -> ModeEnding:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
@@ -300,14 +323,14 @@ def _ending(piecewise, guards: Guards, result, end: Snapshot, when, way: ModeWay
     return ModeEnding(onward, wrong, first, end, result)
 
 
-def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol):
+def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol: Array):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
     state = stop_gradient(tuple(end))
     g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count]), state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
-def _beyond(piecewise: Piecewise, first, end: Snapshot, given: Given):
+def _beyond(piecewise: Piecewise, first: Array, end: Snapshot, given: Given):
     """The modes after the guard `first` has crossed zero, and along which jumps the motion then slides."""
     state, given = stop_gradient((end.t, end.q, end.v)), stop_gradient(given)
     n = len(piecewise.guards)

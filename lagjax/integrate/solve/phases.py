@@ -1,6 +1,6 @@
 """The parts of a solve that a hybrid system defines: phases, their guards, and the resets of the state by switches."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
 from lagjax.integrate.solve.backward_time import runs_backward
@@ -41,7 +41,7 @@ class Reset(eqx.Module):
     when: Callable | None = None
     slower_than: Array | np.ndarray | None = None
 
-    def __call__(self, t, q, v, multipliers, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree):
         q, v = self._reset(t, q, v, multipliers, params)
         if self.settle is None:
             return q, v, jnp.asarray(False)
@@ -52,7 +52,7 @@ class Reset(eqx.Module):
         at_rest = self.settle(t, q, v, params)
         return q, jtu.tree_map(lambda x, y: jnp.where(rests, x, y), at_rest, v), rests
 
-    def _reset(self, t, q, v, multipliers, params):
+    def _reset(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree):
         if self.function is None:
             return q, v
         given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
@@ -82,7 +82,7 @@ def check_phases(hybrid: Hybrid, start: State):
                 )
 
 
-def refuse_beside_switches(hybrid: Hybrid, start: State, ts, adjoint, event):
+def refuse_beside_switches(hybrid: Hybrid, start: State, ts: Array, adjoint: Any, event: Any):
     """Raise if an argument has no meaning for a motion in phases."""
     check_phases(hybrid, start)
     if runs_backward(ts):
@@ -116,7 +116,7 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
     return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
 
-def _phase(hybrid, i, start, events):
+def _phase(hybrid: Hybrid, i: int, start: State, events: Mapping[str, Crossing]):
     numbers, system = hybrid.leaving(i), hybrid.systems[i]
     names = {_name(hybrid, k): hybrid.switches[k] for k in numbers}
     crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
@@ -127,11 +127,11 @@ def _phase(hybrid, i, start, events):
     return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
 
 
-def _name(hybrid, k):
+def _name(hybrid: Hybrid, k: int):
     return f"{hybrid.switches[k].in_words()}, number {k}"
 
 
-def _reset(switch: Switch, hybrid, system) -> Reset:
+def _reset(switch: Switch, hybrid: Hybrid, system: System) -> Reset:
     function = switch.reset
     if isinstance(function, OfPhases):
         function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
@@ -147,7 +147,7 @@ def _reset(switch: Switch, hybrid, system) -> Reset:
     return Reset(function, takes, settle, switch.when, switch.slower_than)
 
 
-def _traced_switch(hybrid, k, start):
+def _traced_switch(hybrid: Hybrid, k: int, start: State):
     switch = hybrid.switches[k]
     system = hybrid.systems[hybrid.names.index(switch.phase)]
     multipliers = model_of(system, *start).zero_multipliers()
@@ -164,11 +164,11 @@ def _traced_switch(hybrid, k, start):
     return switch.with_functions(when, reset)
 
 
-def _is_anything(call, value):
+def _is_anything(call: Call, value):
     """The parts of a contact are checked where they are used."""
 
 
-def _check_reset(call, found, start):
+def _check_reset(call: Call, found, start: State):
     if not (_alike(found, start.v) or _alike(found, (start.q, start.v))):
         raise ValueError(
             f"{call} must return velocities like v, or a pair (q, v).\n"
@@ -205,7 +205,7 @@ class Nearest(eqx.Module):
     system: System
     takes: tuple[str, ...] = eqx.field(static=True, default=OF_STATE)
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         model = model_of(self.system, t, q, v, params)
         if not model.m:
             return v
@@ -213,6 +213,6 @@ class Nearest(eqx.Module):
         return jtu.tree_map(jnp.add, v, velocity_change(model, t, q, v, -off))
 
 
-def _alike(found, wanted):
+def _alike(found, wanted: Sequence):
     same = jtu.tree_structure(found) == jtu.tree_structure(wanted)
     return same and jtu.tree_map(jnp.shape, found) == jtu.tree_map(jnp.shape, wanted)

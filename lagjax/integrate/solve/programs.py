@@ -7,12 +7,14 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from lagjax.display.progress import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
@@ -38,6 +40,7 @@ from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, evalua
 from lagjax.numerics.methods.runge_kutta import Dopri8, in_our_form
 from lagjax.system.coordinates import State
 from lagjax.system.model import Model, model_of
+from lagjax.system.system import System
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
@@ -58,7 +61,7 @@ def trajectory_of(*problem) -> Trajectory:
     # Padded with the last time.
     many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
 
-    def of(settings):
+    def of(settings: Settings):
         return hashable_partition((*motion, many, guards, settings))
 
     arrays, static = of(settings)
@@ -130,7 +133,7 @@ def _trajectory_of(*problem):
     return _trajectory(*problem)
 
 
-def _trajectory(system, q0, v0, params, ts, guards, settings):
+def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, guards, settings: Settings):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
     start = State(ts[0], q0, v0, params)
     model = model_of(system, *start)
@@ -147,7 +150,7 @@ def _trajectory(system, q0, v0, params, ts, guards, settings):
     jumps = jumps if jumps is not None and jumps.count else None
     solve = solved_in_legs if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
 
-    def solve_arrays(x, fixed, adjoint, differentiated):
+    def solve_arrays(x, fixed, adjoint: Any, differentiated):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
         too_many = None
@@ -192,7 +195,7 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
     return found[0] if found and not why else None
 
 
-def _how(method, asked, settings, in_legs):
+def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
@@ -201,7 +204,7 @@ def _how(method, asked, settings, in_legs):
     return SolveInfo(name, method.error_order(terms), evaluations_a_step(method), chosen)
 
 
-def method_of(settings, model: Model):
+def method_of(settings: Settings, model: Model):
     """Return the method asked for, raising if it cannot do it; by default the fastest that can."""
     chosen = settings.method
     if chosen is None:

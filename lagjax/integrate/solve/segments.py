@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import Crossings, Guards
 from lagjax.integrate.solve.one_motion import resolution, solved
+from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, Switches
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
@@ -39,9 +40,10 @@ from lagjax.mechanics.equations import all_finite
 from lagjax.system import coordinates
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import model_of
+from lagjax.system.system import System
 
 
-def nothing(guards: Guards | None, names, q, v, multipliers) -> dict[str, Crossings]:
+def nothing(guards: Guards | None, names, q: PyTree, v: PyTree, multipliers: dict[str, Array]) -> dict[str, Crossings]:
     """The events of these names before any crossing; `multipliers`: those of all phases, NaN."""
     room = {kind.name: kind.most for kind in (() if guards is None else guards.kinds)}
 
@@ -64,7 +66,7 @@ def _joined(before: Crossings, new: Crossings) -> Crossings:
     place = jnp.arange(before.t.shape[0]) - jnp.sum(jnp.isfinite(before.t))
     multipliers = {name: new.multipliers.get(name, jnp.full_like(x, jnp.nan)) for name, x in before.multipliers.items()}
 
-    def join(x, y):
+    def join(x, y: PyTree):
         later = (place >= 0).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(later, y[jnp.maximum(place, 0)].astype(x.dtype), x)
 
@@ -128,7 +130,9 @@ class PhaseWay(NamedTuple):
     result: Any
 
 
-def solved_in_legs(hybrid: Hybrid, q0, v0, params, ts, phases, settings, adjoint):
+def solved_in_legs(
+    hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases, settings: Settings, adjoint: Any
+):
     """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
@@ -168,7 +172,7 @@ def if_any(next_leg: Callable, way: Any, _: None) -> tuple[Any, None]:
     return lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None
 
 
-def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
+def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phase, settings: Settings):
     dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
@@ -195,7 +199,17 @@ def _first_leg(hybrid, q0, v0, params, ts, phase, settings):
     )  # fmt: skip
 
 
-def _leg(hybrid, i, in_phase, way: PhaseWay, params, ts, phase: Phase, settings, adjoint) -> PhaseWay:
+def _leg(
+    hybrid: Hybrid,
+    i: int,
+    in_phase: Array,
+    way: PhaseWay,
+    params: PyTree,
+    ts: Array,
+    phase: Phase,
+    settings: Settings,
+    adjoint: Any,
+) -> PhaseWay:
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
     system = hybrid.systems[i]
     # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
@@ -250,7 +264,15 @@ class PhaseEnding(NamedTuple):
 
 
 def _ending(
-    phase: Phase, result, end: Snapshot, when, in_phase, way: PhaseWay, params, resolution, rtol
+    phase: Phase,
+    result,
+    end: Snapshot,
+    when: Array,
+    in_phase: Array,
+    way: PhaseWay,
+    params: PyTree,
+    resolution: Array,
+    rtol: Array,
 ) -> PhaseEnding:
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     assert phase.guards is not None
@@ -275,19 +297,19 @@ def _ending(
     return PhaseEnding(onward, first, end, result)
 
 
-def _is_below(end: Snapshot, params, guards: Guards, count: int, rtol):
+def _is_below(end: Snapshot, params: PyTree, guards: Guards, count: int, rtol: Array):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
     state = stop_gradient(tuple(end))
     g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count]), state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
-def reached(q):
+def reached(q: PyTree):
     """The rows of q that are known."""
     return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
 
 
-def _filled(rows: OutputRows, known, found, i) -> OutputRows:
+def _filled(rows: OutputRows, known: Array, found, i: int) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
 
     def put(all, new):
@@ -305,7 +327,7 @@ class After(NamedTuple):
     rests: Bool[Array, ""]
 
 
-def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
+def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay):
     """Return the state after the phase's first switch, the next phase, and the record with that switch."""
     onward, first, end, _ = ending
     states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
@@ -327,12 +349,12 @@ def _switched(system, ending: PhaseEnding, params, phase: Phase, way: PhaseWay):
     return after, to, record
 
 
-def sizes_of(q, v):
+def sizes_of(q: PyTree, v: PyTree):
     """The sizes of coordinates and velocities, (2, n)."""
     return jnp.abs(jnp.stack([stop_gradient(coordinates.flatten(y)[0]) for y in (q, v)]))
 
 
-def _one_of(first, values):
+def _one_of(first: Array, values):
     found = values[0]
     for i, x in enumerate(values[1:], 1):
         found = jnp.where(first == i, x, found)

@@ -7,7 +7,7 @@ Dopri8's is of order six) and satisfy the constraints, at the cost of one step p
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -47,7 +47,7 @@ class Field(eqx.Module):
     equations: Equations
     feedback: Float[Array, ""] | None = None
 
-    def __call__(self, t, y, args):
+    def __call__(self, t: Array, y: PyTree, args: PyTree):
         independent = args.independent if isinstance(args, StageConstraints) else None
         return y[1], kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))[0]
 
@@ -57,7 +57,7 @@ class FastField(eqx.Module):
 
     equations: Equations
 
-    def __call__(self, t, y, args):
+    def __call__(self, t: Array, y: PyTree, args: PyTree):
         return y[1], self.equations.fast(t, *y)[0]
 
 
@@ -120,26 +120,26 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         """The vector field by the written-out equations."""
         return diffrax.ODETerm(FastField(self.equations))
 
-    def _between(self, *, t0, t1, y0, y1=None, state=None):
+    def _between(self, *, t0: Array, t1: Array, y0: PyTree, y1: PyTree = None, state=None):
         if self.arriving:
             return Arrived(t0=t0, t1=t1, y0=y0, y1=y1)
         return SteppedTo(t0=t0, t1=t1, y0=y0, state=state, solver=self)
 
-    def order(self, terms):
+    def order(self, terms: diffrax.AbstractTerm):
         return self.solver.order(terms)
 
-    def strong_order(self, terms):
+    def strong_order(self, terms: diffrax.AbstractTerm):
         return self.solver.strong_order(terms)
 
-    def error_order(self, terms):
+    def error_order(self, terms: diffrax.AbstractTerm):
         return self.solver.error_order(terms)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree):
         if self.fast is not None:
             return self.fast.init(self.fast_terms, t0, t1, y0, args)
         return self.solver.init(self.terms, t0, t1, y0, self._stages(t0, y0))
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: diffrax.AbstractTerm, t0: Array, y0: PyTree, args: PyTree):
         # Only used to choose the first step, which has to be finite even where the motion is refused.
         if self.fast is not None:
             rate = self.fast_terms.vf(t0, y0, args)
@@ -147,7 +147,16 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
             rate = self.solver.func(self.terms, t0, y0, self._stages(t0, y0))
         return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Any,
+    ):
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.fast is None:
@@ -167,7 +176,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _fast_step(self, t0, t1, y0, solver_state, made_jump):
+    def _fast_step(self, t0: Array, t1: Array, y0: PyTree, solver_state: PyTree, made_jump: Any):
         fast, terms = self.fast, self.fast_terms
         assert fast is not None
         jumped = True if self.project else made_jump
@@ -185,7 +194,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         # A branch also in a batch, where all lanes take it or none.
         return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, solver_state, result), again)
 
-    def _robust_step(self, t0, t1, y0, solver_state, made_jump):
+    def _robust_step(self, t0: Array, t1: Array, y0: PyTree, solver_state: PyTree, made_jump: Any):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
         terms, stages = self.terms, self._stages(t0, y0)
@@ -199,7 +208,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, solver_state, result
 
-    def again(self, t0, t1, y0):
+    def again(self, t0: Array, t1: Array, y0: PyTree):
         """Repeat an accepted step from its start, fast if possible; return its end, and whether that is finite."""
         if self.fast is None:
             return self.again_robustly(t0, t1, y0), jnp.asarray(True)
@@ -209,20 +218,20 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         y1 = self.equations.projected(t1, *y1) if self.project else y1
         return y1, all_finite((y1, error))
 
-    def again_robustly(self, t0, t1, y0):
+    def again_robustly(self, t0: Array, t1: Array, y0: PyTree):
         """Repeat an accepted step with the robust solve; return its end."""
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
         return self._robust_step(t0, t1, y0, None, True)[0]
 
-    def rates(self, t, y):
+    def rates(self, t: Array, y: PyTree):
         """The accelerations, and the multipliers by name."""
         a, multipliers = self.equations.rates(t, *y)
         if self.feedback is not None:
             a, _ = self.equations.accelerations(t, *y, self.feedback)
         return a, multipliers
 
-    def acceptable(self, y0, y1, error):
+    def acceptable(self, y0: PyTree, y1: PyTree, error):
         """Whether an output's error is not far above the tolerance; the controller does not check steps to outputs.
 
         With fixed steps there is no tolerance; beyond a method's limit of stability the error is as large as the state.
@@ -232,13 +241,13 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         rtol, atol = (self.tolerances.rtol[0], self.tolerances.atol[0]) if self.controlled else (0.0, 0.0)
         share = OUTPUT_TOLERANCES * rtol if self.controlled else LOST
 
-        def largest(tree):
+        def largest(tree: PyTree):
             return jnp.max(jnp.abs(ravel_pytree(tree)[0]))
 
         of_parts = [largest(e) <= OUTPUT_TOLERANCES * atol + share * largest((a, b)) for a, b, e in zip(y0, y1, error)]
         return of_parts[0] & of_parts[1]
 
-    def _stages(self, t, y):
+    def _stages(self, t: Array, y: PyTree):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
         return StageConstraints(self.equations.independent(t, *y, threshold))
 
@@ -251,7 +260,7 @@ class Arrived(Interpolation):
     y0: PyTree
     y1: PyTree
 
-    def at(self, t):
+    def at(self, t: Array):
         return jtu.tree_map(lambda y0, y1: jnp.where(t <= self.t0, y0, y1), self.y0, self.y1)
 
 
@@ -264,7 +273,7 @@ class SteppedTo(Interpolation):
     state: PyTree
     solver: ProjectedSolver
 
-    def at(self, t):
+    def at(self, t: Array):
         s = self.solver
         # diffrax's program contains this three times, each compiled: the robust step alone compiles in a third of the
         # time of both, and costs little at run time, since most outputs are ends of steps.
@@ -276,7 +285,7 @@ class SteppedTo(Interpolation):
         return jtu.tree_map(lambda x: jnp.where(valid, x, jnp.nan), y)
 
 
-def forward_differentiable(method):
+def forward_differentiable(method: diffrax.AbstractSolver):
     """A method whose stage loop can be differentiated forward even inside a reverse-mode solve.
 
     An event time is an implicit function of the step, and its derivative needs ∂y/∂t forward. Such a loop also

@@ -8,12 +8,15 @@ Times at which a force jumps are ends of steps, too, and each step stays on its 
 few units of round-off away from a jump, so that the force is never evaluated at the jump itself.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.stepping.tolerances import PerCoordinateTolerance
 from lagjax.mechanics.equations import Equations
@@ -39,13 +42,33 @@ class StepToOutputs(diffrax.AbstractStepSizeController):
         """Wrap the inner controller likewise; `ts` stay, since time always runs forward here."""
         return StepToOutputs(self.controller.wrap(direction), self.ts, self.shares)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        dt0: Any,
+        args: PyTree,
+        func: Callable,
+        error_order: Any,
+    ):
         """Choose the first step."""
         proposed, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index, step = jnp.minimum(1, self.ts.size - 1), self.shares[0] * (proposed - t0)
         return self._toward(index, t0, step), (state, index, step)
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(
+        self,
+        t0: Array,
+        t1: Array,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: Any,
+        controller_state: PyTree,
+    ):
         """Decide whether to keep a step, and choose the next one."""
         state, index, before = controller_state
         # Output times may be closer together than the least step; that must not end the solve.
@@ -61,7 +84,7 @@ class StepToOutputs(diffrax.AbstractStepSizeController):
         index = jnp.where(keep & (t1 >= self.ts[index]), jnp.minimum(index + 1, self.ts.size - 1), index)
         return keep, next_t0, self._toward(index, next_t0, proposed), jumped, (state, index, proposed), result
 
-    def _toward(self, index, t, step):
+    def _toward(self, index, t: Array, step):
         left = self.ts[index] - t
         step = jnp.minimum(step, self.shares[1] * (self.ts[index] - self.ts[index - 1]))
         halfway = t + jnp.where(step < 0.5 * left, step, 0.5 * left)
@@ -80,7 +103,7 @@ def together(ts: Float[Array, " T"], jump_ts: Float[Array, " J"]) -> Float[Array
     return jnp.sort(jnp.where(repeated, ts[-1], times), stable=True)
 
 
-def between_jumps(t0, t1, jump_ts, made_jump):
+def between_jumps(t0: Array, t1: Array, jump_ts, made_jump: Any):
     """Return the ends of the step from t0 to t1, moved off any jump, and whether it starts at one."""
     margin = _round_off(jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
     starts, ends, room = jnp.any(t0 == jump_ts), jnp.any(t1 == jump_ts), t1 - t0 > 4 * margin
@@ -88,7 +111,7 @@ def between_jumps(t0, t1, jump_ts, made_jump):
     return jnp.where(starts & room, t0 + margin, t0), t1, starts | made_jump
 
 
-def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
+def apart_from_jumps(equations: Equations, ts: Array, jump_ts, q: PyTree, v: PyTree):
     """Return the outputs; one at the time of a jump must not move with the jump, although the end of its step does.
 
     `late` is zero, but its derivative is that of the difference of the two times.
@@ -105,5 +128,5 @@ def apart_from_jumps(equations: Equations, ts, jump_ts, q, v):
     return jax.tree.map(along, q, v), jax.tree.map(along, v, a)
 
 
-def _round_off(t):
+def _round_off(t: Array):
     return MARGIN * np.finfo(t.dtype).eps * t

@@ -13,15 +13,17 @@ which have the same unit for all coordinates. If everything is zero at the start
 acceleration there yields in the whole time, or, if that is zero too, the acceleration of the step.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.integrate.solve.settings import Settings
 from lagjax.jaxtools.trees import stop_gradient
 
 # The size of an angle counts up to this: a tolerance relative to a thousand turns would mean nothing.
@@ -64,7 +66,7 @@ class Scales(NamedTuple):
     unknown: Bool[Array, ""]
 
 
-def tolerances_at(start, ts, settings, sizes_so_far=None, a=None) -> Tolerances:
+def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=None) -> Tolerances:
     """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
@@ -79,12 +81,12 @@ def tolerances_at(start, ts, settings, sizes_so_far=None, a=None) -> Tolerances:
     return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 
 
-def span_of(ts):
+def span_of(ts: Array):
     """The time that a motion takes; positive even if the motion is refused."""
     return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
-def scales_of(mass, q, v, a, span) -> Scales:
+def scales_of(mass, q: PyTree, v: PyTree, a, span) -> Scales:
     """The scales of a motion, from its first state and the accelerations there, which need not be finite."""
     root_mass, sizes = (
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
@@ -168,14 +170,34 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         """Return this controller: time always runs forward."""
         return self
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(
+        self,
+        terms: diffrax.AbstractTerm,
+        t0: Array,
+        t1,
+        y0: PyTree,
+        dt0: Any,
+        args: PyTree,
+        func: Callable,
+        error_order: Any,
+    ):
         """The first step."""
         if self.scales is not None and dt0 is None:
             dt0 = FIRST * stop_gradient(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
         t1, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         return t1, (state, None if self.scales is None else self.scales.first)
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(
+        self,
+        t0: Array,
+        t1,
+        y0: PyTree,
+        y1_candidate: PyTree,
+        args: PyTree,
+        y_error: PyTree,
+        error_order: Any,
+        controller_state: PyTree,
+    ):
         """Whether to keep a step, and the next one."""
         state, largest = controller_state
         weighed, now = self._weighed(t1 - t0, y0, y1_candidate, y_error, largest)
@@ -187,7 +209,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _weighed(self, h, y0, y1, error, largest):
+    def _weighed(self, h: Array, y0: PyTree, y1: PyTree, error, largest):
         """The error in the controller's units, and the largest numbers including this step."""
         error, unravel = ravel_pytree(error)
         before, after, h = stop_gradient((_rows(*y0), _rows(*y1), h))
@@ -202,7 +224,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)
         return unravel(error * weights.ravel()), now
 
-    def _allowed_by_size(self, size, largest, rate):
+    def _allowed_by_size(self, size: int, largest, rate):
         scales = self.scales
         assert scales is not None
         others = shared(scales, largest)

@@ -235,11 +235,11 @@ def _continue_all(
     )
 
 
-def _of_length_zero(system, params, node: Snapshot, t):
+def _of_length_zero(system: System, params: PyTree, node: Snapshot, t):
     """Return the node itself, with its derivatives with respect to t, which equals its time."""
     h = t - node.t
 
-    def rate(dt, y):
+    def rate(dt, y: PyTree):
         return y[1], accelerations(system, node.t + dt, *y, params)[0]
 
     def moved(dt, slope):
@@ -280,7 +280,7 @@ def _check_can_be_continued(trajectory):
         )
 
 
-def _has_constraints(system):
+def _has_constraints(system: System):
     return any(phase.constraints for phase in system.phases)
 
 
@@ -297,7 +297,7 @@ def _check_ended(trajectory, t):
         )
 
 
-def _times(t, dtype):
+def _times(t, dtype: np.dtype):
     given, t = t, numpy_of(t).asarray(t)
     if not (jnp.issubdtype(t.dtype, jnp.floating) or jnp.issubdtype(t.dtype, jnp.integer)):
         raise TypeError(f"t must be a time or an array of times, not {given!r:.60}.\nFix: traj.at(0.5).")

@@ -15,9 +15,11 @@ and the Jacobi integral if nothing depends on time. `lj.symmetries` finds the ot
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.display.animation import Animation
 from lagjax.jaxtools.compiled import compiled
@@ -28,7 +30,7 @@ from lagjax.system import coordinates
 from lagjax.system.user_errors import Call, check_arguments
 
 
-def curves(tree):
+def curves(tree: PyTree):
     """Return one curve for each coordinate, by the user's names."""
     first = jax.tree.map(lambda x: np.asarray(x[0]), tree)
     columns = np.stack([np.ravel(x) for x in _rows(tree)])
@@ -41,7 +43,7 @@ def finite(*curves):
     return tuple(x[all_finite] for x in curves)
 
 
-def _rows(tree):
+def _rows(tree: PyTree):
     leaves = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)]
     return np.concatenate(leaves, axis=1)
 
@@ -113,11 +115,11 @@ def film_of_lanes(
     return at, {name: np.stack([points[name] for points in found]) for name in like}, kept
 
 
-def _check_positions(positions):
+def _check_positions(positions: Callable):
     check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
 
 
-def _frames(start, end, seconds, rate, trail):
+def _frames(start, end, seconds: float | None, rate: float, trail: float):
     """Return the times of the frames, and how many frames the trail keeps."""
     seconds = float(np.clip(abs(end - start), SHORTEST, LONGEST)) if seconds is None else seconds
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
@@ -129,14 +131,14 @@ def _frames(start, end, seconds, rate, trail):
     return np.linspace(start, end, count), int(min(trail * rate, count))
 
 
-def hermite(t, q, v, at):
+def hermite(t: np.ndarray, q: PyTree, v: PyTree, at):
     """Return q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
     if t[-1] < t[0]:
         t, q, v = jax.tree.map(lambda x: x[::-1], (t, q, v))
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     h = t[i + 1] - t[i]
 
-    def leaf(q, v):
+    def leaf(q: PyTree, v: PyTree):
         width, s = (x.reshape(-1, *(1,) * (q.ndim - 1)) for x in (h, (at - t[i]) / h))
         values = (1 + 2 * s) * (1 - s) ** 2 * q[i] + s**2 * (3 - 2 * s) * q[i + 1]
         return values + width * s * (1 - s) * ((1 - s) * v[i] - s * v[i + 1])
@@ -164,7 +166,7 @@ def _reached(traj, ended_by_event):
     return t, q, v
 
 
-def drawn(positions, t, q, params) -> dict[str, np.ndarray]:
+def drawn(positions: Callable, t: np.ndarray, q: PyTree, params: PyTree) -> dict[str, np.ndarray]:
     """Return the points that `positions` gives for each state: by name, (T, k, 2)."""
     frames = []
     for i, now in enumerate(t):
@@ -189,7 +191,7 @@ def drawn(positions, t, q, params) -> dict[str, np.ndarray]:
     return drawn
 
 
-def _points(name, value):
+def _points(name: str, value):
     """Return one point or several as (k, 2), or raise."""
     try:
         x = np.asarray(value, float)
@@ -205,11 +207,11 @@ def _points(name, value):
     return x.reshape(-1, 2)
 
 
-def _of(name):
+def _of(name: str):
     return f" for '{name}'" if name else ""
 
 
-def _check_dense(positions, t, q, v, params, points):
+def _check_dense(positions: Callable, t: np.ndarray, q: PyTree, v: PyTree, params: PyTree, points):
     """Raise if the outputs are too far apart to interpolate between them."""
     every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
     half_q, half_v = jax.tree.map(lambda x: x[every_other], (q, v))
@@ -229,7 +231,7 @@ def _check_dense(positions, t, q, v, params, points):
 PANEL, LONG = "change of charges\nat the outputs", 28
 
 
-def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
+def panels(trajectory, charges: Any) -> dict[str, dict[str, np.ndarray]]:
     """Return the curves of a trajectory, by panel: coordinates, velocities, multipliers, and charges if requested.
 
     `charges`: whether to draw the charges known to be conserved; or functions of (t, q, v, params), by name.
@@ -248,7 +250,7 @@ def panels(trajectory, charges) -> dict[str, dict[str, np.ndarray]]:
     return found
 
 
-def changes(trajectory, charges) -> dict[str, np.ndarray]:
+def changes(trajectory, charges: Any) -> dict[str, np.ndarray]:
     """Return the change of each charge since its first value, (T,), relative to its largest term at the outputs."""
     of_system = charges is True
     functions = known_charges(trajectory) if of_system else _by_name(charges)
@@ -289,7 +291,7 @@ def known_charges(trajectory) -> dict[str, NoetherCharge]:
     return {generator.name: NoetherCharge(model.system, generator) for generator in found}
 
 
-def _by_name(charges) -> dict[str, Callable]:
+def _by_name(charges: Any) -> dict[str, Callable]:
     if isinstance(charges, Mapping) or hasattr(charges, "keys"):
         found = {name: charges[name] for name in charges.keys()}
     elif callable(charges):
@@ -309,8 +311,8 @@ def _by_name(charges) -> dict[str, Callable]:
 
 
 @compiled
-def _along(functions, t, q, v, params):
-    def at(t, q, v):
+def _along(functions, t: np.ndarray, q: PyTree, v: PyTree, params: PyTree):
+    def at(t: np.ndarray, q: PyTree, v: PyTree):
         found = {}
         for name, charge in functions.items():
             value = charge(t, q, v, params)

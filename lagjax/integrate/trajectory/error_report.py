@@ -6,6 +6,7 @@ After many steps an error of up to ten thousand tolerances is expected, as long 
 `scaled_error` is the worst error in units of that limit.
 """
 
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -49,12 +50,12 @@ class Errors(NamedTuple):
     steps: Int[Array, ""]
 
 
-def columns(xp, tree, rows) -> Any:
+def columns(xp: ModuleType, tree: PyTree, rows) -> Any:
     """Return the leaves of a tree as the columns of one array."""
     return xp.concatenate([xp.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
-def sizes_of(xp, largest, is_angle, span, steps, outputs):
+def sizes_of(xp: ModuleType, largest, is_angle, span, steps, outputs):
     """Return the sizes of coordinates and velocities, (2, n), from their largest values at outputs, `largest` (2, n).
 
     Sparse outputs may all lie where a velocity, or a coordinate, is zero. A coordinate then counts as at least the
@@ -68,13 +69,13 @@ def sizes_of(xp, largest, is_angle, span, steps, outputs):
     return xp.stack([xp.maximum(q, v * step), xp.where(v > TURNING * between, v, between)])
 
 
-def of_a_step(size, tolerance):
+def of_a_step(size: int, tolerance):
     """Return a step's tolerances for coordinates and velocities of these sizes, (2, n); `atol` is (2,) or (2, n)."""
     rtol, atol = tolerance
     return (atol[:, None] if atol.ndim == 1 else atol) + rtol[:, None] * size
 
 
-def allowed(xp, size, span, tolerance):
+def allowed(xp: ModuleType, size: int, span, tolerance):
     """Return the allowed errors of coordinates and velocities of these sizes, (2, n); `tolerance` is (rtol, atol)."""
     tolerances = of_a_step(size, tolerance)
     largest = xp.max(size, axis=1, keepdims=True)
@@ -83,13 +84,13 @@ def allowed(xp, size, span, tolerance):
     return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
 
 
-def in_units_of(xp, error, limit):
+def in_units_of(xp: ModuleType, error, limit):
     """Return errors in units of the allowed ones; where a number is zero throughout, its size is the error itself."""
     known = limit > 0
     return xp.where(known, error / xp.where(known, limit, 1.0), xp.where(error > 0, 1 / DIGITS_LEFT, 0.0 * error))
 
 
-def scaled_error(xp, worst, largest, trajectory, ts, tolerance):
+def scaled_error(xp: ModuleType, worst, largest, trajectory, ts, tolerance):
     """Return the largest of the errors `worst` (2, n) in units of the allowed ones; the former value if all are NaN."""
     span, steps = abs(ts[-1] - ts[0]), xp.asarray(trajectory.stats["num_accepted_steps"])
 
@@ -260,12 +261,12 @@ def warning_of(trajectory) -> str:
     )
 
 
-def _left(error, size):
+def _left(error, size: int):
     digits = int(np.floor(-np.log10(error / size))) if 0 < error < size else 0
     return f"{digits or 'no'} digit{'' if digits == 1 else 's'} left"
 
 
-def _expected(size, limit):
+def _expected(size: int, limit):
     return "three correct digits allow" if limit >= 0.999 * DIGITS_LEFT * size else f"{EXPECTED:,.0f} tolerances"
 
 

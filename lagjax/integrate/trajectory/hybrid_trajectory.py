@@ -1,7 +1,8 @@
 """A motion in phases: a trajectory that knows the phase of each output, and its switches."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -119,7 +120,7 @@ class HybridTrajectory(Trajectory):
         worst = [_residual_in(model, i, self) for i, model in enumerate(self.model.phases) if model.m]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
-    def plot(self, charges=False):
+    def plot(self, charges: Any = False):
         """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
 
         Switches stand at their own times; else what happens between two outputs is not seen.
@@ -155,11 +156,11 @@ class HybridTrajectory(Trajectory):
         ]
 
 
-def _integral(model, t, q, v):
+def _integral(model: Model, t: Array, q: PyTree, v: PyTree):
     return jacobi_and_scale(model, t, q, v)[0]
 
 
-def _of_phases(function, trajectory):
+def _of_phases(function: Callable, trajectory):
     """Return `function(model, t, q, v)` at all outputs, each with the model of its own phase."""
     found = jnp.full_like(trajectory.t, jnp.nan)
     for i, model in enumerate(trajectory.model.phases):
@@ -168,12 +169,12 @@ def _of_phases(function, trajectory):
     return found
 
 
-def _residual_in(model: Model, i, trajectory):
+def _residual_in(model: Model, i: int, trajectory):
     return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v)
 
 
 @compiled
-def _worst(model, i, phase, t, q, v):
+def _worst(model: Model, i: int, phase: Array, t: Array, q: PyTree, v: PyTree):
     in_phase = phase == i
     # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
     at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))

@@ -1,7 +1,7 @@
 """Trajectories read from files, with the system that the user passes again, if it is the same."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -102,20 +102,20 @@ def check_shapes(found: dict[str, Any]) -> None:
     t, outputs = found["t"], found["t"].shape
     batch = outputs[:-1]
 
-    def check(name, leaves, lead, kinds="f", exactly=False):
+    def check(name: str, leaves: Sequence, lead, kinds="f", exactly=False):
         for x in leaves if isinstance(leaves, list) else jax.tree.leaves(leaves):
             shape = np.shape(x) if exactly else np.shape(x)[: len(lead)]
             if not isinstance(x, (jax.Array, np.ndarray, np.generic)) or shape != lead or x.dtype.kind not in kinds:
                 raise ValueError(f"{name} does not belong to times of shape {outputs}.")
 
-    def check_states(name, said, lead):
+    def check_states(name: str, said: dict[str, Any], lead):
         check(name, [said["t"]], lead, exactly=True)
         check(name, (said["q"], said["v"]), lead)
         check(name, list(said["multipliers"].values()), lead)
         if jax.tree.structure(said["q"]) != jax.tree.structure(said["v"]) or not jax.tree.leaves(said["q"]):
             raise ValueError(f"{name} has no coordinates, or velocities in another structure.")
 
-    def of_rows(said):
+    def of_rows(said: dict[str, Any]):
         # The crossings or switches of each lane: their number is free.
         return (*batch, said["t"].shape[len(batch)])
 
@@ -175,7 +175,7 @@ def check_is_system(system: Any) -> None:
         )
 
 
-def same_system(system, known: UnknownSystem, path) -> System | Hybrid:
+def same_system(system: System, known: UnknownSystem, path: str | os.PathLike) -> System | Hybrid:
     """The system, which the user passes again, traced at a state of the motion; raise if the file has another one."""
     check_is_system(system)
     if known.state is None:
@@ -213,7 +213,7 @@ def made(cls: type, fields: dict[str, Any]) -> Any:
     return without_init(cls, {name: fields[name] for name in fields_of(cls) or ()})
 
 
-def result_of_names(said) -> RESULTS:
+def result_of_names(said: dict[str, Any]) -> RESULTS:
     """The results whose names were written."""
     codes, now = said["codes"], np.asarray(said["codes"]).copy()
     names = {int(code): name for code, name in said["names"].items()}

@@ -39,7 +39,7 @@ def _absolute(atol):
     return _pair(atol) if np.ndim(atol) == 1 else "by size"
 
 
-def batch_lines(traj, lanes) -> list[str]:
+def batch_lines(traj, lanes: tuple[int, ...]) -> list[str]:
     """The printed lines of a batch; `lanes`: its shape."""
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(item(traj.result, v))}" for v, n in zip(values, counts)]

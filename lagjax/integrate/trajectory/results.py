@@ -1,5 +1,7 @@
 """The results of a motion or a fit, with their messages."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,17 +52,17 @@ RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
 ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
 
 
-def ended_well(result) -> Bool[Array, "..."]:
+def ended_well(result: Any) -> Bool[Array, "..."]:
     """Whether a motion was computed to its end or its event."""
     return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
 
 
-def is_among(result, others) -> bool:
+def is_among(result: Any, others: Any) -> bool:
     """Whether a result with a known value is one of `others`; without JAX, which takes ten times as long."""
     return int(result._value) in [int(other._value) for other in others]
 
 
-def message(result) -> str:
+def message(result: Any) -> str:
     """The message of a result."""
     if is_among(result, [RESULTS.event_occurred]):
         return "ended by its event"
@@ -68,11 +70,11 @@ def message(result) -> str:
     return RESULTS._index_to_message[int(result._value)]
 
 
-def in_words(code) -> str:
+def in_words(code: Any) -> str:
     """The message of a result, from its number."""
     return message(item(RESULTS.successful, code))
 
 
-def item(result, value):
+def item(result: Any, value: Any):
     """The result with the number `value`; `result`: any known one."""
     return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))

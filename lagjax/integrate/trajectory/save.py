@@ -70,7 +70,7 @@ def _fields(module) -> dict:
     return {name: getattr(module, name) for name in module.__dataclass_fields__}
 
 
-def result_in_names(result) -> dict[str, Any]:
+def result_in_names(result: Any) -> dict[str, Any]:
     """Results by their names, which are stable; their numbers may differ in another version."""
     codes = np.asarray(result._value)
     names = {int(x._value): name for name, x in RESULTS._name_to_item.items()}

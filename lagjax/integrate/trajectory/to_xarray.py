@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate.trajectory.results import in_words
 
@@ -146,7 +147,7 @@ def _taken(trajectory):
     return {"t", "times", "phase", "result", "end", "scaled_error", *COUNTS, *coordinates}
 
 
-def _leaves(tree):
+def _leaves(tree: PyTree):
     return jax.tree_util.tree_leaves_with_path(tree)
 
 

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -181,7 +181,7 @@ class Trajectory(eqx.Module):
         """
         return dataset(self, dims)
 
-    def plot(self, charges=False):
+    def plot(self, charges: Any = False):
         """Plot coordinates, velocities and multipliers against time; returns a matplotlib `Figure`.
 
         `charges=True` adds the relative change of the quantities known to be conserved; `lj.symmetries(...)`, or
@@ -254,7 +254,7 @@ class Trajectory(eqx.Module):
         found.append(("change of the Jacobi integral", drift + as_it_may))
         return found + of_events
 
-    def _check_alone(self, call):
+    def _check_alone(self, call: str):
         if self.t.ndim != 1:
             raise ValueError(
                 f"this trajectory is a batch of shape {self.t.shape[:-1]}: draw one lane of it.\n"
@@ -269,10 +269,10 @@ class Trajectory(eqx.Module):
 
 
 @jitted
-def jacobi_and_scale(model, t, q, v):
+def jacobi_and_scale(model: Model, t: Array, q: PyTree, v: PyTree):
     """The Jacobi integral at each of a batch of states, and the size of its terms `|v·p| + |L|`."""
 
-    def at(t, q, v):
+    def at(t: Array, q: PyTree, v: PyTree):
         x, u = model.vectors(q, v)
         value, p = jax.value_and_grad(model.lagrangian, argnums=2)(t, x, u)
         power = u @ p
@@ -281,7 +281,7 @@ def jacobi_and_scale(model, t, q, v):
     return jax.vmap(at)(t, q, v)
 
 
-def worst_drift(model, t, q, v):
+def worst_drift(model: Model, t: Array, q: PyTree, v: PyTree):
     """The largest change of the Jacobi integral from the first state on, relative to its largest terms."""
     h, scale = jacobi_and_scale(model, t, q, v)
     largest = jnp.nanmax(scale)
@@ -289,10 +289,10 @@ def worst_drift(model, t, q, v):
 
 
 @compiled
-def _worst_drift(model, t, q, v):
+def _worst_drift(model: Model, t: Array, q: PyTree, v: PyTree):
     return worst_drift(model, t, q, v)
 
 
 @compiled
-def _worst_residual(model, t, q, v):
+def _worst_residual(model: Model, t: Array, q: PyTree, v: PyTree):
     return worst_residual(model, t, q, v)
