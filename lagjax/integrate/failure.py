@@ -1,8 +1,7 @@
-"""The error message of a failed motion, in the user's terms.
+"""The error of a failed motion: in the user's terms, or from inside a program by the message of its result.
 
-Failures raised at run time, including those of an empty batch.
-
-Equinox raises the largest code of the lanes that fail, and an empty batch has no largest code.
+At run time equinox raises the largest code of the lanes that fail. An empty batch has no largest code, so the code
+passes through a primitive that gives an empty batch one of success.
 """
 
 from collections.abc import Sequence

@@ -281,16 +281,9 @@ def _along_axes(like, wanted: Sequence, push, cotangents: Sequence):
 
 
 def _tangent_transpose(
-    points: Sequence,
-    dx: Sequence,
-    wanted: Sequence,
-    cotangents: Sequence,
-    *,
-    outputs: Callable,
-    shapes: tuple,
-    size: int,
-    many: bool,
-):
+    points: Sequence, dx: Sequence, wanted: Sequence, cotangents: Sequence, *, outputs: Callable, shapes: tuple,
+    size: int, many: bool,
+):  # fmt: skip
     x, fixed = points[:size], points[size:]
     if _are_few(a for a, w in zip(x, wanted) if w):
         params = dict(outputs=outputs, shapes=shapes, size=size)

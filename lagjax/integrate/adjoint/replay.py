@@ -227,15 +227,9 @@ def _moved_batched(operands: Sequence, axes: Sequence, **params):
 
 
 def _moved_transpose(
-    points: Sequence,
-    moving: Sequence,
-    wanted: Sequence,
-    cotangents: Sequence,
-    *,
-    motion: BackwardMotion,
-    lanes,
+    points: Sequence, moving: Sequence, wanted: Sequence, cotangents: Sequence, *, motion: BackwardMotion, lanes,
     moved: Sequence,
-):
+):  # fmt: skip
     leaves, values = points[: motion.size], points[motion.size :]
     given = iter(cotangents)
     given = jtu.tree_unflatten(motion.found[0][0], [next(given) if _is_float(x) else None for x in values])

@@ -143,16 +143,9 @@ class EventController(diffrax.AbstractStepSizeController):
         return t1, (inner, Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part))
 
     def adapt_step_size(
-        self,
-        t0: Array,
-        t1,
-        y0: PyTree,
-        y1_candidate: PyTree,
-        args: PyTree,
-        y_error: PyTree,
-        error_order,
+        self, t0: Array, t1, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order,
         controller_state: PyTree,
-    ):
+    ):  # fmt: skip
         """Whether to keep a step, or a part of one, and the next."""
         inner, watched = controller_state
         parted, resolution = watched.part.parted, self.resolution

@@ -1,13 +1,12 @@
 """The jumps of a system, found in the programs of L, the force and the dissipation.
 
 In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all three are smooth. `found` traces them once,
-on shapes, and gives the smooth system, the guard of each mode, and the times of jumps that depend on t alone.
+on shapes, and gives the smooth system, the guard of each mode, and what is known of jumps that depend on t alone: a
+pulse, a relay, a square wave.
 
-The times at which a force jumps because of t alone: a pulse, a relay, a square wave.
-
-Where the program compares t itself with a number (`t < off`), that number is the time. All other comparisons of
-functions of t are evaluated on a fine grid, and each change is bisected; Newton's formula then gives the last digits,
-and the derivatives. The times become ends of steps.
+The times of these become ends of steps (`with_jumps_in_time`). Where the program compares t itself with a number
+(`t < off`), that number is the time. All other comparisons of functions of t are evaluated on a fine grid, and each
+change is bisected; Newton's formula then gives the last digits, and the derivatives.
 """
 
 from collections import Counter

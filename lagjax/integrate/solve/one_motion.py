@@ -217,17 +217,9 @@ def _loop(
         return Solution(reached, found.outputs, end, found.stats, found.result, None, found)
 
     def solve(
-        terms: diffrax.AbstractTerm,
-        solver,
-        t0: Array,
-        t1: Array,
-        dt0,
-        y0: PyTree,
-        args: PyTree,
-        saveat,
-        controller: Any,
-        event: Any,
-    ):
+        terms: diffrax.AbstractTerm, solver, t0: Array, t1: Array, dt0, y0: PyTree, args: PyTree, saveat,
+        controller: Any, event: Any,
+    ):  # fmt: skip
         solution = diffrax.diffeqsolve(
             terms, solver, t0, t1, dt0, y0, args, saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
             event=event, max_steps=settings.max_steps, throw=False, progress_meter=_progress_meter(settings.progress),

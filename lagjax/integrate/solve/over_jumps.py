@@ -164,16 +164,9 @@ class ModeWay(NamedTuple):
 
 
 def solved_over_jumps(
-    jumps: Jumps,
-    system: System,
-    q0: PyTree,
-    v0: PyTree,
-    params: PyTree,
-    ts: Array,
-    guards,
-    settings: Settings,
+    jumps: Jumps, system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, guards, settings: Settings,
     adjoint: Any,
-):
+):  # fmt: skip
     """Return the fields of the trajectory, like `one_motion.solved`."""
     model = model_of(system, ts[0], q0, v0, params)
     small = model.n + model.m <= 24
@@ -234,15 +227,9 @@ def _first(model: Model, q0: PyTree, v0: PyTree, ts: Array, guards, modes: Array
 
 
 def _leg(
-    piecewise: Piecewise,
-    guards: Guards,
-    recorded,
-    way: ModeWay,
-    params: PyTree,
-    ts: Array,
-    settings: Settings,
+    piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params: PyTree, ts: Array, settings: Settings,
     adjoint: Any,
-) -> ModeWay:
+) -> ModeWay:  # fmt: skip
     """Return the way after one more leg."""
     # Past outputs would cost a step each: those ahead come first, padded with the last.
     place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues

@@ -1,6 +1,10 @@
 """The compiled program behind `integrate`: the choice of the program and of the method, and the cache of programs.
 
 The program itself is in `one_motion.py`, and for motions in phases in `segments.py`.
+
+Of a kind of motion there are two programs, of which the second is compiled only if the first is not enough. One program
+with the robust way as a branch (`lax.cond`) gives the first answer of a pendulum on a rod after 3.0 times that of bare
+diffrax, two programs after 2.3 times (processor time, two cores).
 """
 
 from collections.abc import Callable

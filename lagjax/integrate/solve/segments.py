@@ -200,16 +200,9 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
 
 
 def _leg(
-    hybrid: Hybrid,
-    i: int,
-    in_phase: Array,
-    way: PhaseWay,
-    params: PyTree,
-    ts: Array,
-    phase: Phase,
-    settings: Settings,
+    hybrid: Hybrid, i: int, in_phase: Array, way: PhaseWay, params: PyTree, ts: Array, phase: Phase, settings: Settings,
     adjoint: Any,
-) -> PhaseWay:
+) -> PhaseWay:  # fmt: skip
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
     system = hybrid.systems[i]
     # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
@@ -264,16 +257,9 @@ class PhaseEnding(NamedTuple):
 
 
 def _ending(
-    phase: Phase,
-    result,
-    end: Snapshot,
-    when: Array,
-    in_phase: Array,
-    way: PhaseWay,
-    params: PyTree,
-    resolution: Array,
+    phase: Phase, result, end: Snapshot, when: Array, in_phase: Array, way: PhaseWay, params: PyTree, resolution: Array,
     rtol: Array,
-) -> PhaseEnding:
+) -> PhaseEnding:  # fmt: skip
     """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
     assert phase.guards is not None
     count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0

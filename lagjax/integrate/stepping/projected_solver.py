@@ -148,15 +148,9 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         return jtu.tree_map(lambda f: jnp.where(self.refused | ~jnp.isfinite(f), 0.0, f), rate)
 
     def step(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: Array,
-        t1: Array,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
+        self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, args: PyTree, solver_state: PyTree,
         made_jump: Any,
-    ):
+    ):  # fmt: skip
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.fast is None:

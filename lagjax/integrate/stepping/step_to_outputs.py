@@ -43,32 +43,18 @@ class StepToOutputs(diffrax.AbstractStepSizeController):
         return StepToOutputs(self.controller.wrap(direction), self.ts, self.shares)
 
     def init(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: Array,
-        t1: Array,
-        y0: PyTree,
-        dt0: Any,
-        args: PyTree,
-        func: Callable,
+        self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, dt0: Any, args: PyTree, func: Callable,
         error_order: Any,
-    ):
+    ):  # fmt: skip
         """Choose the first step."""
         proposed, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index, step = jnp.minimum(1, self.ts.size - 1), self.shares[0] * (proposed - t0)
         return self._toward(index, t0, step), (state, index, step)
 
     def adapt_step_size(
-        self,
-        t0: Array,
-        t1: Array,
-        y0: PyTree,
-        y1_candidate: PyTree,
-        args: PyTree,
-        y_error: PyTree,
-        error_order: Any,
+        self, t0: Array, t1: Array, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order: Any,
         controller_state: PyTree,
-    ):
+    ):  # fmt: skip
         """Decide whether to keep a step, and choose the next one."""
         state, index, before = controller_state
         # Output times may be closer together than the least step; that must not end the solve.

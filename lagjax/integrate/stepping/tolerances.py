@@ -171,16 +171,9 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         return self
 
     def init(
-        self,
-        terms: diffrax.AbstractTerm,
-        t0: Array,
-        t1,
-        y0: PyTree,
-        dt0: Any,
-        args: PyTree,
-        func: Callable,
+        self, terms: diffrax.AbstractTerm, t0: Array, t1, y0: PyTree, dt0: Any, args: PyTree, func: Callable,
         error_order: Any,
-    ):
+    ):  # fmt: skip
         """The first step."""
         if self.scales is not None and dt0 is None:
             dt0 = FIRST * stop_gradient(self.scales.time * self.rtol ** (1.0 / float(error_order or 1.0)))
@@ -188,16 +181,9 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         return t1, (state, None if self.scales is None else self.scales.first)
 
     def adapt_step_size(
-        self,
-        t0: Array,
-        t1,
-        y0: PyTree,
-        y1_candidate: PyTree,
-        args: PyTree,
-        y_error: PyTree,
-        error_order: Any,
+        self, t0: Array, t1, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order: Any,
         controller_state: PyTree,
-    ):
+    ):  # fmt: skip
         """Whether to keep a step, and the next one."""
         state, largest = controller_state
         weighed, now = self._weighed(t1 - t0, y0, y1_candidate, y_error, largest)

@@ -1,17 +1,15 @@
-"""A motion at the times of film frames: between outputs by cubic Hermite interpolation of q, with v as its slope.
+"""What is drawn of a trajectory: its curves and charges by the user's names, and its film.
+
+Some charges follow from the structure of a system: the momenta of coordinates that neither L nor a constraint contains,
+and the Jacobi integral if nothing depends on time. `lj.symmetries` finds the others.
+
+Between outputs a film interpolates q by a cubic (Hermite's), with v as its slope:
 
     q(t_i + s h) = (1 + 2 s)(1 - s)² q_i + s² (3 - 2 s) q_{i+1} + h s (1 - s)² v_i - h s² (1 - s) v_{i+1}
 
 The values at outputs are exact; between them the error falls with the fourth power of their distance, which is enough
 for pictures if outputs are dense. To check this, every other output is left out and interpolated from the rest: it is
 then wrong by about sixteen times the error.
-
-The curves that are drawn of a trajectory, by the user's names.
-
-The curves that are drawn of a trajectory and of its conserved charges.
-
-Some charges follow from the structure of a system: the momenta of coordinates that neither L nor a constraint contains,
-and the Jacobi integral if nothing depends on time. `lj.symmetries` finds the others.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,4 @@
-"""Describe the error and the cost of a motion in words: for `print` and for the warning.
-
-How the estimated errors of a motion are judged.
+"""The error and the cost of a motion: judged, and described in words for `print` and for the warning.
 
 After many steps an error of up to ten thousand tolerances is expected, as long as three digits are left.
 `scaled_error` is the worst error in units of that limit.
