@@ -203,10 +203,11 @@ def test_a_potential_is_learned():
     optimiser = optax.multi_transform(rates, {part: part for part in rates})
     end = trained(loss, unknowns, optimiser, 1000, 16)
     score = lambda params: float(quietly(learned, [one, other], params, free=[], **cut).rms()["q"])
-    assert score(loss.params(end)) < 0.004 < 0.02 < score(start)
-    q = jnp.linspace(-1.3, 1.3, 27)
-    off = jax.vmap(loss.params(end)["potential"])(q) - well(q)
-    assert float(jnp.max(jnp.abs(off - jnp.mean(off)))) < 0.1
+    assert score(loss.params(end)) < 0.004 < 0.01 < score(start)
+    q = jnp.concatenate([jnp.asarray(r.measured["q"]) for r in (one, other)])
+    true, found = (jax.vmap(jax.grad(V))(q) for V in (well, loss.params(end)["potential"]))
+    # 0.08; without training, by a network that is zero, 1.
+    assert float(jnp.linalg.norm(found - true)) < 0.15 * float(jnp.linalg.norm(true))
     short = [trained(loss, unknowns, optimiser, 20, 16, seed) for seed in (0, 0, 1)]
     assert eqx.tree_equal(*short[:2]) and not eqx.tree_equal(*short[1:])
 
