@@ -150,7 +150,12 @@ def test_sweeps(stored, tmp_path):
         found = WAYS[way](swept)
         assert repr(found) == repr(swept) and found.ok.all()
         lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
-        same(lane(found), lane(swept))
+        if stored and way == "pickle":
+            # A store is reopened: it does not have the functions of the system.
+            one, other = (jax.tree.leaves(lane(x).q) for x in (found, swept))
+            np.testing.assert_array_equal(one, other)
+        else:
+            same(lane(found), lane(swept))
     if stored:
         with pytest.raises(ValueError, match="the values in a store belong to the run"):
             found.resweep(where=True)
