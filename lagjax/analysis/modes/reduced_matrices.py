@@ -128,10 +128,10 @@ def parts_of(kind: LinearisationKind, model: Model, s: State) -> LinearParts:
 
     if m:
 
-        def constraint_force(x: Array, u: Array):
+        def force_of_constraints(x: Array, u: Array) -> Array:
             return jax.grad(lambda u: stacked @ constraints.velocity_residual(model, t, x, u))(u)
 
-        by_position, by_velocity = jax.jacfwd(constraint_force, argnums=(0, 1))(x, u)
+        by_position, by_velocity = jax.jacfwd(force_of_constraints, argnums=(0, 1))(x, u)
         velocity, position = velocity - by_velocity.astype(x.dtype), position - by_position.astype(x.dtype)
     if friction is not None:
 
