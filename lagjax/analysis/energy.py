@@ -33,7 +33,7 @@ from lagjax.mechanics.structure import sees_time
 from lagjax.numerics import quadrature
 from lagjax.system import constraints, coordinates
 from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
@@ -115,7 +115,7 @@ class Motion:
         works, error = self._integrated(allowed) if len(self.t) > 1 and self.sources else (powers, 0.0)
         return {name: self._work(name, powers[name], works[name]) for name in self.sources}, error
 
-    def _powers(self, phase, t, q, v, multipliers):
+    def _powers(self, phase, t, q: PyTree, v: PyTree, multipliers: PyTree):
         """The powers by source, (rows, n)."""
         powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
         for i in np.unique(phase):
@@ -242,7 +242,7 @@ class Motion:
         names = () if self.switches is None else [self.switches.names[i] for i in self.entered]
         return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
 
-    def _work(self, name, power, work):
+    def _work(self, name: str, power, work):
         total = np.sum(work, axis=1)
         if name == TIME:
             return Work(power[:, 0], total, total)
@@ -259,10 +259,10 @@ class Energies(NamedTuple):
 
 
 @compiled
-def _energies(model, t, q, v):
+def _energies(model: Model, t, q: PyTree, v: PyTree):
     """The `Energies` at each of a batch of states."""
 
-    def at(t, q, v):
+    def at(t, q: PyTree, v: PyTree):
         x, u = model.vectors(q, v)
         energy = jax.value_and_grad(model.lagrangian, argnums=2)
         (value, p), (rest, p_at_rest) = energy(t, x, u), energy(t, x, jnp.zeros_like(u))
@@ -272,7 +272,7 @@ def _energies(model, t, q, v):
     return jax.vmap(at)(t, q, v)
 
 
-def _sources(model) -> dict[str, int]:
+def _sources(model: Model) -> dict[str, int]:
     """The sources of work in a system, and the size of each power."""
     system, n = model.system, model.n
     found = {FORCE: n} if system.force is not None else {}
@@ -282,11 +282,11 @@ def _sources(model) -> dict[str, int]:
 
 
 @compiled
-def _powers(model, t, q, v, multipliers):
+def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree):
     """The power of each source at each of a batch of states, (rows, n)."""
     system, timed = model.system, sees_time(model.system.lagrangian, model)
 
-    def at(t, q, v, multipliers):
+    def at(t, q: PyTree, v: PyTree, multipliers: PyTree):
         (x, u), stacked, powers = model.vectors(q, v), model.stacked(multipliers), {}
         if system.force is not None:
             powers[FORCE] = model.force(t, x, u, stacked) * u

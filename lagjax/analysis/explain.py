@@ -5,6 +5,7 @@ from typing import NamedTuple, overload
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.display import plots as plot
 from lagjax.display.printable import by_line
@@ -23,7 +24,7 @@ from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
 from lagjax.system.coordinates import State
 from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 
@@ -136,16 +137,16 @@ class Explanation:
 
 
 @overload
-def explain(system: System, t, q, v, params=None) -> Explanation:
+def explain(system: System, t, q: PyTree, v: PyTree, params: PyTree = None) -> Explanation:
     """Explain one system."""
 
 
 @overload
-def explain(system: Hybrid, t, q, v, params=None) -> HybridExplanation:
+def explain(system: Hybrid, t, q: PyTree, v: PyTree, params: PyTree = None) -> HybridExplanation:
     """Explain a motion in phases."""
 
 
-def explain(system, t, q, v, params=None):
+def explain(system, t, q: PyTree, v: PyTree, params: PyTree = None):
     """Say what a system amounts to at a state: freedoms, dependent constraints, mass matrix, problems.
 
     >>> import lagjax as lj
@@ -241,7 +242,7 @@ class _Place(NamedTuple):
     unreachable: str | None = None
 
 
-def _on_the_constraints(model, s) -> _Place:
+def _on_the_constraints(model: Model, s) -> _Place:
     """Find the nearest state on the constraints; off them, dependent constraints contradict each other that much."""
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
     equations = equations_of(model)
@@ -256,7 +257,7 @@ def _on_the_constraints(model, s) -> _Place:
     return _Place(s._replace(q=q, v=v), f"by {off} as given; everything here describes the nearest state on them")
 
 
-def _in_turns(model, s):
+def _in_turns(model: Model, s):
     """List angles of more than a turn, which may have been meant in degrees."""
     x = np.asarray(model.vector(s.q))
     large = np.abs(x) > 2 * np.pi

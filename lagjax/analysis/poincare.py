@@ -287,7 +287,7 @@ class Velocity(eqx.Module):
 
     coordinate: str | None = eqx.field(static=True)
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
         names, wanted = coordinates.names(v), self.coordinate
         if wanted is None and len(names) > 1:
             raise ValueError(
@@ -315,7 +315,7 @@ def _recorded(section):
     return section
 
 
-def _among(names, name, asked, fix="'{}'"):
+def _among(names, name: str, asked, fix="'{}'"):
     """Return `name`; raise unless it is one of `names`. `asked`: for what it was given."""
     if name not in names:
         near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
@@ -323,7 +323,7 @@ def _among(names, name, asked, fix="'{}'"):
     return name
 
 
-def _entry(name):
+def _entry(name: str):
     """The part of a coordinate's name after "q" or "v": `theta` -> `.theta`, `q[0]` -> `[0]`."""
     return name[1:] if name == "q" or name.startswith("q[") else f".{name}"
 

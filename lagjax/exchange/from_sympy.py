@@ -402,7 +402,7 @@ class _Names:
                 "Fix: L.subs(f(x), ...) with its formula; .doit(); .rewrite(...) in other functions."
             ) from None
 
-    def constraint(self, name, given) -> Holonomic | Nonholonomic:
+    def constraint(self, name: str, given) -> Holonomic | Nonholonomic:
         """The constraint; holonomic if it contains no velocity."""
         several = isinstance(given, list | tuple) or getattr(given, "is_Matrix", False)
         given, role = [*given] if several else given, f"constraint '{name}'"

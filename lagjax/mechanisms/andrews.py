@@ -27,7 +27,7 @@ Mazzia & Magherini, *Test Set for Initial Value Problem Solvers* (Bari), problem
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system.constraints import Holonomic
@@ -58,7 +58,7 @@ PARAMS = {
 }  # fmt: skip
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Seven kinetic energies, one spring, one motor."""
     p, (m1, m2, m3, m4, m5, m6, m7), (I1, I2, I3, I4, I5, I6, I7) = params, params["m"], params["I"]
     tail, pull = p["e"] - p["ea"], p["zf"] - p["fa"]
@@ -82,7 +82,7 @@ def lagrangian(t, q, v, params):
     return kinetic - 0.5 * p["c0"] * stretch**2 + p["mom"] * q.beta
 
 
-def loops(t, q, params):
+def loops(t, q: PyTree, params: PyTree):
     """The point P from crank and rod, minus P from each of the three other chains: six equations."""
     p = params
     rod, link4, link6 = q.beta + q.theta, q.phi + q.delta, q.omega + q.epsilon

@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
 from lagjax.system.constraints import Holonomic
@@ -52,7 +52,7 @@ PARAMS = {"m": 1.0, "l": 1.0, "a": 0.1, "g": 9.81}
 HANDS = (1, -1, 1, -1, 1)
 
 
-def closed(q, params):
+def closed(q: PyTree, params: PyTree):
     """All six points and axes, (6, 3) each, including those of the ground."""
     length = params["l"]
     first, last = jnp.zeros((1, 3), q.points.dtype), jnp.stack([0.0 * length, 0.0 * length, length])[None]
@@ -61,7 +61,7 @@ def closed(q, params):
     return points, axes
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Five rods of square section."""
     m, a = params["m"], params["a"]
     ground = np.zeros((1, 3))
@@ -73,26 +73,26 @@ def lagrangian(t, q, v, params):
     return along + across - 0.5 * m * params["g"] * jnp.sum(points[:-1, 1] + points[1:, 1])
 
 
-def lengths(t, q, params):
+def lengths(t, q: PyTree, params: PyTree):
     """|r_i|² = l², (5,)."""
     points, _ = closed(q, params)
     return squared_distance(points[:-1], points[1:]) - params["l"] ** 2
 
 
-def hinges_across_rods(t, q, params):
+def hinges_across_rods(t, q: PyTree, params: PyTree):
     """r_i·u_i = 0 and r_i·u_(i+1) = 0, (10,)."""
     points, axes = closed(q, params)
     rods = points[1:] - points[:-1]
     return jnp.concatenate([jnp.sum(rods * axes[:-1], axis=1), jnp.sum(rods * axes[1:], axis=1)])
 
 
-def hinges_crossed(t, q, params):
+def hinges_crossed(t, q: PyTree, params: PyTree):
     """u_i·u_(i+1) = 0 on each rod, (5,)."""
     _, axes = closed(q, params)
     return jnp.sum(axes[:-1] * axes[1:], axis=1)
 
 
-def unit_axes(t, q, params):
+def unit_axes(t, q: PyTree, params: PyTree):
     """|u_i|² = 1, (4,)."""
     return jnp.sum(q.axes**2, axis=1) - 1.0
 
@@ -102,7 +102,7 @@ def closure(theta, phi):
     return jnp.cos(theta) + jnp.cos(phi) + jnp.cos(theta) * jnp.cos(phi)
 
 
-def chain(theta, phi, params):
+def chain(theta, phi, params: PyTree):
     """The chain built from its hinge angles, starting at the ground: a `Chain`, and the resulting P_5 and u_5."""
     rod, axis, point = jnp.array([0.0, 0.0, -1.0]), jnp.array([0.0, 1.0, 0.0]), jnp.zeros(3)
     points, axes = [], []

@@ -19,7 +19,7 @@ Source: Mazzia & Magherini, *Test Set for Initial Value Problem Solvers* (Bari),
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system.constraints import Holonomic
@@ -38,13 +38,13 @@ class Ends(NamedTuple):
 PARAMS = {"M": 10.0, "epsilon": 0.01, "L": 1.0, "L0": 0.5, "r": 0.1, "omega": 10.0, "g": 1.0}
 
 
-def road(t, params):
+def road(t, params: PyTree):
     """The right wheel, (x_b, y_b) at time t."""
     height = params["r"] * jnp.sin(params["omega"] * t)
     return jnp.sqrt(params["L"] ** 2 - height**2), height
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Two half-masses on two springs; the right one stands on the moving wheel."""
     xb, yb = road(t, params)
     k = 0.5 * params["M"] * params["epsilon"] ** 2
@@ -55,13 +55,13 @@ def lagrangian(t, q, v, params):
     return kinetic - springs - k * params["g"] * (q.yl + q.yr)
 
 
-def upright(t, q, params):
+def upright(t, q: PyTree, params: PyTree):
     """The left spring stands at right angles to the road."""
     xb, yb = road(t, params)
     return q.xl * xb + q.yl * yb
 
 
-def axle(t, q, params):
+def axle(t, q: PyTree, params: PyTree):
     """The axle's squared length."""
     return (q.xl - q.xr) ** 2 + (q.yl - q.yr) ** 2 - params["L"] ** 2
 

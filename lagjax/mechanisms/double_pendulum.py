@@ -15,7 +15,7 @@ Source: Landau & Lifshitz, *Mechanics*, §5, Problem 1.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, squared_distance
 from lagjax.system.constraints import Holonomic
@@ -32,18 +32,18 @@ class Masses(NamedTuple):
 PARAMS = {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81}
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Two masses in a vertical plane."""
     m1, m2, g = params["m1"], params["m2"], params["g"]
     return 0.5 * m1 * v.r1 @ v.r1 + 0.5 * m2 * v.r2 @ v.r2 - g * (m1 * q.r1[1] + m2 * q.r2[1])
 
 
-def inner(t, q, params):
+def inner(t, q: PyTree, params: PyTree):
     """The first mass is l1 from the pivot."""
     return q.r1 @ q.r1 - params["l1"] ** 2
 
 
-def outer(t, q, params):
+def outer(t, q: PyTree, params: PyTree):
     """The second mass is l2 from the first."""
     return squared_distance(q.r1, q.r2) - params["l2"] ** 2
 

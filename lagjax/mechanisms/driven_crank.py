@@ -18,6 +18,7 @@ Source: Simeon, *Math. Modelling of Systems* 2 (1996) 1, with a rigid rod: Ω = 
 """
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanisms import slider_crank
 from lagjax.mechanisms.mechanism import Mechanism
@@ -28,7 +29,7 @@ from lagjax.system.system import System
 PARAMS = slider_crank.PARAMS | {"rate": 150.0}
 
 
-def motor(t, q, params):
+def motor(t, q: PyTree, params: PyTree):
     """The crank's angle is Ω t."""
     return q.crank.angle - params["rate"] * t
 
@@ -36,7 +37,7 @@ def motor(t, q, params):
 system = System(slider_crank.lagrangian, {**slider_crank.system.constraints, "motor": Holonomic(motor)})
 
 
-def exact(t, params):
+def exact(t, params: PyTree):
     """(q, v, torque) at times t, in NumPy."""
     m1, m2, m3, J2, l1, l2, g = (params[k] for k in ("m1", "m2", "m3", "J2", "l1", "l2", "g"))
     rate, angle = params["rate"], params["rate"] * np.asarray(t, float)

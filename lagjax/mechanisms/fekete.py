@@ -19,6 +19,7 @@ Value Problem Solvers* (Bari), problem "fekete" (there with a second set of mult
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system.constraints import Holonomic
@@ -27,18 +28,18 @@ from lagjax.system.system import System
 PARAMS = {"alpha": 0.5}
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Unit masses at p (N, 3), with a logarithmic potential between each pair."""
     first, second = np.triu_indices(q.shape[0], 1)
     return 0.5 * jnp.sum(v**2) + 0.5 * jnp.sum(jnp.log(jnp.sum((q[first] - q[second]) ** 2, axis=1)))
 
 
-def friction(t, q, v, params):
+def friction(t, q: PyTree, v: PyTree, params: PyTree):
     """Rayleigh's function of a viscous medium."""
     return 0.5 * params["alpha"] * jnp.sum(v**2)
 
 
-def sphere(t, q, params):
+def sphere(t, q: PyTree, params: PyTree):
     """Every particle stays on the unit sphere, (N,)."""
     return jnp.sum(q**2, axis=1) - 1.0
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
 from lagjax.system.constraints import Holonomic
@@ -58,14 +58,14 @@ def frame(psi):
     return jnp.stack([cos, sin, zero]), jnp.stack([-sin, cos, zero])
 
 
-def rods(q, params):
+def rods(q: PyTree, params: PyTree):
     """(start, end) of both rods, (2, 3) each."""
     e, _ = frame(q.psi)
     top = jnp.stack([0.0 * params["h"], 0.0 * params["h"], params["h"]])
     return jnp.stack([top + params["b"] * e, top - params["b"] * e]), jnp.stack([q.C, q.D])
 
 
-def springs(q, params):
+def springs(q: PyTree, params: PyTree):
     """The lengths of both springs, (2,)."""
     start, end = rods(q, params)
     e, _ = frame(q.psi)
@@ -74,7 +74,7 @@ def springs(q, params):
     return jnp.sqrt(squared_distance(feet, 0.5 * (start + end)))
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Shaft and slider, two rods, two balls, gravity along -z, two springs."""
     p = params
     (start, end), (start_velocity, end_velocity) = jax.jvp(lambda q: rods(q, params), (q,), (v,))
@@ -85,18 +85,18 @@ def lagrangian(t, q, v, params):
     return kinetic - p["g"] * heights - 0.5 * p["k"] * jnp.sum((springs(q, p) - p["l0"]) ** 2)
 
 
-def dissipation(t, q, v, params):
+def dissipation(t, q: PyTree, v: PyTree, params: PyTree):
     """Rayleigh's function of the two dampers."""
     _, rates = jax.jvp(lambda q: springs(q, params), (q,), (v,))
     return 0.5 * params["c"] * jnp.sum(rates**2)
 
 
-def rod_lengths(t, q, params):
+def rod_lengths(t, q: PyTree, params: PyTree):
     """Each ball is one length from its hinge, (2,)."""
     return squared_distance(*rods(q, params)) - params["l"] ** 2
 
 
-def rod_planes(t, q, params):
+def rod_planes(t, q: PyTree, params: PyTree):
     """Each ball is in the plane that turns with the shaft, (2,)."""
     _, n = frame(q.psi)
     return jnp.stack([q.C @ n, q.D @ n])

@@ -23,6 +23,7 @@ computational benchmark problems, A02 (N = 40 there; N = 2, as here, in OpenSim'
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
 from lagjax.system.constraints import Holonomic
@@ -31,7 +32,7 @@ from lagjax.system.system import System
 PARAMS = {"m": 1.0, "l": 1.0, "g": 9.81}
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Legs and couplers, from the velocities of the heads B (N + 1, 2)."""
     m = params["m"]
     legs = jnp.sum(rod_kinetic_energy(m, jnp.zeros_like(v), v))
@@ -40,13 +41,13 @@ def lagrangian(t, q, v, params):
     return legs + couplers - m * params["g"] * height
 
 
-def legs(t, q, params):
+def legs(t, q: PyTree, params: PyTree):
     """Each head is one length from its foot, (N + 1,)."""
     feet = params["l"] * np.stack([np.arange(q.shape[0]), np.zeros(q.shape[0])], axis=1)
     return squared_distance(feet, q) - params["l"] ** 2
 
 
-def couplers(t, q, params):
+def couplers(t, q: PyTree, params: PyTree):
     """Neighbouring heads are one length apart, (N,)."""
     return squared_distance(q[:-1], q[1:]) - params["l"] ** 2
 

@@ -28,7 +28,7 @@ Source: Simeon, *Math. Modelling of Systems* 2 (1996) 1; Bari test set, problem 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system.constraints import Holonomic
@@ -56,7 +56,7 @@ PARAMS = {
 }  # fmt: skip
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """Two plane rigid bodies and a block, with gravity along -y."""
     m1, m2, m3, g = params["m1"], params["m2"], params["m3"], params["g"]
     crank = 0.5 * m1 * (v.crank.x**2 + v.crank.y**2) + 0.5 * params["J1"] * v.crank.angle**2
@@ -74,17 +74,17 @@ def centre(body):
     return jnp.stack([body.x, body.y])
 
 
-def crank_at_origin(t, q, params):
+def crank_at_origin(t, q: PyTree, params: PyTree):
     """The crank's near end stays at O."""
     return centre(q.crank) - half(q.crank, params["l1"])
 
 
-def rod_on_crank(t, q, params):
+def rod_on_crank(t, q: PyTree, params: PyTree):
     """The rod's near end is the crank's far end."""
     return centre(q.rod) - half(q.rod, params["l2"]) - centre(q.crank) - half(q.crank, params["l1"])
 
 
-def block_on_rod(t, q, params):
+def block_on_rod(t, q: PyTree, params: PyTree):
     """The block is the rod's far end, and stays on y = 0."""
     return centre(q.rod) + half(q.rod, params["l2"]) - jnp.stack([q.block, jnp.zeros_like(q.block)])
 

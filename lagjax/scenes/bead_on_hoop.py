@@ -30,6 +30,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.analysis.continuation.equilibria import continue_equilibria
 from lagjax.display import plots
@@ -62,25 +63,25 @@ MISPRINTS = (
 )
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ m a² (ψ̇² + ω² sin²ψ) + m g a cos ψ, with q = ψ."""
     m, a, g, omega = params["m"], params["a"], params["g"], params["omega"]
     return 0.5 * m * a**2 * (v**2 + omega**2 * jnp.sin(q) ** 2) + m * g * a * jnp.cos(q)
 
 
-def driven_lagrangian(t, q, v, params):
+def driven_lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ m a² (ψ̇² + sin²ψ θ̇²) + m g a cos ψ."""
     m, a, g = params["m"], params["a"], params["g"]
     rate_squared = v["psi"] ** 2 + (jnp.sin(q["psi"]) * v["theta"]) ** 2
     return 0.5 * m * a**2 * rate_squared + m * g * a * jnp.cos(q["psi"])
 
 
-def motor(t, q, params):
+def motor(t, q: PyTree, params: PyTree):
     """θ - ω t: the hoop's angle is prescribed. Its multiplier is the motor's torque."""
     return q["theta"] - params["omega"] * t
 
 
-def friction(t, q, v, params):
+def friction(t, q: PyTree, v: PyTree, params: PyTree):
     """R = ½ b a² ψ̇²: the hoop drags the bead with the force -b a ψ̇ along it."""
     return 0.5 * params["b"] * (params["a"] * v) ** 2
 
@@ -103,7 +104,7 @@ class Balance(NamedTuple):
     sideways: jax.Array
 
 
-def balance(params, psi, psi_rate) -> Balance:
+def balance(params: PyTree, psi, psi_rate) -> Balance:
     """E, h, L_z, p_ψ, τ, ω τ, and the hoop's force on the bead outward and along increasing θ.
 
     The sideways force 2 m a ω cos ψ ψ̇ is τ / (a sin ψ), finite at the bottom, where τ vanishes.
@@ -119,7 +120,7 @@ def balance(params, psi, psi_rate) -> Balance:
     )  # fmt: skip
 
 
-def natural_rate(params):
+def natural_rate(params: PyTree):
     """ω0 = √(g/a): the pendulum's frequency, and the critical speed."""
     return jnp.sqrt(params["g"] / params["a"])
 
@@ -129,7 +130,7 @@ def tilt(excess):
     return 2 * jnp.arcsin(jnp.sqrt(0.5 * excess / (1 + excess)))
 
 
-def equilibrium_angle(params):
+def equilibrium_angle(params: PyTree):
     """α = arccos(ω0²/ω²) above ω0, and 0, the bottom, up to it; π/2 for g = 0."""
     g, reached = params["g"], params["a"] * params["omega"] ** 2
     above = reached > g
@@ -137,7 +138,7 @@ def equilibrium_angle(params):
     return jnp.where(above, 2 * jnp.arcsin(jnp.sqrt(half_versine)), 0.0)
 
 
-def short_of_horizontal(params):
+def short_of_horizontal(params: PyTree):
     """π/2 - α = arcsin(ω0²/ω²): how far below the horizontal the bead rests, accurate for fast rotation."""
     return jnp.arcsin(params["g"] / (params["a"] * params["omega"] ** 2))
 
@@ -150,7 +151,7 @@ class BeadSquares(NamedTuple):
     top: jax.Array
 
 
-def small_motion(params) -> BeadSquares:
+def small_motion(params: PyTree) -> BeadSquares:
     """ω0² - ω² at the bottom, ω² sin²α = ω² - ω0⁴/ω² about α (meaningful above ω0), -(ω0² + ω²) at the top."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
     return BeadSquares(below - squared, (squared - below) * (squared + below) / squared, -(below + squared))
@@ -166,13 +167,13 @@ def growth(square):
     return frequency(-square)
 
 
-def lag_behind_hoop(params):
+def lag_behind_hoop(params: PyTree):
     """ω - Ω about α, computed as ω0⁴ / (ω² (ω + Ω)): at ω = 1e6 round-off would swamp the difference itself."""
     below, omega = params["g"] / params["a"], params["omega"]
     return below**2 / (omega**2 * (omega + frequency(small_motion(params).alpha)))
 
 
-def libration(params, psi):
+def libration(params: PyTree, psi):
     """Does a bead released from rest at ψ go through the bottom? Also rate, m and m1 of its elliptic functions."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
     s2, c2 = jnp.sin(0.5 * psi) ** 2, jnp.cos(0.5 * psi) ** 2
@@ -185,14 +186,14 @@ def libration(params, psi):
 
 
 @jax.jit
-def exact_period(params, psi):
+def exact_period(params: PyTree, psi):
     """The period after a release from rest at ψ: through the bottom and back, or about α and back."""
     through_bottom, rate, _, m1 = libration(params, psi)
     return jnp.where(through_bottom, 2.0, 1.0) * jnp.pi / (rate * agm(1.0, jnp.sqrt(m1)))
 
 
 @jax.jit
-def exact_motion(params, psi, t):
+def exact_motion(params: PyTree, psi, t):
     """ψ(t) and ψ̇(t) after a release from rest at ψ (not exactly at an equilibrium or on the homoclinic orbit)."""
     through_bottom, rate, m, m1 = libration(params, psi)
     sn, cn, dn = jacobi_elliptic(rate * t, m, m1)
@@ -202,14 +203,14 @@ def exact_motion(params, psi, t):
     return 2 * jnp.arctan(x), 2 * x_rate / (1 + x**2)
 
 
-def other_turning_point(params, psi):
+def other_turning_point(params: PyTree, psi):
     """Where a bead released at ψ comes to rest beyond α; from ψ = 0 the outer end of the homoclinic orbit."""
     below, squared = params["g"] / params["a"], params["omega"] ** 2
     s2 = jnp.sin(0.5 * psi) ** 2
     return 2 * jnp.arctan2(jnp.sqrt((squared - below) - squared * s2), jnp.sqrt(below + squared * s2))
 
 
-def homoclinic_motion(params, t):
+def homoclinic_motion(params: PyTree, t):
     """ψ and ψ̇ on the orbit that leaves the bottom and returns to it, at its outer end at t = 0; ω > ω0."""
     growing = growth(small_motion(params).bottom)
     x = growing / natural_rate(params) / jnp.cosh(growing * t)
@@ -217,7 +218,7 @@ def homoclinic_motion(params, t):
 
 
 @jax.jit
-def rotation_period(params, H):
+def rotation_period(params: PyTree, H):
     """The time of one turn over the top, H = 2 h / (m a²) > 2 ω0².
 
     T = 2π / (√A agm(p, q)) with the roots p², q² of A y² - B y + C never formed: one step of the mean gives
@@ -233,7 +234,7 @@ def rotation_period(params, H):
 HALF_PERIOD = diffrax.Event(lambda t, y, params, **kwargs: y[1], direction=False)
 
 
-def swing(params, psi, longest, tolerance=1e-10):
+def swing(params: PyTree, psi, longest, tolerance=1e-10):
     """Release the bead at rest at ψ and stop where it comes to rest again, half a period later.
 
     It starts on the side (+ψ or -ψ) from which it moves towards larger angles, and moves for `longest` at most.
@@ -244,7 +245,7 @@ def swing(params, psi, longest, tolerance=1e-10):
     return integrate(system, start, jnp.zeros_like(start), params, **how)
 
 
-def settled(params, psi, time, tolerance=1e-9):
+def settled(params: PyTree, psi, time, tolerance=1e-9):
     """Where a bead with friction (params["b"]), released at rest at ψ, ends up."""
     ts = jnp.stack([jnp.zeros_like(time), time])
     return integrate(damped_system, psi, jnp.zeros_like(psi), params, ts=ts, rtol=tolerance, atol=tolerance).end.q
@@ -259,7 +260,7 @@ def pitchfork(speeds, starts, **settings):
     return sweep(settles, {"omega": speeds, "psi": starts}, paired=True, progress=False, **settings)
 
 
-def driven_start(params, psi):
+def driven_start(params: PyTree, psi):
     """The state of `driven_system` at rest on the hoop."""
     return {"psi": psi, "theta": 0.0}, {"psi": 0.0, "theta": params["omega"]}
 
@@ -318,7 +319,7 @@ def cases():
     return [*rows, _pitchfork_case(), _critical_case()]
 
 
-def _period_case(name, params, psi, tolerance, allowed):
+def _period_case(name: str, params: PyTree, psi, tolerance, allowed):
     exact = exact_period(params, psi)
     motion = swing(params, psi, 0.75 * exact, tolerance)
     happened = f"period {float(exact):.6g} s by an event, {int(motion.stats['num_steps'])} steps at {tolerance:g}"

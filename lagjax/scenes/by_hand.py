@@ -9,23 +9,24 @@ logarithms and square roots cancel, and by Gauss's theorem a field is a surface 
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.scenes import potentials
 
 
-def geodesic(t, q, v, params):
+def geodesic(t, q: PyTree, v: PyTree, params: PyTree):
     """ψ'' = sin ψ cos ψ + 2 ψ'² cot ψ."""
     s, c = jnp.sin(q), jnp.cos(q)
     return c * (s + 2 * v**2 / s), {}
 
 
-def on_sphere(t, q, v, params):
+def on_sphere(t, q: PyTree, v: PyTree, params: PyTree):
     """r̈ = 2 λ r with λ = -½ v²/r²."""
     rate = -jnp.sum(v**2) / jnp.sum(q**2)
     return rate * q, {"sphere": 0.5 * rate}
 
 
-def rolling(t, q, v, params):
+def rolling(t, q: PyTree, v: PyTree, params: PyTree):
     """r̈ = 0, with the rolling constraint eliminated: (r² + β l²) θ̈ = -r (g cos θ + 2 ṙ θ̇)."""
     m, l, beta, g = params["m"], params["R"] + params["a"], params["beta"], params["g"]
     r = q["r"]
@@ -35,12 +36,12 @@ def rolling(t, q, v, params):
     return a, {"contact": normal, "rolling": -(beta * m * l) * theta}
 
 
-def bead(t, q, v, params):
+def bead(t, q: PyTree, v: PyTree, params: PyTree):
     """ψ̈ = sin ψ (ω² cos ψ - g/a), Eq. (13)."""
     return jnp.sin(q) * (params["omega"] ** 2 * jnp.cos(q) - params["g"] / params["a"]), {}
 
 
-def driven_bead(t, q, v, params):
+def driven_bead(t, q: PyTree, v: PyTree, params: PyTree):
     """θ̈ = 0, and the motor's torque is the rate of change of m a² sin²ψ θ̇."""
     s, c = jnp.sin(q["psi"]), jnp.cos(q["psi"])
     psi = s * (v["theta"] ** 2 * c - params["g"] / params["a"])
@@ -48,7 +49,7 @@ def driven_bead(t, q, v, params):
     return {"psi": psi, "theta": jnp.zeros_like(psi)}, {"motor": torque}
 
 
-def rails_in_the_lab(t, q, v, params):
+def rails_in_the_lab(t, q: PyTree, v: PyTree, params: PyTree):
     """Two rotating springs."""
     K, k = params["K"] / params["m"], params["k"] / params["m"]
     c, s = jnp.cos(params["omega"] * t), jnp.sin(params["omega"] * t)
@@ -56,7 +57,7 @@ def rails_in_the_lab(t, q, v, params):
     return {"x": across * s - along * c, "y": -along * s - across * c}, {}
 
 
-def rails_rotating(t, q, v, params):
+def rails_rotating(t, q: PyTree, v: PyTree, params: PyTree):
     """Eq. (15) without its misprints."""
     m, omega = params["m"], params["omega"]
     K, k = params["K"] / m, params["k"] / m
@@ -66,13 +67,13 @@ def rails_rotating(t, q, v, params):
     }, {}
 
 
-def field_of_plane(q, params):
+def field_of_plane(q: PyTree, params: PyTree):
     """-2π G σ towards the plane."""
     z = -2 * jnp.pi * params["G"] * params["sigma"] * jnp.sign(q["z"])
     return jnp.zeros_like(z), jnp.zeros_like(z), z
 
 
-def field_of_half_plane(q, params):
+def field_of_half_plane(q: PyTree, params: PyTree):
     """-G σ (ln(y² + z²), 2 atan2(|z|, -y)): the rest of the derivative cancels."""
     strength = -params["G"] * params["sigma"]
     y, z = q["y"], q["z"]
@@ -80,14 +81,14 @@ def field_of_half_plane(q, params):
     return jnp.zeros_like(y), strength * jnp.log(y**2 + z**2), turned
 
 
-def field_of_cylinder(q, params):
+def field_of_cylinder(q: PyTree, params: PyTree):
     """-2π G ρ s inside, times a²/s² outside."""
     a2, s2 = params["a"] ** 2, q["x"] ** 2 + q["y"] ** 2
     strength = -2 * jnp.pi * params["G"] * params["rho"] * jnp.where(s2 < a2, 1.0, a2 / s2)
     return strength * q["x"], strength * q["y"], jnp.zeros_like(s2)
 
 
-def field_of_finite_cylinder(q, params):
+def field_of_finite_cylinder(q: PyTree, params: PyTree):
     """-G ρ ∮ n dS / |r' - r|: the z component from the lids, the others from the side. Inaccurate far away."""
     a, b, x, y, z = params["a"], params["b"], q["x"], q["y"], q["z"]
     angles, weights = potentials.clustered_nodes(96, 1e-4)
@@ -105,7 +106,7 @@ def field_of_finite_cylinder(q, params):
     return strength * jnp.sum(side * c), strength * jnp.sum(side * s), strength * (lids[0] - lids[1])
 
 
-def field_of_elliptic_cylinder(q, params):
+def field_of_elliptic_cylinder(q: PyTree, params: PyTree):
     """-4π G ρ a b (x/A, y/B) / (A + B): the potential is stationary in the confocal coordinate."""
     a, b, x, y = params["a"], params["b"], q["x"], q["y"]
     p = 0.5 * (x**2 + y**2 - a**2 - b**2)
@@ -116,7 +117,7 @@ def field_of_elliptic_cylinder(q, params):
     return strength * x / A, strength * y / B, jnp.zeros_like(x)
 
 
-def field_of_dumbbell(q, params):
+def field_of_dumbbell(q: PyTree, params: PyTree):
     """Two balls (points outside, springs inside) and a rod, whose Φ depends on the sum of distances from its ends."""
     x, y, z, c, half = q["x"], q["y"], q["z"], params["c"], 0.5 * params["length"]
     s2, radius = x**2 + y**2, params["radius"]
@@ -134,7 +135,7 @@ def field_of_dumbbell(q, params):
     return across * x, across * y, -params["G"] * along
 
 
-def field_of_helix(q, params):
+def field_of_helix(q: PyTree, params: PyTree):
     """The derivative of the sum over turns with respect to A², times the derivative of A² by the coordinates."""
     a, h, x, y = params["a"], params["h"], q["x"], q["y"]
     angles, weights = potentials.clustered_nodes(256, 0.1)

@@ -33,6 +33,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.analysis.modes.normal_modes import normal_modes
 from lagjax.display import plots
@@ -69,7 +70,7 @@ MISPRINTS = (
 )
 
 
-def lab_lagrangian(t, q, v, params):
+def lab_lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L in x, y: depends on time explicitly, because the springs turn."""
     m, K, k, R0 = params["m"], params["K"], params["k"], params["R0"]
     c, s = jnp.cos(params["omega"] * t), jnp.sin(params["omega"] * t)
@@ -77,7 +78,7 @@ def lab_lagrangian(t, q, v, params):
     return 0.5 * m * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * K * stretch**2 - 0.5 * k * across**2
 
 
-def rotating_lagrangian(t, q, v, params):
+def rotating_lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L in R, r: independent of time, but with terms linear in the velocities."""
     m, K, k, R0, omega = params["m"], params["K"], params["k"], params["R0"], params["omega"]
     speed_squared = (v["R"] - omega * q["r"]) ** 2 + (v["r"] + omega * q["R"]) ** 2
@@ -88,7 +89,7 @@ lab_system = System(lab_lagrangian)
 rotating_system = System(rotating_lagrangian)
 
 
-def to_lab(params, t, q, v):
+def to_lab(params: PyTree, t, q: PyTree, v: PyTree):
     """(x, y) and their rates from (R, r) and their rates."""
     omega = params["omega"]
     c, s = jnp.cos(omega * t), jnp.sin(omega * t)
@@ -99,7 +100,7 @@ def to_lab(params, t, q, v):
     )
 
 
-def to_rotating(params, t, q, v):
+def to_rotating(params: PyTree, t, q: PyTree, v: PyTree):
     """(R, r) and their rates from (x, y) and their rates."""
     omega = params["omega"]
     c, s = jnp.cos(omega * t), jnp.sin(omega * t)
@@ -117,7 +118,7 @@ class RailBalance(NamedTuple):
     power: jax.Array
 
 
-def balance(params, q, v) -> RailBalance:
+def balance(params: PyTree, q: PyTree, v: PyTree) -> RailBalance:
     """E, h' = E - ω L_z, L_z, τ = r (K (R - R0) - k R) and dE/dt = ω τ, from the rotating coordinates.
 
     h' is computed independently of E and L_z, as ½m(Ṙ² + ṙ²) + V - ½mω²(R² + r²).
@@ -135,7 +136,7 @@ def balance(params, q, v) -> RailBalance:
     )
 
 
-def equilibrium_length(params):
+def equilibrium_length(params: PyTree):
     """R_eq = R0 / (1 - m ω²/K), infinite at ω² = K/m; on the other side of the axis above it."""
     return params["K"] * params["R0"] / (params["K"] - params["m"] * params["omega"] ** 2)
 
@@ -147,14 +148,14 @@ class RailSquares(NamedTuple):
     slow: jax.Array
 
 
-def mode_squares(params) -> RailSquares:
+def mode_squares(params: PyTree) -> RailSquares:
     """Ω² of both modes: the slow one as c / Ω_fast², so that it does not cancel near a critical speed."""
     half_sum, root, product = _characteristic(params)
     fast = half_sum + 0.5 * root
     return RailSquares(fast=fast, slow=product / fast)
 
 
-def _characteristic(params):
+def _characteristic(params: PyTree):
     """Half the sum, the difference and the product of the squared frequencies."""
     kappa, Kappa = params["k"] / params["m"], params["K"] / params["m"]
     squared = params["omega"] ** 2
@@ -162,18 +163,18 @@ def _characteristic(params):
     return 0.5 * (kappa + Kappa) + squared, root, (kappa - squared) * (Kappa - squared)
 
 
-def is_stable(params):
+def is_stable(params: PyTree):
     """(1 - m ω²/K) (1 - m ω²/k) > 0: below both critical speeds, or above both (gyroscopically)."""
     squared = params["m"] * params["omega"] ** 2
     return (1 - squared / params["K"]) * (1 - squared / params["k"]) > 0
 
 
-def critical_speeds(params):
+def critical_speeds(params: PyTree):
     """√(k/m) and √(K/m), the lower first."""
     return tuple(jnp.sqrt(f(params["k"], params["K"]) / params["m"]) for f in (jnp.minimum, jnp.maximum))
 
 
-def strongest_growth(params):
+def strongest_growth(params: PyTree):
     """The largest growth rate between the critical speeds, |Κ - κ| / √(8 (Κ + κ)), and its ω."""
     kappa, Kappa = params["k"] / params["m"], params["K"] / params["m"]
     total = Kappa + kappa
@@ -181,7 +182,7 @@ def strongest_growth(params):
     return jnp.abs(Kappa - kappa) / jnp.sqrt(8 * total), speed
 
 
-def escape(params):
+def escape(params: PyTree):
     """At ω = √(K/m), where no equilibrium exists: R ~ ½ a t² and r ~ b t; returns (a, b)."""
     kappa, Kappa = params["k"] / params["m"], params["K"] / params["m"]
     push = Kappa * params["R0"] / (kappa + 3 * Kappa)
@@ -189,7 +190,7 @@ def escape(params):
 
 
 @jax.jit
-def exact_motion(params, q0, v0, t):
+def exact_motion(params: PyTree, q0: PyTree, v0: PyTree, t):
     """q(t) and v(t) in R, r: the matrix exponential by Sylvester's formula; t of any shape."""
     m, omega = params["m"], params["omega"]
     Kappa, kappa = params["K"] / m, params["k"] / m
@@ -247,7 +248,7 @@ def runs():
     ]
 
 
-def _run(name, system, params, ts, acceleration=None):
+def _run(name: str, system, params: PyTree, ts, acceleration=None):
     """A run whose error is measured in the coordinates of its system; the invariant is h' in both frames."""
     in_lab = system is lab_system
     start = to_lab(params, 0.0, Q0, V0) if in_lab else (Q0, V0)
@@ -286,7 +287,7 @@ def cases():
     return [*rows, _map_case(), _modes_case()]
 
 
-def _case(name, change, time):
+def _case(name: str, change, time):
     params = PARAMS | change
     trajectory = integrate(rotating_system, Q0, V0, params, ts=jnp.array([0.0, time]), rtol=1e-12, atol=1e-12)
     end, exact = trajectory.end, exact_motion(params, Q0, V0, time)
@@ -296,7 +297,7 @@ def _case(name, change, time):
     return Case(name, f"{happened}, {int(trajectory.stats['num_steps'])} steps", error, 1e-9)
 
 
-def _verdict(params):
+def _verdict(params: PyTree):
     slow = float(mode_squares(params).slow)
     # The rounding of √(K/m) alone would give a frequency of 1e-8 instead of zero.
     if abs(slow) < 1e-9:

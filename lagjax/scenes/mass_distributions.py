@@ -26,6 +26,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.analysis.symmetry.search import symmetries
 from lagjax.display import plots
@@ -77,7 +78,7 @@ MISPRINTS = (
 def lagrangian_of(potential):
     """L = ½ |v|² - Φ(q) of a particle of unit mass."""
 
-    def lagrangian(t, q, v, params):
+    def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
         return 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2) - potential(q, params)
 
     lagrangian.__name__ = potential.__name__
@@ -106,7 +107,7 @@ ORBITS = {
 INSIDE = vector(0.75, 0.25, 0.0), vector(0.5, -0.5, 0.25)
 
 
-def charges(name, q, v, params) -> dict[str, jax.Array]:
+def charges(name: str, q: PyTree, v: PyTree, params: PyTree) -> dict[str, jax.Array]:
     """Momenta and energy at one state; for the helix also the screw's charge, correct and as printed."""
     p_z, L_z = v["z"], q["x"] * v["y"] - q["y"] * v["x"]
     energy = 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2) + POTENTIALS[name](q, params)
@@ -117,29 +118,29 @@ def charges(name, q, v, params) -> dict[str, jax.Array]:
     return found
 
 
-def bounce_period(params, speed):
+def bounce_period(params: PyTree, speed):
     """The time between two upward passages of the plane with this speed."""
     return 4 * speed / (2 * jnp.pi * params["G"] * params["sigma"])
 
 
-def inside_frequency(params):
+def inside_frequency(params: PyTree):
     """√(2πGρ): the frequency of every motion perpendicular to the axis inside the circular cylinder."""
     return jnp.sqrt(2 * jnp.pi * params["G"] * params["rho"])
 
 
-def circular_speed(params):
+def circular_speed(params: PyTree):
     """a √(2πGρ): the speed of a circular orbit around the circular cylinder, at every radius s >= a."""
     return params["a"] * inside_frequency(params)
 
 
-def ellipse_frequencies(params):
+def ellipse_frequencies(params: PyTree):
     """The frequencies along x and y inside the elliptic cylinder; their squares add up to 4πGρ."""
     a, b = params["a"], params["b"]
     density = 4 * jnp.pi * params["G"] * params["rho"] / (a + b)
     return jnp.sqrt(density * b), jnp.sqrt(density * a)
 
 
-def exact_inside_ellipse(params, q0, v0, t):
+def exact_inside_ellipse(params: PyTree, q0: PyTree, v0: PyTree, t):
     """q(t) and v(t) inside the elliptic cylinder: an oscillation along x, one along y, free flight along z."""
     q, v = {"z": q0["z"] + v0["z"] * t}, {"z": v0["z"] + 0 * t}
     for k, frequency in zip("xy", ellipse_frequencies(params)):
@@ -149,12 +150,12 @@ def exact_inside_ellipse(params, q0, v0, t):
     return q, v
 
 
-def ellipse_energies(params, q, v):
+def ellipse_energies(params: PyTree, q: PyTree, v: PyTree):
     """E_x and E_y, separately conserved inside the elliptic cylinder."""
     return tuple(0.5 * (v[k] ** 2 + (w * q[k]) ** 2) for k, w in zip("xy", ellipse_frequencies(params)))
 
 
-def euler_integral(params, q, v):
+def euler_integral(params: PyTree, q: PyTree, v: PyTree):
     """(r1 x v)·(r2 x v) + 2 c G (M2 cos θ2 - M1 cos θ1), conserved outside the balls if the rod has no mass."""
     c = params["c"]
     r1 = jnp.stack([q["x"], q["y"], q["z"] - c], axis=-1)
@@ -220,7 +221,7 @@ def _two_balls_run():
     return Run("two balls", SYSTEMS["dumbbell"], params, q0, v0, ts, error, words, by_hand=acceleration)
 
 
-def charges_along(name, trajectory):
+def charges_along(name: str, trajectory):
     """`charges` at every output of a trajectory."""
     return jax.jit(jax.vmap(lambda q, v, params: charges(name, q, v, params), in_axes=(0, 0, None)))(
         trajectory.q, trajectory.v, trajectory.params
@@ -241,7 +242,7 @@ def cases():
     ]
 
 
-def fall_onto_plane(params, speed, tolerance=1e-10):
+def fall_onto_plane(params: PyTree, speed, tolerance=1e-10):
     """Fall from the highest point until an event finds the plane, reached with this speed: a quarter of a bounce."""
     height = speed**2 / (4 * np.pi * params["G"] * params["sigma"])
     start = vector(0.0, 0.0, height), vector(0.25, 0.5, 0.0)
@@ -329,7 +330,7 @@ def _helix_cases():
     return [wire, sheet, straight]
 
 
-def helix_orbit(params):
+def helix_orbit(params: PyTree):
     """The generic orbit around the helix, 201 outputs."""
     q0, v0, _ = ORBITS["helix"]
     ts = np.linspace(0.0, 12.0, 201)
@@ -350,7 +351,7 @@ def _symmetries_case():
     return Case("a-g: symmetries", happened, float(len(lines) - sum(lines.values())), 0.5)
 
 
-def found_conserved(name) -> list[str]:
+def found_conserved(name: str) -> list[str]:
     """What `symmetries` finds, with the names of `CONSERVED`; boosts along free directions are left out."""
     q, v, _ = ORBITS[name]
     words = {"Jacobi integral": "E", f"h p_z + 2π L_z with h = {PARAMS['helix']['h']:g}": "h p_z + 2 pi L_z"}

@@ -43,6 +43,7 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 # Enough for 1 - m down to 1e-150: the mean converges quadratically once the ratio is of order one.
 AGM_STEPS = 12
@@ -80,12 +81,12 @@ DIRECT_TURNS = 8
 FAR = 100.0
 
 
-def plane(q, params):
+def plane(q: PyTree, params: PyTree):
     """(a) The plane z = 0. On it, where the force jumps, its gradient is the mean: zero."""
     return 2 * jnp.pi * params["G"] * params["sigma"] * _absolute(q["z"])
 
 
-def half_plane(q, params):
+def half_plane(q: PyTree, params: PyTree):
     """(b) The half plane z = 0, y > 0 without its uniform infinite pull; the field is singular at y = z = 0."""
     y, z = q["y"], _absolute(q["z"])
     # 2 |z| atan2(|z|, -y) is π|z| + 2z atan(y/z) without the division: smooth through z = 0 where y < 0.
@@ -93,7 +94,7 @@ def half_plane(q, params):
     return params["G"] * params["sigma"] * bracket
 
 
-def strip(q, params):
+def strip(q: PyTree, params: PyTree):
     """The strip z = 0, 0 < y < W, relative to line sources with the potential ln 1 = 0 at unit distance."""
     z = _absolute(q["z"])
 
@@ -103,7 +104,7 @@ def strip(q, params):
     return params["G"] * params["sigma"] * (primitive(params["width"] - q["y"]) - primitive(-q["y"]))
 
 
-def cylinder(q, params):
+def cylinder(q: PyTree, params: PyTree):
     """(c) The infinite circular cylinder; Φ = 0 on its surface."""
     a = params["a"]
     s2 = q["x"] ** 2 + q["y"] ** 2
@@ -112,7 +113,7 @@ def cylinder(q, params):
     return jnp.pi * params["G"] * params["rho"] * jnp.where(inside, s2 - a**2, outer)
 
 
-def finite_cylinder(q, params, nodes=96, nearest=1e-4):
+def finite_cylinder(q: PyTree, params: PyTree, nodes=96, nearest=1e-4):
     """(d) The circular cylinder |z| < b. On the side itself its field has an error of `nearest`/10."""
     a, b = params["a"], params["b"]
     r2 = q["x"] ** 2 + q["y"] ** 2 + q["z"] ** 2
@@ -123,7 +124,7 @@ def finite_cylinder(q, params, nodes=96, nearest=1e-4):
     return params["G"] * params["rho"] * jnp.where(far, _finite_cylinder_far(far_q, a, b), near)
 
 
-def elliptic_cylinder(q, params):
+def elliptic_cylinder(q: PyTree, params: PyTree):
     """(e) The infinite elliptic cylinder with semi-axes a along x, b along y; Φ = 0 on the axis."""
     a, b, x2, y2 = params["a"], params["b"], q["x"] ** 2, q["y"] ** 2
     # λ² + p λ + r = 0, with r < 0 outside; for p > 0 the other form of the root avoids cancellation.
@@ -140,7 +141,7 @@ def elliptic_cylinder(q, params):
     return 2 * jnp.pi * params["G"] * params["rho"] * a * b * bracket
 
 
-def dumbbell(q, params):
+def dumbbell(q: PyTree, params: PyTree):
     """(f) Balls of one radius, M1 at z = c and M2 at z = -c, joined by a thin rod; singular on the rod."""
     s2, z, length = q["x"] ** 2 + q["y"] ** 2, q["z"], params["length"]
     balls = _ball(s2 + (z - params["c"]) ** 2, params["M1"], params["radius"])
@@ -151,7 +152,7 @@ def dumbbell(q, params):
     return params["G"] * (balls + rod)
 
 
-def helix(q, params, nodes=256, nearest=0.1):
+def helix(q: PyTree, params: PyTree, nodes=256, nearest=0.1):
     """(g) The infinite wire x + i y = a exp(2πi z/h), right-handed for h > 0; Φ = 0 on the axis.
 
     By default the error of the field is 1e-12 at distances from the wire above a/10 if h >= a, above a/4 if h = a/2.
@@ -169,7 +170,7 @@ def helix(q, params, nodes=256, nearest=0.1):
 
 
 @partial(jax.jit, static_argnums=0)
-def gradient(potential, q, params):
+def gradient(potential, q: PyTree, params: PyTree):
     """∇Φ, like q."""
     return jax.grad(potential)(q, params)
 
@@ -197,7 +198,7 @@ def _absolute(x):
     return x * jnp.sign(x)
 
 
-def _finite_cylinder_near(q, a, b, angles, weights):
+def _finite_cylinder_near(q: PyTree, a, b, angles, weights):
     x, y, z = q["x"], q["y"], q["z"]
     # The position of the nodes does not change the integral, so they turn with the particle without a derivative.
     azimuth = jax.lax.stop_gradient(jnp.arctan2(y, x))
@@ -219,7 +220,7 @@ def _finite_cylinder_near(q, a, b, angles, weights):
     return -0.5 * (lid_and_side(b - z) + lid_and_side(b + z))
 
 
-def _finite_cylinder_far(q, a, b):
+def _finite_cylinder_far(q: PyTree, a, b):
     """-V/r Σ <r'^l P_l> P_l(cos θ)/r^l with the volume V = 2π a² b."""
     r2 = q["x"] ** 2 + q["y"] ** 2 + q["z"] ** 2
     c2 = q["z"] ** 2 / r2

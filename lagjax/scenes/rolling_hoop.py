@@ -34,6 +34,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from scipy import special
 
 from lagjax.display import plots
@@ -67,7 +68,7 @@ MISPRINTS = (
 )
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ m (ṙ² + r² θ̇²) + ½ β m a² φ̇² - m g r sin θ."""
     m, a, g = params["m"], params["a"], params["g"]
     centre = 0.5 * m * (v["r"] ** 2 + q["r"] ** 2 * v["theta"] ** 2)
@@ -75,12 +76,12 @@ def lagrangian(t, q, v, params):
     return centre + spin - m * g * q["r"] * jnp.sin(q["theta"])
 
 
-def contact(t, q, params):
+def contact(t, q: PyTree, params: PyTree):
     """f₁ = r - (R + a), Eq. (1)."""
     return q["r"] - (params["R"] + params["a"])
 
 
-def rolling(t, q, v, params):
+def rolling(t, q: PyTree, v: PyTree, params: PyTree):
     """f₂ = (R + a) θ̇ + a φ̇, Eq. (2)."""
     return (params["R"] + params["a"]) * v["theta"] + params["a"] * v["phi"]
 
@@ -93,7 +94,7 @@ in_flight = System(lagrangian)
 DEPARTURE = {"departure": Crossing(lambda t, q, v, multipliers, params: multipliers["contact"], direction=-1)}
 
 
-def start(params, theta, theta_rate=0.0):
+def start(params: PyTree, theta, theta_rate=0.0):
     """A rolling state at the angle `theta`, as (q, v)."""
     l, zero = params["R"] + params["a"], 0.0 * theta
     q = {"r": l + zero, "theta": theta, "phi": zero}
@@ -101,7 +102,7 @@ def start(params, theta, theta_rate=0.0):
     return q, v
 
 
-def roll(params, theta, theta_rate, ts, **options):
+def roll(params: PyTree, theta, theta_rate, ts, **options):
     """Roll from `theta` until the normal force vanishes, or to the end of `ts`; return a `Trajectory`.
 
     **Raises:** `ValueError` if the hoop is not pressed against the cylinder at the start (the event finds zeros of λ,
@@ -125,17 +126,17 @@ class Multipliers(NamedTuple):
     rolling: jax.Array
 
 
-def rate(params):
+def rate(params: PyTree):
     """w = √(g / ((1 + β) (R + a))), the small-swing frequency about the bottom."""
     return jnp.sqrt(params["g"] / ((1 + params["beta"]) * (params["R"] + params["a"])))
 
 
-def exact_rate(params, theta, theta0, theta_rate0=0.0):
+def exact_rate(params: PyTree, theta, theta0, theta_rate0=0.0):
     """θ̇ of a hoop on its way down the right side, Eq. (11)."""
     return -jnp.sqrt(theta_rate0**2 + 2 * rate(params) ** 2 * (jnp.sin(theta0) - jnp.sin(theta)))
 
 
-def exact_multipliers(params, theta, theta0, theta_rate0=0.0) -> Multipliers:
+def exact_multipliers(params: PyTree, theta, theta0, theta_rate0=0.0) -> Multipliers:
     """λ and μ at θ, for a start at (θ₀, θ̇₀); Eq. (12) is the hoop from rest at the top."""
     m, g, beta = params["m"], params["g"], params["beta"]
     l = params["R"] + params["a"]
@@ -143,13 +144,13 @@ def exact_multipliers(params, theta, theta0, theta_rate0=0.0) -> Multipliers:
     return Multipliers(normal, beta * m * g * jnp.cos(theta) / (1 + beta))
 
 
-def departure_sine(params, theta0, theta_rate0=0.0):
+def departure_sine(params: PyTree, theta0, theta_rate0=0.0):
     """sin θ_d; if it is not below sin θ₀, the hoop is in flight from the start."""
     beta, l = params["beta"], params["R"] + params["a"]
     return (2 * jnp.sin(theta0) + (1 + beta) * l * theta_rate0**2 / params["g"]) / (3 + beta)
 
 
-def departure_time(params, tilt):
+def departure_time(params: PyTree, tilt):
     """The time from rest at `tilt` = π/2 - θ₀ > 0 to the departure, by Carlson's R_F."""
     y0 = np.sin(tilt / 2) ** 2
     y = (1 - 2 * np.cos(tilt) / (3 + np.asarray(params["beta"]))) / 2
@@ -157,7 +158,7 @@ def departure_time(params, tilt):
     return np.sqrt(y - y0) * carlson / np.asarray(rate(params))
 
 
-def exact_motion(params, theta0, t):
+def exact_motion(params: PyTree, theta0, t):
     """q(t) and v(t) of the hoop held to the cylinder, released from rest at θ₀ within (-π/2, π/2)."""
     w, ratio = float(rate(params)), (params["R"] + params["a"]) / params["a"]
     t = np.asarray(t)
@@ -169,7 +170,7 @@ def exact_motion(params, theta0, t):
     return q, {"r": 0 * t, "theta": theta_rate, "phi": -ratio * theta_rate}
 
 
-def period(params, theta0):
+def period(params: PyTree, theta0):
     """The period of the hoop swinging about the bottom, released from rest at θ₀: 4 K(k²) / w."""
     return 4 * special.elliprf(0.0, np.cos((theta0 + TOP) / 2) ** 2, 1.0) / float(rate(params))
 
@@ -184,14 +185,14 @@ class Flight(NamedTuple):
     spin: jax.Array
 
 
-def leaving(params, theta0, theta_rate0=0.0) -> Flight:
+def leaving(params: PyTree, theta0, theta_rate0=0.0) -> Flight:
     """The state at the departure on the right side, where (R + a) θ̇² = g sin θ."""
     l, sine = params["R"] + params["a"], departure_sine(params, theta0, theta_rate0)
     cosine, speed = jnp.sqrt(1 - sine**2), jnp.sqrt(params["g"] * l * sine)
     return Flight(l * cosine, l * sine, speed * sine, -speed * cosine, speed / params["a"])
 
 
-def flight(params, left: Flight, t) -> Flight:
+def flight(params: PyTree, left: Flight, t) -> Flight:
     """The parabola, a time t after the departure."""
     g = params["g"]
     return left._replace(
@@ -199,13 +200,13 @@ def flight(params, left: Flight, t) -> Flight:
     )
 
 
-def time_to_floor(params, left: Flight):
+def time_to_floor(params: PyTree, left: Flight):
     """How long the hoop flies before it lands on the floor on which the cylinder lies, y = -R + a."""
     drop = left.y + params["R"] - params["a"]
     return (left.vy + jnp.sqrt(left.vy**2 + 2 * params["g"] * drop)) / params["g"]
 
 
-def flight_in_polar(left: Flight, params):
+def flight_in_polar(left: Flight, params: PyTree):
     """A state of the flight in the coordinates of the Lagrangian, as (q, v)."""
     r = jnp.hypot(left.x, left.y)
     q = {"r": r, "theta": jnp.arctan2(left.y, left.x), "phi": 0.0}
@@ -262,10 +263,10 @@ def _about_the_bottom(theta0, periods, outputs):
 
 
 @compiled
-def departures(params, theta, theta_rate, tolerance, until):
+def departures(params: PyTree, theta, theta_rate, tolerance, until):
     """Roll a batch of starts, each with its own tolerance, until departure or `until`: (t, θ, left?, θ on the way)."""
 
-    def lane(params, theta, theta_rate, tolerance, until):
+    def lane(params: PyTree, theta, theta_rate, tolerance, until):
         q, v = start(params, theta, theta_rate)
         ts, tolerances = jnp.linspace(0.0, until, 41), {"rtol": tolerance, "atol": tolerance}
         rolled = integrate(system, q, v, params, ts=ts, **tolerances, events=DEPARTURE, throw=False)
@@ -320,7 +321,7 @@ def _top(lanes=LANES):
     return Case("at rest on the top for 10 s", "stays; pi/2 is rounded, and that grows", off, 1e-7)
 
 
-def _refusal(name, theta, theta_rate):
+def _refusal(name: str, theta, theta_rate):
     try:
         roll(PARAMS, theta, theta_rate, np.array([0.0, 1.0]))
     except ValueError as error:

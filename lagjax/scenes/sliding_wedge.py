@@ -18,6 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.display import plots
 from lagjax.integrate.integrate import integrate
@@ -40,13 +41,13 @@ MISPRINTS = (
 )
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ m (ẋ² + ẏ²) + ½ M Ẋ² + m g y, Eq. (14)."""
     m, M, g = params["m"], params["M"], params["g"]
     return 0.5 * m * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * M * v["X"] ** 2 + m * g * q["y"]
 
 
-def incline(t, q, params):
+def incline(t, q: PyTree, params: PyTree):
     """f = (x - X) sin α - y cos α: the particle is on the incline."""
     return (q["x"] - q["X"]) * jnp.sin(params["alpha"]) - q["y"] * jnp.cos(params["alpha"])
 
@@ -64,7 +65,7 @@ class Exact(NamedTuple):
     along: jax.Array
 
 
-def exact_accelerations(params) -> Exact:
+def exact_accelerations(params: PyTree) -> Exact:
     """Ẍ, ẍ, ÿ, λ and the acceleration along the wedge in closed form, valid for M = 0, α = 0, α = π/2 too."""
     m, M, g = params["m"], params["M"], params["g"]
     s, c = jnp.sin(params["alpha"]), jnp.cos(params["alpha"])
@@ -75,7 +76,7 @@ def exact_accelerations(params) -> Exact:
     )  # fmt: skip
 
 
-def exact_motion(params, q0, v0, t):
+def exact_motion(params: PyTree, q0: PyTree, v0: PyTree, t):
     """q(t) and v(t) from a state on the incline: uniform acceleration."""
     a = exact_accelerations(params)
     q = {k: q0[k] + v0[k] * t + 0.5 * getattr(a, k) * t**2 for k in q0}
@@ -83,7 +84,7 @@ def exact_motion(params, q0, v0, t):
     return q, v
 
 
-def start_on_incline(params, X=0.0, X_rate=0.0, along=0.0, along_rate=0.0):
+def start_on_incline(params: PyTree, X=0.0, X_rate=0.0, along=0.0, along_rate=0.0):
     """The state with the particle at the distance `along` down the incline, with the relative speed `along_rate`."""
     s, c = np.sin(params["alpha"]), np.cos(params["alpha"])
     q = {"X": X, "x": X + along * c, "y": along * s}
@@ -91,13 +92,13 @@ def start_on_incline(params, X=0.0, X_rate=0.0, along=0.0, along_rate=0.0):
     return q, v
 
 
-def power_of_normal_force(params, v, multiplier):
+def power_of_normal_force(params: PyTree, v: PyTree, multiplier):
     """The rate at which the constraint force does work on the particle and on the wedge, (P_m, P_M)."""
     s, c = jnp.sin(params["alpha"]), jnp.cos(params["alpha"])
     return multiplier * (v["x"] * s - v["y"] * c), -multiplier * v["X"] * s
 
 
-def horizontal_momentum(params, v):
+def horizontal_momentum(params: PyTree, v: PyTree):
     """p_x = m ẋ + M Ẋ; with X eliminated, (m + M) ẋ - M ẏ / tan α."""
     return params["m"] * v["x"] + params["M"] * v["X"]
 
@@ -109,7 +110,7 @@ def runs():
     return [_run("from rest", Q0, V0, ts), _run("thrown uphill", *moving, ts)]
 
 
-def _run(name, q0, v0, ts):
+def _run(name: str, q0: PyTree, v0: PyTree, ts):
     def error(trajectory):
         return relative_error((trajectory.q, trajectory.v), exact_motion(PARAMS, q0, v0, ts))
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from scipy import optimize
 
 from lagjax.display import plots
@@ -36,13 +37,13 @@ PARAMS = rolling_hoop.PARAMS | {"mu": 0.25}
 FIRST = 1.5
 
 
-def friction(t, q, v, multipliers, params):
+def friction(t, q: PyTree, v: PyTree, multipliers: PyTree, params: PyTree):
     """Q = μ λ (l, a) for (θ, φ): against a contact that slides downhill, f₂ < 0."""
     force = params["mu"] * multipliers["contact"]
     return {"r": 0.0, "theta": (params["R"] + params["a"]) * force, "phi": params["a"] * force}
 
 
-def height(t, q, params):
+def height(t, q: PyTree, params: PyTree):
     """The height of the hoop above the ground on which the cylinder lies."""
     return q["r"] * jnp.sin(q["theta"]) + params["R"] - params["a"]
 
@@ -61,7 +62,7 @@ hybrid = Hybrid(
 )
 
 
-def roll_and_slip(params, ts, **options) -> HybridTrajectory:
+def roll_and_slip(params: PyTree, ts, **options) -> HybridTrajectory:
     """The motion from rest at the top, started at `FIRST` with the speed that it has there."""
     rate = rolling_hoop.exact_rate(params, FIRST, rolling_hoop.TOP)
     return _in_phases(*rolling_hoop.start(params, FIRST, rate), params, ts=ts, **options)
@@ -83,7 +84,7 @@ class Friction(NamedTuple):
     lands: float
 
 
-def exact(params) -> Friction:
+def exact(params: PyTree) -> Friction:
     """From rest at the top; φ̇ by a quadrature of φ̈ = μ λ / (β m a), the rest in closed form."""
     mu, beta, g, a = (params[name] for name in ("mu", "beta", "g", "a"))
     l = params["R"] + a
@@ -116,7 +117,7 @@ def _root(function, low, high) -> float:
     return float(np.asarray(optimize.brentq(function, low, high, xtol=1e-15)))
 
 
-def seen(params) -> Friction:
+def seen(params: PyTree) -> Friction:
     """The same as `exact`, but by integration with rtol 1e-11."""
     switches = roll_and_slip(params, np.array([0.0, 3.0]), rtol=1e-11, estimate_error=False).switches
     (slip, left, down), rate = switches.q["theta"][:3], switches.v["theta"][1]

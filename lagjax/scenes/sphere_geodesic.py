@@ -31,7 +31,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.display import plots
 from lagjax.integrate.integrate import integrate
@@ -59,17 +59,17 @@ MISPRINTS = (
 )
 
 
-def arc_length(t, q, v, params):
+def arc_length(t, q: PyTree, v: PyTree, params: PyTree):
     """f = √(sin²ψ + ψ'²), with t = θ, q = ψ, v = ψ'."""
     return jnp.sqrt(jnp.sin(q) ** 2 + v**2)
 
 
-def free_particle(t, q, v, params):
+def free_particle(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ |ṙ|²."""
     return 0.5 * jnp.sum(v**2)
 
 
-def sphere(t, q, params):
+def sphere(t, q: PyTree, params: PyTree):
     """|r|² - R²."""
     return jnp.sum(q**2) - params["R"] ** 2
 
@@ -117,7 +117,7 @@ def great_circle(psi1, theta1, psi2, theta2) -> GreatCircle:
     return circle
 
 
-def distance(params, psi1, theta1, psi2, theta2):
+def distance(params: PyTree, psi1, theta1, psi2, theta2):
     """The length of the minor arc, with full accuracy at every separation."""
     return params["R"] * plane_and_arc(psi1, theta1, psi2, theta2).angle
 
@@ -178,7 +178,7 @@ def _length(vector):
     return jnp.hypot(jnp.hypot(vector[0], vector[1]), vector[2])
 
 
-def cartesian(params, psi, theta):
+def cartesian(params: PyTree, psi, theta):
     """r of a point, (..., 3)."""
     return params["R"] * jnp.stack(
         [jnp.sin(psi) * jnp.cos(theta), jnp.sin(psi) * jnp.sin(theta), jnp.cos(psi) + 0 * theta], axis=-1
@@ -191,7 +191,7 @@ def exact_over_azimuth(A, B, theta):
     return jnp.arctan2(1.0, q), -slope / (1 + q**2)
 
 
-def exact_embedded(q0, v0, s):
+def exact_embedded(q0: PyTree, v0: PyTree, s):
     """r and dr/ds at (T,) arc lengths, from the start of a path of unit speed."""
     R = jnp.sqrt(jnp.sum(q0**2))
     cosine, sine = jnp.cos(s / R)[:, None], jnp.sin(s / R)[:, None]
@@ -199,12 +199,12 @@ def exact_embedded(q0, v0, s):
     return q0 * cosine + R * v0 * sine, v0 * cosine - q0 * sine / R
 
 
-def exact_multiplier(params):
+def exact_multiplier(params: PyTree):
     """λ = -1 / (2 R²) at unit speed."""
     return -0.5 / params["R"] ** 2
 
 
-def start_towards(params, psi1, theta1, psi2, theta2):
+def start_towards(params: PyTree, psi1, theta1, psi2, theta2):
     """A start in r at the first point, of unit speed, along the minor arc to the second."""
     normal = great_circle(psi1, theta1, psi2, theta2).normal
     q = cartesian(params, psi1, theta1)
@@ -255,7 +255,7 @@ def _over_the_poles():
 
 
 @compiled
-def arrivals(q0, v0, arc):
+def arrivals(q0: PyTree, v0: PyTree, arc):
     """The end points (N, 3) of a batch of starts in r after their arc lengths."""
 
     def ends(q: Array, v: Array, s: Array):
@@ -325,7 +325,7 @@ def _over_azimuth_cases():
     ]
 
 
-def _undetermined(name, ends):
+def _undetermined(name: str, ends):
     try:
         great_circle(*ends)
     except ValueError as error:

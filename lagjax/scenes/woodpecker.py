@@ -34,7 +34,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
 from lagjax.integrate.integrate import integrate
@@ -56,7 +56,7 @@ TURN = -0.5294719671108
 MOST_SWITCHES = 24
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """The Lagrangian of the bird on its sleeve, for small angles."""
     bird = v["y"] + params["l_M"] * v["sleeve"] + params["l_G"] * v["bird"]
     height = q["y"] + params["l_M"] * q["sleeve"] + params["l_G"] * q["bird"]
@@ -66,33 +66,33 @@ def lagrangian(t, q, v, params):
     return kinetic - weight - 0.5 * params["c"] * (q["sleeve"] - q["bird"]) ** 2
 
 
-def beak(t, q, params):
+def beak(t, q: PyTree, params: PyTree):
     """The distance of the beak from the pole."""
     return params["l_M"] + params["l_G"] - params["l_S"] - params["r_0"] - params["h_S"] * q["bird"]
 
 
-def edges(t, q, params):
+def edges(t, q: PyTree, params: PyTree):
     """The distance of the nearer edge from the pole, valid if it is small."""
     width = params["r_M"] - params["r_0"]
     return (width**2 - (params["h_M"] * q["sleeve"]) ** 2) / (2 * width)
 
 
-def sliding_beak(t, q, v, params):
+def sliding_beak(t, q: PyTree, v: PyTree, params: PyTree):
     """The upward velocity of the beak along the pole."""
     return v["y"] + params["l_M"] * v["sleeve"] + (params["l_G"] - params["l_S"]) * v["bird"]
 
 
-def sliding(t, q, v, params):
+def sliding(t, q: PyTree, v: PyTree, params: PyTree):
     """The upward velocity of an edge along the pole."""
     return v["y"] + params["r_M"] * v["sleeve"]
 
 
-def coefficient(params):
+def coefficient(params: PyTree):
     """The coefficient of friction, the same for all contacts."""
     return params["mu"]
 
 
-def friction(side, t, q, v, multipliers, params):
+def friction(side, t, q: PyTree, v: PyTree, multipliers: PyTree, params: PyTree):
     """The friction on an edge that slides up (side 1) or down (side -1)."""
     force = -side * params["mu"] * multipliers["edges"]
     return {"y": force, "sleeve": params["r_M"] * force, "bird": 0.0}
@@ -123,7 +123,7 @@ hybrid = Hybrid(
 SLIPS = 7
 
 
-def jammed_at(params, bird, y=0.0):
+def jammed_at(params: PyTree, bird, y=0.0):
     """A state at rest, jammed at the lower edge, with the bird at the angle `bird`."""
     q = {"y": y, "sleeve": -(params["r_M"] - params["r_0"]) / params["h_M"], "bird": bird}
     return q, {"y": 0.0, "sleeve": 0.0, "bird": 0.0}
@@ -137,7 +137,7 @@ class Lap(NamedTuple):
     fallen: Float[Array, ""]
 
 
-def motion(params, ts, turn=TURN, **options) -> HybridTrajectory:
+def motion(params: PyTree, ts, turn=TURN, **options) -> HybridTrajectory:
     """The motion of the jammed toy, starting where its bird turns."""
     traj = integrate(hybrid, *jammed_at(params, turn), params, ts=ts, start="sticks", **options)
     assert isinstance(traj, HybridTrajectory)

@@ -9,23 +9,24 @@ from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.stability.trial import DEGRADED, REDUCED, Trial
 from lagjax.system.system import System
 
 
-def attracted(t, q, v, params):
+def attracted(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ |ṙ|² + k / r."""
     return 0.5 * jnp.sum(v**2) + params["k"] / jnp.sqrt(jnp.sum(q**2))
 
 
-def henon_heiles(t, q, v, params):
+def henon_heiles(t, q: PyTree, v: PyTree, params: PyTree):
     """Two coordinates, coupled by a cubic (Hénon & Heiles 1964)."""
     x, y = q["x"], q["y"]
     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (x**2 + y**2) - x**2 * y + y**3 / 3
 
 
-def two_rods(t, q, v, params):
+def two_rods(t, q: PyTree, v: PyTree, params: PyTree):
     """A double pendulum, angles from the vertical."""
     m1, m2, l1, l2, g = (params[name] for name in ("m1", "m2", "l1", "l2", "g"))
     kinetic = 0.5 * (m1 + m2) * (l1 * v["one"]) ** 2 + 0.5 * m2 * (l2 * v["two"]) ** 2
@@ -33,7 +34,7 @@ def two_rods(t, q, v, params):
     return kinetic + (m1 + m2) * g * l1 * jnp.cos(q["one"]) + m2 * g * l2 * jnp.cos(q["two"])
 
 
-def rigid_body(t, q, v, params):
+def rigid_body(t, q: PyTree, v: PyTree, params: PyTree):
     """A free rigid body in Euler's angles z-x-z."""
     s, c = jnp.sin(q["theta"]), jnp.cos(q["theta"])
     one = v["phi"] * s * jnp.sin(q["psi"]) + v["theta"] * jnp.cos(q["psi"])
@@ -45,7 +46,7 @@ def rigid_body(t, q, v, params):
 kepler, cubic, pendulum, body = map(System, (attracted, henon_heiles, two_rods, rigid_body))
 
 
-def _on_ellipse(eccentricity, q0, v0, params, ts):
+def _on_ellipse(eccentricity, q0: PyTree, v0: PyTree, params: PyTree, ts):
     """Motion from the pericentre of an ellipse with k = a = 1, by Newton's method for Kepler's equation."""
     mean = jnp.mod(ts, 2 * jnp.pi)
     anomaly = mean + eccentricity * jnp.sin(mean)
@@ -69,7 +70,7 @@ def _turns(eccentricity, **what):
     )  # fmt: skip
 
 
-def _to(name, system, params, span, start, end, **what):
+def _to(name: str, system, params: PyTree, span, start, end, **what):
     """A motion with a known last state."""
     both = [{key: np.array([first[key], last[key]]) for key in first} for first, last in zip(start, end)]
     ts = np.array([0.0, span])

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.trial import REFUSED, Trial, by_parameter
@@ -9,27 +10,27 @@ from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System
 
 
-def free_fall(t, q, v, params):
+def free_fall(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ |ṙ|² - g y."""
     return 0.5 * jnp.sum(v**2) - params["g"] * q[1]
 
 
-def rod(t, q, params):
+def rod(t, q: PyTree, params: PyTree):
     """|r|² - a²."""
     return q @ q - params["a"] ** 2
 
 
-def rod_again(t, q, params):
+def rod_again(t, q: PyTree, params: PyTree):
     """The same rod, expressed by its length."""
     return 3.0 * (jnp.sqrt(q @ q) - params["a"])
 
 
-def level(t, q, params):
+def level(t, q: PyTree, params: PyTree):
     """y stays where it is."""
     return q[1]
 
 
-def lift(t, q, params):
+def lift(t, q: PyTree, params: PyTree):
     """y rises as ½ t²."""
     return q[1] - 0.5 * t**2
 
@@ -38,7 +39,7 @@ twice = System(free_fall, {"rod": Holonomic(rod), "rod_again": Holonomic(rod_aga
 torn = System(free_fall, {"level": Holonomic(level), "lift": Holonomic(lift)})
 
 
-def _on_the_rod(q0, v0, params, ts):
+def _on_the_rod(q0: PyTree, v0: PyTree, params: PyTree, ts):
     psi, rate = bead_on_hoop.exact_motion(params | {"omega": 0.0}, jnp.arctan2(q0[0], -q0[1]), ts)
     a, (cos, sin) = params["a"], (jnp.cos(psi), jnp.sin(psi))
     return a * jnp.stack([sin, -cos], axis=-1), a * jnp.stack([rate * cos, rate * sin], axis=-1)

@@ -3,13 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.scenes import sphere_geodesic
 from lagjax.stability.trial import FULL, REDUCED, REFUSED, Trial, zeros
 from lagjax.system.system import System
 
 
-def angles_lagrangian(t, q, v, params):
+def angles_lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ R² (ψ̇² + sin²ψ θ̇²)."""
     return 0.5 * params["R"] ** 2 * (v["psi"] ** 2 + (jnp.sin(q["psi"]) * v["theta"]) ** 2)
 
@@ -17,11 +18,11 @@ def angles_lagrangian(t, q, v, params):
 by_angles = System(angles_lagrangian)
 
 
-def _circle(q0, v0, params, ts):
+def _circle(q0: PyTree, v0: PyTree, params: PyTree, ts):
     return sphere_geodesic.exact_embedded(q0, v0, ts)
 
 
-def _circle_from_angles(q0, v0, params, ts):
+def _circle_from_angles(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """The exact path in space, from angles and their rates."""
     r, rate = jax.jvp(lambda q: sphere_geodesic.cartesian(params, q["psi"], q["theta"]), (q0,), (v0,))
     speed = jnp.sqrt(jnp.sum(rate**2))
@@ -33,7 +34,7 @@ def _position_in_space(trajectory):
     return sphere_geodesic.cartesian({"R": sphere_geodesic.PARAMS["R"]}, trajectory.q["psi"], trajectory.q["theta"])
 
 
-def _over_azimuth(q0, v0, params, ts):
+def _over_azimuth(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """ψ and ψ' from the great circle cot ψ = A cos θ + B sin θ through the start."""
     q, slope = jnp.cos(q0) / jnp.sin(q0), -v0 / jnp.sin(q0) ** 2
     shifted = q * jnp.cos(ts - ts[0]) + slope * jnp.sin(ts - ts[0])

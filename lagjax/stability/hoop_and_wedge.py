@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.numerics.methods.runge_kutta import Dopri8
 from lagjax.scenes import bead_on_hoop, sliding_wedge
@@ -20,7 +21,7 @@ def single(tree):
 # The wedge: mass ratio and angle.
 
 
-def _wedge_motion(q0, v0, params, ts):
+def _wedge_motion(q0: PyTree, v0: PyTree, params: PyTree, ts):
     return sliding_wedge.exact_motion(params, q0, v0, ts)
 
 
@@ -43,11 +44,11 @@ def wedge():
 # The bead on the hoop: a pendulum, with or without rotation of the hoop.
 
 
-def _bead_motion(q0, v0, params, ts):
+def _bead_motion(q0: PyTree, v0: PyTree, params: PyTree, ts):
     return bead_on_hoop.exact_motion(params, q0, ts)
 
 
-def swing(name, change, psi, span, points=6, **what):
+def swing(name: str, change, psi, span, points=6, **what):
     """A swing from rest at ψ over `span` periods; absolute tolerances in proportion to angle and rate."""
     params = {"m": 0.5, "a": 0.75, "g": 9.8125} | change
     period = float(bead_on_hoop.exact_period(params, psi))
@@ -120,7 +121,7 @@ def separatrix():
     return by_both(rows)
 
 
-def _fall(q0, v0, params, ts):
+def _fall(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """χ and its rate from rest at χ0 close to the top (where g < 0): tan(χ/2) = tan(χ0/2) / cn(ω0 t)."""
     rate = jnp.sqrt(-params["g"] / params["a"])
     s2, c2 = jnp.sin(0.5 * q0) ** 2, jnp.cos(0.5 * q0) ** 2

@@ -3,6 +3,7 @@
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.hoop_and_wedge import by_both, swing
@@ -10,7 +11,7 @@ from lagjax.stability.trial import DEGRADED, REDUCED, REFUSED, Trial
 from lagjax.system.system import System
 
 
-def pendulum(t, q, v, params):
+def pendulum(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ v² + cos q."""
     return 0.5 * v**2 + jnp.cos(q)
 
@@ -19,7 +20,7 @@ rotor = System(pendulum)
 UNIT = {"a": 1.0, "g": 1.0, "omega": 0.0}
 
 
-def _whole_turns(q0, v0, params, ts):
+def _whole_turns(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """Direction and rate near whole turns, after which the pendulum is back at the bottom with the rate v0."""
     period = bead_on_hoop.rotation_period(UNIT, v0**2 - 2.0)
     over = v0 * (ts - jnp.round(ts / period) * period)

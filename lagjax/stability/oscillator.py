@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import diffrax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.integrate.integrate import integrate
 from lagjax.stability.trial import ACCURATE, FULL, Outcome
@@ -22,7 +23,7 @@ OMEGA = 1e5
 HALVINGS = 20
 
 
-def lagrangian(t, q, v, params):
+def lagrangian(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ v² - ½ ω² q²."""
     return 0.5 * v**2 - 0.5 * params["omega"] ** 2 * q**2
 
@@ -30,7 +31,7 @@ def lagrangian(t, q, v, params):
 oscillator = System(lagrangian)
 
 
-def exact(q0, v0, params, ts):
+def exact(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """The exact q and its rate."""
     w = params["omega"]
     return q0 * jnp.cos(w * ts) + v0 / w * jnp.sin(w * ts), v0 * jnp.cos(w * ts) - w * q0 * jnp.sin(w * ts)

@@ -14,7 +14,7 @@ from lagjax.system import coordinates
 from lagjax.system.system import System
 
 
-def spring(t, q, v, params):
+def spring(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ |ṙ|² - ½ k (|r| - 1)²."""
     return 0.5 * jnp.sum(v**2) - 0.5 * params["k"] * (jnp.sqrt(jnp.sum(q**2)) - 1.0) ** 2
 
@@ -22,7 +22,7 @@ def spring(t, q, v, params):
 whirled = System(spring)
 
 
-def _whirl(q0, v0, params, ts):
+def _whirl(q0: PyTree, v0: PyTree, params: PyTree, ts):
     """The circle at the rate ω, on which the spring balances at the radius k / (k - ω²)."""
     rate = v0[1] / q0[0]
     radius = params["k"] / (params["k"] - rate**2)
@@ -63,12 +63,12 @@ def _mechanism(mechanism):
     )  # fmt: skip
 
 
-def friction(t, q, v, params):
+def friction(t, q: PyTree, v: PyTree, params: PyTree):
     """R = ½ c v²."""
     return 0.5 * params["c"] * v**2
 
 
-def free(t, q, v, params):
+def free(t, q: PyTree, v: PyTree, params: PyTree):
     """L = ½ v²."""
     return 0.5 * v**2
 
@@ -76,7 +76,7 @@ def free(t, q, v, params):
 braked = System(free, dissipation=friction)
 
 
-def _braking(q0, v0, params, ts):
+def _braking(q0: PyTree, v0: PyTree, params: PyTree, ts):
     decay = jnp.exp(-params["c"] * ts)
     return q0 + v0 / params["c"] * (1 - decay), v0 * decay
 

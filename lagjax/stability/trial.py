@@ -97,7 +97,7 @@ def zeros(tree):
     return jax.tree.map(lambda x: np.zeros(np.shape(x)), tree)
 
 
-def by_parameter(q0, v0, params, name, size=1.0):
+def by_parameter(q0: PyTree, v0: PyTree, params: PyTree, name: str, size=1.0):
     """The direction that changes one parameter."""
     return zeros(q0), zeros(v0), zeros(params) | {name: size}
 
@@ -204,7 +204,7 @@ class Trial:
 def _in_lanes(system, point, tangents, ts, options, observed):
     """The observed values and their directional derivative in forward mode; the other lanes start displaced."""
 
-    def motion(q0, v0, params):
+    def motion(q0: PyTree, v0: PyTree, params: PyTree):
         return observed(integrate(system, q0, v0, params, ts=ts, throw=False, **options))
 
     def lane(along):

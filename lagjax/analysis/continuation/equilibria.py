@@ -144,7 +144,7 @@ def _velocity(steady, x):
     return steady.velocity(x, steady.held)
 
 
-def _solution(steady: Steady, v) -> np.ndarray | str:
+def _solution(steady: Steady, v: PyTree) -> np.ndarray | str:
     """The unknowns of the equilibrium near `steady.x0`, or a message that says why there is none."""
     if steady.symmetries.count and steady.symmetries.hold == VELOCITY:
         v = coordinates.like(v, np.asarray(_velocity(steady, steady.x0)))
@@ -161,7 +161,9 @@ def _solution(steady: Steady, v) -> np.ndarray | str:
     return unknowns(row)
 
 
-def _frame(steady: Steady, place: ParameterPlace, first: float, last: float, v, units) -> tuple[Frame, np.ndarray]:
+def _frame(
+    steady: Steady, place: ParameterPlace, first: float, last: float, v: PyTree, units
+) -> tuple[Frame, np.ndarray]:
     """The units and the combinations of equations that are solved; and the point at which the branch begins."""
     y, x0 = _solution(steady, v), steady.model.tree(steady.x0)
     if isinstance(y, str):

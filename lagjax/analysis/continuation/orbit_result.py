@@ -137,7 +137,7 @@ class OrbitBranch(eqx.Module):
     def _names(self):
         return coordinates.names(self.orbit.q)
 
-    def _values(self, name):
+    def _values(self, name: str):
         if name == "period":
             return np.asarray(self.period)
         leaves = [np.asarray(x).reshape(len(self), -1) for x in jax.tree.leaves(self.high)]

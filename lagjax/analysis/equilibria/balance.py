@@ -82,7 +82,7 @@ class Steady(eqx.Module):
     def m(self) -> int:
         return self.model.m
 
-    def of(self, params) -> "Steady":
+    def of(self, params: PyTree) -> "Steady":
         """The same with other parameters."""
         return Steady(self.model.of(params), self.t, self.held, self.x0, self.symmetries)
 
@@ -120,7 +120,7 @@ class Steady(eqx.Module):
 
 # Jitted so that a Lagrangian is traced only once, however often its balance is evaluated.
 @jitted
-def imbalance(s: Steady, t, x, u, a, multipliers):
+def imbalance(s: Steady, t, x, u, a, multipliers: PyTree):
     """The residual `M a - F - Aᵀ λ - B λ` for any velocity and acceleration."""
     forcing, inertia = forcing_and_inertia(s.model, t, x, u)
     residual = inertia(a) - forcing

@@ -82,7 +82,7 @@ def stacked(starts, what="starts") -> PyTree:
     return starts
 
 
-def stacked_one(q):
+def stacked_one(q: PyTree):
     """A state of rest at q."""
     q = jax.tree.map(lambda x: x[0], stacked([q]))
     return q, _at_rest(q)
@@ -351,7 +351,7 @@ def _with(array, places, values):
     return array
 
 
-def _is_a_state(system, t, q, params) -> bool:
+def _is_a_state(system, t, q: PyTree, params: PyTree) -> bool:
     """Whether the argument `starts` is a single start."""
     try:
         checked(system, State(t, *stacked_one(q), params))
@@ -360,7 +360,7 @@ def _is_a_state(system, t, q, params) -> bool:
     return True
 
 
-def _velocities(velocities, q, count):
+def _velocities(velocities, q: PyTree, count):
     """One velocity for each start."""
     v = stacked([velocities] if _is_one(velocities, q) else velocities, "velocities")
     if jax.tree.structure(v) != jax.tree.structure(q):
@@ -368,18 +368,18 @@ def _velocities(velocities, q, count):
     return jax.tree.map(lambda x, of: numpy_of(x).broadcast_to(x, (count, *of.shape[1:])), v, q)
 
 
-def _is_one(velocities, q):
+def _is_one(velocities, q: PyTree):
     if isinstance(velocities, list) or jax.tree.structure(velocities) != jax.tree.structure(q):
         return False
     return all(jnp.ndim(x) == y.ndim - 1 for x, y in zip(jax.tree.leaves(velocities), jax.tree.leaves(q)))
 
 
-def _moving(v, count):
+def _moving(v: PyTree, count):
     return np.any(np.concatenate([np.asarray(x).reshape(count, -1) for x in jax.tree.leaves(v)], axis=1) != 0, axis=0)
 
 
 @partial(compiled, in_numpy=True)
-def searched(steady: Steady, q, v, lasting, expected, concrete) -> EquilibriumRow:
+def searched(steady: Steady, q: PyTree, v: PyTree, lasting, expected, concrete) -> EquilibriumRow:
     """Search from each start; one row each. `expected`: the number of coordinates at rest that nothing depends on."""
     return jax.vmap(lambda q, v: _search(steady, q, v, lasting, expected, concrete))(q, v)
 
@@ -394,7 +394,7 @@ def held_at(steady: Steady, x, u):
     return rates, steady.momenta(x, steady.velocity(x, rates)) if steady.symmetries.hold == MOMENTUM and k else rates
 
 
-def _search(steady: Steady, q, v, lasting, expected, concrete) -> EquilibriumRow:
+def _search(steady: Steady, q: PyTree, v: PyTree, lasting, expected, concrete) -> EquilibriumRow:
     x0, u0 = coordinates.flatten(q)[0], coordinates.flatten(v)[0]
     rates, held = held_at(steady, x0, u0)
     steady = Steady(steady.model, steady.t, held, steady.x0, steady.symmetries)

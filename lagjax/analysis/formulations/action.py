@@ -32,7 +32,14 @@ PIECES = 32
 
 
 def action(
-    system, path: Trajectory | Callable, params=None, t0=None, t1=None, *, pieces: int = PIECES, error: bool = False
+    system,
+    path: Trajectory | Callable,
+    params: PyTree = None,
+    t0=None,
+    t1=None,
+    *,
+    pieces: int = PIECES,
+    error: bool = False,
 ) -> Float[Array, ""] | tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the action `S = ∫ L dt` of a path, differentiable in everything that the path and L depend on.
 
@@ -86,7 +93,7 @@ def action(
     return (whole, jnp.abs(halves - whole)) if error else whole
 
 
-def _action_of_trajectory(system, path, params, t0, t1, pieces):
+def _action_of_trajectory(system, path, params: PyTree, t0, t1, pieces):
     if path.t.ndim != 1:
         raise ValueError(
             f"this trajectory is a batch of shape {path.t.shape[:-1]}: take the action of one lane of it.\n"
@@ -128,7 +135,7 @@ def _action_of_trajectory(system, path, params, t0, t1, pieces):
     return found, jnp.abs(found - integral(quadrature.GAUSS))
 
 
-def _along_the_steps(system, path, params, t0, t1):
+def _along_the_steps(system, path, params: PyTree, t0, t1):
     """The action of a motion that is integrated again, and the error of the quadrature."""
     states = np.concatenate([np.ravel(y) for y in jax.tree.leaves((path.q, path.v))])
     dtype = np.asarray(path.t).dtype

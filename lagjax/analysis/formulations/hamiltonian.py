@@ -80,13 +80,13 @@ def _regular(matrix):
 
 
 @judging
-def _reached(found, target, matrix, v):
+def _reached(found, target, matrix, v: PyTree):
     terms = jnp.abs(target) + jnp.abs(matrix) @ jnp.abs(v)
     return jnp.max(jnp.abs(found - target)) <= ROUND_OFFS * jnp.finfo(v.dtype).eps * jnp.max(terms)
 
 
 def _newton(residual, start):
-    def step(v, r, i):
+    def step(v: PyTree, r, i):
         return dense.solve(jax.jacfwd(residual)(v), r)
 
     # Round-off ends the quadratic convergence: the residual no longer falls.
@@ -102,15 +102,15 @@ class Hamiltonian(eqx.Module):
 
     system: System
 
-    def __call__(self, t, q, p, params) -> Float[Array, ""]:
+    def __call__(self, t, q: PyTree, p, params: PyTree) -> Float[Array, ""]:
         """H at a position and a momentum, `[L]`."""
         return self._at(t, q, p, params)[0]
 
-    def velocity(self, t, q, p, params) -> PyTree[Float[Array, "..."]]:
+    def velocity(self, t, q: PyTree, p, params: PyTree) -> PyTree[Float[Array, "..."]]:
         """The velocity that belongs to a momentum, like q, `[q]/[t]`."""
         return self._at(t, q, p, params)[1]
 
-    def rates(self, t, q, p, params) -> tuple[PyTree[Array], PyTree[Array]]:
+    def rates(self, t, q: PyTree, p, params: PyTree) -> tuple[PyTree[Array], PyTree[Array]]:
         """Hamilton's equations: `(q̇, ṗ)`, each like q, including the forces that L does not contain."""
         if self.system.constraints:
             raise ValueError(
@@ -122,7 +122,7 @@ class Hamiltonian(eqx.Module):
         _, v, momentum_rate = self._at(t, q, p, params)
         return v, momentum_rate
 
-    def _at(self, t, q, p, params):
+    def _at(self, t, q: PyTree, p, params: PyTree):
         if jax.tree.structure(p) != jax.tree.structure(q):
             has = [", ".join(coordinates.names(tree)) for tree in (q, p)]
             raise ValueError(
@@ -169,7 +169,7 @@ def hamiltonian(system: System) -> Hamiltonian:
 
 
 @compiled
-def _hamiltonian(system, t, q, p, params):
+def _hamiltonian(system, t, q: PyTree, p, params: PyTree):
     model = model_of(system, t, q, q, params)
     x, momentum = model.vectors(q, p)
 

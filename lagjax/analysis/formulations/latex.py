@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.exchange.from_sympy import sympy_itself
 from lagjax.jaxtools.jaxpr import MOVING, ClosedJaxpr, equations, interpreted
@@ -73,7 +73,7 @@ class EquationsOfMotion(eqx.Module):
         return f"{self}\n(verified to {self.error:.0e} at {self.states} states)"
 
 
-def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
+def latex(system, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> EquationsOfMotion:
     r"""Return Lagrange's equations of a small system in LaTeX, verified numerically.
 
     >>> import jax.numpy as jnp
@@ -130,7 +130,7 @@ def latex(system, q, v, params=None, *, t=0.0) -> EquationsOfMotion:
     return EquationsOfMotion(tuple(lines), error, STATES)
 
 
-def _symbols(model, s: coordinates.State) -> dict[Any, str]:
+def _symbols(model: Model, s: coordinates.State) -> dict[Any, str]:
     """The symbols of t, q, v, the parameters, multipliers and accelerations, with their LaTeX.
 
     The first character of a symbol's own name is its place among the factors of a product, and keeps names apart.

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax.analysis.formulations.hamiltonian import velocity_of
 from lagjax.jaxtools.cache import remembered
@@ -26,7 +26,7 @@ from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.constraints import Holonomic
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 
@@ -36,21 +36,21 @@ class Routhian(eqx.Module):
     system: System
     cyclic: tuple[str, ...] = eqx.field(static=True)
 
-    def __call__(self, t, q, v, params):
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
         """R at a state of the remaining coordinates, `[L]`."""
         q, v = jax.tree.map(jnp.asarray, coordinates.as_floats((q, v)))
         return self._at(t, q, v, params)[0]
 
-    def velocities(self, t, q, v, params) -> dict[str, Array]:
+    def velocities(self, t, q: PyTree, v: PyTree, params: PyTree) -> dict[str, Array]:
         """The velocities of the cyclic coordinates, by name, `[q]/[t]`; integrate them to get the coordinates."""
         s = coordinates.state(t, q, v, params)
         return dict(zip(self.cyclic, self._at(*s)[1]))
 
-    def full(self, q, of_cyclic: Mapping):
+    def full(self, q: PyTree, of_cyclic: Mapping):
         """The positions or velocities of all coordinates, from those of the remaining and of the cyclic ones."""
         return _together(q, self.cyclic, [of_cyclic[name] for name in self.cyclic])
 
-    def force(self, t, q, v, params):
+    def force(self, t, q: PyTree, v: PyTree, params: PyTree):
         """The generalised forces on the remaining coordinates, in the structure of `q`."""
         force = self.system.force
         assert force is not None
@@ -60,18 +60,18 @@ class Routhian(eqx.Module):
         indices = [_index(name) for name in self.cyclic]
         return jnp.stack([x for i, x in enumerate(jnp.asarray(forces)) if i not in indices])
 
-    def dissipation(self, t, q, v, params):
+    def dissipation(self, t, q: PyTree, v: PyTree, params: PyTree):
         """Rayleigh's function of the remaining coordinates."""
         dissipation = self.system.dissipation
         assert dissipation is not None
         return dissipation(t, *self._state(t, q, v, params), self._split(params)[0])
 
-    def _state(self, t, q, v, params):
+    def _state(self, t, q: PyTree, v: PyTree, params: PyTree):
         """The positions (zero for cyclic coordinates) and velocities of all coordinates."""
         u = self._at(t, q, v, params)[1]
         return _together(q, self.cyclic, [jnp.zeros_like(x) for x in u]), _together(v, self.cyclic, list(u))
 
-    def _at(self, t, q, v, params):
+    def _at(self, t, q: PyTree, v: PyTree, params: PyTree):
         params, momenta = self._split(params)
         shaped = coordinates.flatten(v)[0]
         zeros = [jnp.zeros_like(shaped[0])] * len(self.cyclic)
@@ -87,7 +87,7 @@ class Routhian(eqx.Module):
         u = jnp.where(found.regular & found.reached, found.v, jnp.nan)
         return of(u) - p @ u, u
 
-    def _split(self, params):
+    def _split(self, params: PyTree):
         if not isinstance(params, Mapping) or set(params) != {"params", "momenta"}:
             raise ValueError(
                 "the parameters of a Routhian are those of the system and the momenta.\n"
@@ -101,7 +101,7 @@ class Routhian(eqx.Module):
             )
         return params["params"], params["momenta"]
 
-    def _check(self, model):
+    def _check(self, model: Model):
         for name in self.cyclic:
             reason = next(what_changes_momentum(model, name), None)
             depends = next(forced_by(model, name), None)
@@ -159,7 +159,7 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
     reduced = Routhian(system, names)
 
     def constraint(g):
-        def of_rest(t, q, params):
+        def of_rest(t, q: PyTree, params: PyTree):
             rest, _ = reduced._split(params)
             zero = jnp.zeros_like(coordinates.flatten(q)[0][0])
             return g(t, _together(q, names, [zero] * len(names)), rest)
@@ -191,7 +191,7 @@ def _together(rest, names, values):
     )
 
 
-def _index(name):
+def _index(name: str):
     start, _, number = name.rstrip("]").rpartition("[")
     if start != "q" or not number.isdigit():
         raise ValueError(f"'{name}' is not an entry of an array q.\nFix: \"q[1]\".")

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.modes.reduced_matrices import LinearisationKind, LinearParts, parts_of
 from lagjax.jaxtools.cache import remembered
@@ -28,6 +28,7 @@ from lagjax.numerics.linalg.rank import DEPENDENT_BELOW
 from lagjax.system import constraints, coordinates
 from lagjax.system.check_functions import prepare
 from lagjax.system.coordinates import State
+from lagjax.system.model import Model
 
 # A state given with seven digits is accepted; frequencies are then accurate to about as many.
 STEADY_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
@@ -262,7 +263,7 @@ class Linearisation(eqx.Module):
         return "\n".join(rows)
 
 
-def linearise(system, t, q, v, params) -> Linearisation:
+def linearise(system, t, q: PyTree, v: PyTree, params: PyTree) -> Linearisation:
     """Return the linear equations of small motions about an equilibrium or a steady motion.
 
     >>> import jax.numpy as jnp
@@ -314,7 +315,7 @@ def linearise(system, t, q, v, params) -> Linearisation:
     return linearisation
 
 
-def _kind(model, s: State) -> LinearisationKind:
+def _kind(model: Model, s: State) -> LinearisationKind:
     """The static part of the linearisation."""
     system, holonomic = model.system, tuple(model.holonomic.tolist())
     known = remembered(model, invariance, lambda: invariance(model))
@@ -324,7 +325,7 @@ def _kind(model, s: State) -> LinearisationKind:
     return LinearisationKind(known.unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, known.timeless)
 
 
-def _chosen(kind, model, s, traced) -> tuple[bool, ...]:
+def _chosen(kind, model: Model, s, traced) -> tuple[bool, ...]:
     """A largest set of independent constraint equations, preferring those on positions."""
     if traced:
         raise ValueError(
@@ -348,13 +349,13 @@ def _chosen(kind, model, s, traced) -> tuple[bool, ...]:
     return tuple(bool(x) for x in chosen)
 
 
-def linearised(kind: LinearisationKind, model, s: State) -> Linearisation:
+def linearised(kind: LinearisationKind, model: Model, s: State) -> Linearisation:
     """The linear equations at another state of the same kind, steady or not."""
     return _linearised(kind, model, s)[0]
 
 
 @compiled
-def _linearised(kind: LinearisationKind, model, s: State) -> tuple[Linearisation, Steadiness]:
+def _linearised(kind: LinearisationKind, model: Model, s: State) -> tuple[Linearisation, Steadiness]:
     """The linearisation, and how far the state is from a steady motion."""
     parts = parts_of(kind, model, s)
     # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.

@@ -456,7 +456,7 @@ class NormalModes(eqx.Module):
         return "\n".join(rows)
 
 
-def normal_modes(system, t=None, q=None, v=None, params=None) -> NormalModes:
+def normal_modes(system, t=None, q: PyTree = None, v: PyTree = None, params: PyTree = None) -> NormalModes:
     """Return the modes of small motions about an equilibrium or a steady motion, and whether they stay small.
 
     >>> import jax.numpy as jnp

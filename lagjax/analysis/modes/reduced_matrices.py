@@ -190,7 +190,7 @@ def parts_of(kind: LinearisationKind, model: Model, s: State) -> LinearParts:
     )  # fmt: skip
 
 
-def _forces(kind: LinearisationKind, model, t, x, u):
+def _forces(kind: LinearisationKind, model: Model, t, x, u):
     """-∂F/∂u, -∂F/∂x and F, without constraint forces."""
     if kind.at_rest:
         # At rest there is no momentum, so the force is that of the potential.
@@ -232,7 +232,7 @@ def _least_squares(columns, target):
     return dense.solved(gram + jnp.diag(jnp.where(size > 0, 0.0, 1.0)), columns.T @ target)
 
 
-def _spread(rows, live, lift, chosen, multipliers):
+def _spread(rows, live, lift, chosen, multipliers: PyTree):
     """The shortest multipliers of all equations that exert the same force as the chosen ones."""
     if chosen.all():
         return multipliers

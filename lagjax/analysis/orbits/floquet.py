@@ -18,7 +18,7 @@ Source: Coddington & Levinson, *Theory of ODEs*, §3.5; Guckenheimer & Holmes, *
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.orbits.monodromy import period_of, problem_of, refuse_singular
 from lagjax.analysis.orbits.result import PeriodicOrbit
@@ -186,7 +186,9 @@ class Floquet(eqx.Module):
         return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
 
 
-def floquet(system, t=None, q=None, v=None, params=None, period=None, *, rtol=None) -> Floquet:
+def floquet(
+    system, t=None, q: PyTree = None, v: PyTree = None, params: PyTree = None, period=None, *, rtol=None
+) -> Floquet:
     """Return the Floquet multipliers of a motion that comes back after a period.
 
     The motion is a periodic orbit, or a state known to come back, such as rest in a driven system:

@@ -90,7 +90,7 @@ class Flow(eqx.Module):
         """(q, v) in the user's structure."""
         return self.model.tree(z[: self.size]), self.model.tree(z[self.size :])
 
-    def vector(self, q, v):
+    def vector(self, q: PyTree, v: PyTree):
         """The vector z of (q, v)."""
         return jnp.concatenate(self.model.vectors(q, v))
 
@@ -204,7 +204,7 @@ def independent_rows_of(model: Model, s: coordinates.State) -> tuple[int, ...] |
 
 
 @compiled
-def _normals(model, s):
+def _normals(model: Model, s):
     return jax.jacfwd(lambda z: _residual(model, s.t, z))(jnp.concatenate(model.vectors(s.q, s.v)))
 
 
@@ -213,7 +213,7 @@ def all_rows(model: Model) -> tuple[int, ...]:
     return tuple(range(int(model.holonomic.sum()) + model.m))
 
 
-def _residual(model, t, z):
+def _residual(model: Model, t, z):
     x, u = jnp.split(z, 2)
     return jnp.concatenate([constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)])
 

@@ -29,7 +29,7 @@ from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import is_traced, numpy_of
 from lagjax.system.argument_checks import by_name
 from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 from lagjax.system.system import System
 
 # Looser than for a cycle: averages over a motion that forgets its start do not depend on all its digits.
@@ -182,7 +182,7 @@ def _check(ts):
 
 
 @compiled
-def _followed(model, s, ts, rtol, rows, count):
+def _followed(model: Model, s, ts, rtol, rows, count):
     flow, t = flow_of(model, rtol, rows), s.t
     z = flow.vector(s.q, s.v)
     scale = _scale(flow, t, z)

@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, flow_of, independent_rows_of, scale_of
 from lagjax.jaxtools.compiled import compiled
@@ -57,7 +57,7 @@ class Reasons(NamedTuple):
     ignorable: tuple[bool, ...]
     momenta: bool
 
-    def names(self, q) -> tuple[str, ...]:
+    def names(self, q: PyTree) -> tuple[str, ...]:
         """A description of each direction, in the order of `directions`."""
         shifted = [name for name, yes in zip(coordinates.names(q), self.ignorable) if yes]
         return (

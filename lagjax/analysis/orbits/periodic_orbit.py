@@ -168,11 +168,11 @@ def _asked(problem, names, hold, relative) -> OrbitRequest:
     return OrbitRequest("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
 
 
-def _velocity(name):
+def _velocity(name: str):
     return f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}"
 
 
-def _no_such(argument, name, names):
+def _no_such(argument, name: str, names):
     near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
     return f"{argument} names '{name}', and there are {listed(names)}.\nFix: {argument}=\"{near}\"."
 

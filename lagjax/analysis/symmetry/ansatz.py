@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.analysis.symmetry.charge_rates import Affine
 from lagjax.mechanics.generators import AXES, points, turned
@@ -41,7 +42,7 @@ class Basis(NamedTuple):
     kinds: tuple[str, ...]
 
 
-def motions(q) -> Basis:
+def motions(q: PyTree) -> Basis:
     """The motions that are tried for coordinates with the structure of q."""
     all_points, n = points(q), len(coordinates.names(q))
     elements = [*_shifts(q, all_points, n), _element(TIME, "time", n, clock=-1.0), *_rotations(all_points, n)]
@@ -55,7 +56,7 @@ def motions(q) -> Basis:
     return Basis(Affine(*stacked), tuple(e.name for e in elements), tuple(e.kind for e in elements))
 
 
-def _shifts(q, all_points, n):
+def _shifts(q: PyTree, all_points, n):
     elements = []
     for k, axis in enumerate(AXES):
         moved = [point.places[k] for point in all_points if point.places[k] is not None]
@@ -81,7 +82,7 @@ def _rotations(all_points, n):
     return elements
 
 
-def _scalings(q, n):
+def _scalings(q: PyTree, n):
     elements = [_element("q·p", "scaling", n, matrix=np.eye(n))]
     if 1 < n <= EACH_UP_TO:
         for i, name in enumerate(coordinates.names(q)):
@@ -89,7 +90,7 @@ def _scalings(q, n):
     return [*elements, _element(f"t ({TIME})", "scaling", n, clock_rate=-1.0)]
 
 
-def _element(name, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
+def _element(name: str, kind, n, shift=None, matrix=None, drift=None, clock=0.0, clock_rate=0.0):
     zero = np.zeros(n)
     matrix = np.zeros((n, n)) if matrix is None else matrix
     shift, drift = (zero if x is None else x for x in (shift, drift))
@@ -137,7 +138,7 @@ class Gauge(NamedTuple):
         return Polynomial(tuple(self.powers[k] for k in kept), tuple(self.factors[k] for k in kept), weights[kept])
 
 
-def gauges(q) -> Gauge:
+def gauges(q: PyTree) -> Gauge:
     """The gauge functions that are tried for coordinates with the structure of q."""
     names = coordinates.names(q)
     n, monomials = len(names), []
@@ -163,7 +164,7 @@ class Polynomial(NamedTuple):
     factors: tuple[tuple[int, ...], ...]
     weights: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t, q: PyTree, params: PyTree):
         """The value of F."""
         x, _ = coordinates.flatten(q)
         total = jnp.zeros_like(x[0])
@@ -179,7 +180,7 @@ class Combination(NamedTuple):
     matrix: np.ndarray
     drift: np.ndarray
 
-    def __call__(self, t, q, params):
+    def __call__(self, t, q: PyTree, params: PyTree):
         """ξ, with the structure of q."""
         x, unflatten = coordinates.flatten(q)
         shift, matrix, drift = (jnp.asarray(y, x.dtype) for y in (self.shift, self.matrix, self.drift))
@@ -192,6 +193,6 @@ class Clock(NamedTuple):
     start: float
     rate: float
 
-    def __call__(self, t, q, params):
+    def __call__(self, t, q: PyTree, params: PyTree):
         """The value of τ."""
         return self.start + self.rate * t

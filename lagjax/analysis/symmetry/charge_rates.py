@@ -28,6 +28,7 @@ from lagjax.mechanics.generators import Generator
 from lagjax.mechanics.lagrangian import applied_force
 from lagjax.mechanics.noether import GeneratorFlow, flow
 from lagjax.system import constraints
+from lagjax.system.model import Model
 
 
 class Precision(NamedTuple):
@@ -119,7 +120,7 @@ class _StateRates(NamedTuple):
     charges: Array
 
 
-def rates(model, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
+def rates(model: Model, affine: Affine, generators: tuple[Generator, ...], s, places) -> Rates:
     """The rates of change of all charges at states around the given one."""
     states, scales = around(model, s, places)
     raw = _rates(model, affine, generators, states, scales)
@@ -151,7 +152,7 @@ def rates(model, affine: Affine, generators: tuple[Generator, ...], s, places) -
 
 
 @compiled
-def _rates(model, affine, generators, states, scales) -> _StateRates:
+def _rates(model: Model, affine, generators, states, scales) -> _StateRates:
     params, equations = model.params, equations_of(model) if model.reacts else None
 
     def at(t, x, u):
@@ -176,7 +177,7 @@ def _rates(model, affine, generators, states, scales) -> _StateRates:
     return jax.vmap(at)(*states[:3])
 
 
-def _constraint_rates(model, scales, state, moved, turned, displaced):
+def _constraint_rates(model: Model, scales, state, moved, turned, displaced):
     """A (ξ - τ v) (m, K), the size of each row of A (m,), and the change of each velocity constraint (m, K)."""
     t, x, u = state
     if not model.m:

@@ -9,7 +9,7 @@ way everywhere on the table, but its momentum changes.
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.symmetry.charge_rates import Affine, precision_of, rates
 from lagjax.analysis.symmetry.random_states import draws
@@ -95,7 +95,7 @@ class SymmetryTest(eqx.Module):
         ])  # fmt: skip
 
 
-def is_symmetry(system, generator, q, v, params=None, *, t=0.0) -> SymmetryTest:
+def is_symmetry(system, generator, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> SymmetryTest:
     """Test whether a one-parameter group is a symmetry of a system and conserves its charge.
 
     >>> import lagjax as lj

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools.cache import remembered
 from lagjax.jaxtools.compiled import compiled
@@ -21,6 +21,7 @@ from lagjax.mechanics.generators import points
 from lagjax.mechanics.structure import are_angles
 from lagjax.numerics.newton import newton
 from lagjax.system import constraints, coordinates
+from lagjax.system.model import Model
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 VELOCITY_WIDTHS = np.array([1.0, 0.3, 1.0, 0.0])
@@ -61,7 +62,7 @@ def draws(count: int, n: int) -> np.ndarray:
     return random
 
 
-def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
+def around(model: Model, s: coordinates.State, places) -> tuple[States, StateScales]:
     """The states at the displacements `places` from a given one, moved onto the constraints."""
     # With concrete values only the program that moves states is compiled, and all questions about a system share it.
     xp = numpy_of((s, model))
@@ -88,7 +89,7 @@ def around(model, s: coordinates.State, places) -> tuple[States, StateScales]:
     return states, scales
 
 
-def sizes(model, s: coordinates.State, x, u) -> StateScales:
+def sizes(model: Model, s: coordinates.State, x, u) -> StateScales:
     """The size of each coordinate and velocity of a state."""
     xp, same = numpy_of((x, u)), _groups(s.q)
 
@@ -107,7 +108,7 @@ def sizes(model, s: coordinates.State, x, u) -> StateScales:
     return StateScales(of_x, xp.where(of_u > 0, of_u, pace * of_x), 1 / pace)
 
 
-def _groups(q) -> np.ndarray:
+def _groups(q: PyTree) -> np.ndarray:
     """Which coordinates share one size, (n, n): those of an array, and those of a point."""
     label = np.zeros(0, int)
     for i, leaf in enumerate(jax.tree.leaves(q)):
@@ -119,11 +120,11 @@ def _groups(q) -> np.ndarray:
 
 
 @compiled
-def _onto_constraints(model, scales, t, xs, us):
+def _onto_constraints(model: Model, scales, t, xs, us):
     return jax.vmap(lambda t, x, u: _on_constraints(model, scales, t, x, u))(t, xs, us)
 
 
-def _on_constraints(model, scales, t, x, u):
+def _on_constraints(model: Model, scales, t, x, u):
     def position(x: Array):
         return constraints.position_residual(model, t, x)
 

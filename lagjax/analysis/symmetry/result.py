@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.mechanics.noether import NoetherCharge
 from lagjax.system import coordinates
@@ -56,7 +57,7 @@ class Words(NamedTuple):
     factor: float
 
 
-def named_parameters(params) -> dict[str, float]:
+def named_parameters(params: PyTree) -> dict[str, float]:
     """The numeric parameters, by name."""
 
     def number_or_none(x: Any) -> np.ndarray | None:
@@ -104,11 +105,11 @@ def in_words(coefficients, names, params: dict[str, float], agrees: float, first
     return Words(text + (f" with {values}" if values else ""), size / leading)
 
 
-def _value(number: RecognisedNumber, params) -> float:
+def _value(number: RecognisedNumber, params: PyTree) -> float:
     return float(number.fraction) * np.pi**number.pi * float(np.prod([params[p] ** e for p, e in number.params]))
 
 
-def _recognised(value: float, params, agrees, parameters_first) -> RecognisedNumber | None:
+def _recognised(value: float, params: PyTree, agrees, parameters_first) -> RecognisedNumber | None:
     """The form in which a number is recognised; None if there is none."""
     if abs(value - 1.0) <= agrees:
         return RecognisedNumber(Fraction(1))
@@ -134,7 +135,7 @@ def _recognised(value: float, params, agrees, parameters_first) -> RecognisedNum
     return (clear or [found for found in alike if not found.params] or [None])[0]
 
 
-def _agreeing(value, number: RecognisedNumber, params, agrees):
+def _agreeing(value, number: RecognisedNumber, params: PyTree, agrees):
     recognised = _value(number, params) if all(params[p] for p, _ in number.params) else 0.0
     if not recognised or abs(abs(value) - abs(recognised)) > agrees * abs(value):
         return None
@@ -203,7 +204,7 @@ class Symmetries(eqx.Module):
     at: str = eqx.field(static=True)
     of: str = eqx.field(static=True)
 
-    def __getitem__(self, name) -> NoetherCharge:
+    def __getitem__(self, name: str) -> NoetherCharge:
         if name not in self.details:
             raise KeyError(f"no symmetry '{name}' was found; there are {', '.join(map(repr, self.details)) or 'none'}")
         return self.details[name].charge
@@ -214,7 +215,7 @@ class Symmetries(eqx.Module):
     def __len__(self) -> int:
         return len(self.details)
 
-    def __contains__(self, name) -> bool:
+    def __contains__(self, name: str) -> bool:
         return name in self.details
 
     def keys(self):

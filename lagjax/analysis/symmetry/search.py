@@ -26,6 +26,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax.analysis.symmetry.ansatz import Basis, Clock, Combination, Gauge, gauges, motions
 from lagjax.analysis.symmetry.charge_rates import Affine, Precision, Rates, precision_of, rates
@@ -41,7 +42,7 @@ from lagjax.mechanics.structure import conserved_momenta
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.check_functions import traced_system
-from lagjax.system.model import model_of
+from lagjax.system.model import Model, model_of
 
 PIVOT_ABOVE = 1e-2
 
@@ -144,7 +145,7 @@ def _cleaned(row, zero_below):
     return np.where(np.abs(row) > zero_below * np.max(np.abs(row)), row, 0.0)
 
 
-def scalings_of(model, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
+def scalings_of(model: Model, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
     """The scalings that multiply L by a factor."""
     if model.system.force is not None or model.system.dissipation is not None:
         return ()
@@ -195,7 +196,9 @@ def _tidied(exponents, action, residual, agrees) -> Scaling:
     return Scaling({name: x for name, x in shown.items() if x}, factor, residual)
 
 
-def symmetries(system, q, v, params=None, *, basis: Iterable | Mapping | None = None, t=0.0) -> Symmetries:
+def symmetries(
+    system, q: PyTree, v: PyTree, params: PyTree = None, *, basis: Iterable | Mapping | None = None, t=0.0
+) -> Symmetries:
     """Find the symmetries of a system within a basis of motions, and what they conserve.
 
     >>> import lagjax as lj
@@ -298,7 +301,7 @@ class _Spaces(NamedTuple):
     gap: float
 
 
-def _found(model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
+def _found(model: Model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
     precision = precision_of(s.t.dtype)
     columns = _columns(tried, own, gauge, sampled)
     spaces = _spaces(columns, gauge, precision)
@@ -458,7 +461,7 @@ def _words(physical, names, weights, gauge: Gauge, parameters, agrees) -> Words:
     return in_words(numbers, named, parameters, agrees, first=[gauge.names[i] for i in of_gauge])
 
 
-def _generator(physical, weights, tried: Basis, own, gauge, name) -> Generator:
+def _generator(physical, weights, tried: Basis, own, gauge, name: str) -> Generator:
     """The combination as one generator."""
     n_own = len(own)
     affine = physical[n_own:]
