@@ -4,7 +4,7 @@ Two tiers of tests, and an option; `.ci/run` runs the scenes and both tiers:
 
     python -m lagjax    the scenes: error against exact motions by method and tolerance, stiff and extreme cases,
                         pictures; the reduced stability report. The exit status is 1 if anything is missed, which
-                        `test_main.py` and `test_stability.py` check.
+                        `test_job.py` and `test_stability.py` check.
     pytest              every module on programs that compile in seconds; messages; docstring examples; architecture.
     pytest -m slow
                         tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.mechanics.test_redundancy import DOOR_STATE, RATE, door, twice
+from tests.mechanics.test_saddle_point import DOOR_STATE, RATE, door, twice
 from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
 from tests.tiers import exhaustive_but
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanisms import MECHANISMS, andrews, car_axis, driven_crank, fekete, n_four_bar
+from lagjax.mechanisms import MECHANISMS, andrews, car_axis
 from tests.mechanisms import published
-from tests.mechanisms.test_equations import stacked
+from tests.mechanisms.test_mechanism import stacked
 from tests.tiers import exhaustive_but
 
 pytestmark = pytest.mark.slow
@@ -93,11 +93,6 @@ def test_end_state_depends_on_the_parameters(name, parameter):
     assert np.max(relative_errors(traj, mechanism.reference)) > 1e3 * 1e-8
 
 
-def test_andrews_published_end():
-    """At 1e-8, the end published for Andrews' mechanism is reached as well as the recomputed one."""
-    assert np.all(relative_errors(run(andrews.MECHANISM, 1e-8), andrews.MECHANISM.reference) <= WITHIN * 1e-8)
-
-
 @pytest.mark.parametrize(
     ("module", "sign", "names", "digits"),
     [(andrews, -1.0, ("loops",), 1e-6), (car_axis, 1.0, ("upright", "axle"), 1e-8)],
@@ -108,51 +103,3 @@ def test_multipliers_of_the_source(module, sign, names, digits):
     ours = np.concatenate([np.ravel(traj.multipliers[name][-1]) for name in names])
     theirs = np.array(module.SOURCE_MULTIPLIERS[-1] if module is andrews else module.SOURCE_MULTIPLIERS)
     assert np.max(np.abs(ours - sign * theirs)) <= digits * np.max(np.abs(theirs))
-
-
-def test_andrews_multipliers_at_the_start():
-    """λ(0) is the source's with its sign reversed."""
-    traj = run(andrews.MECHANISM, 1e-10)
-    assert np.max(np.abs(np.asarray(traj.multipliers["loops"][0]) + andrews.SOURCE_MULTIPLIERS[0])) <= 1e-10
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("rtol", TOLERANCES)
-def test_ladder_before_it_lies_down(rtol):
-    """The chain of four-bars agrees with the elliptic functions before the first singular position."""
-    mechanism = n_four_bar.MECHANISM
-    traj = run(mechanism, rtol, end=0.5)
-    assert float(traj.residual()) <= 1e-12
-    errors = relative_errors(traj, published.ladder_end(2, 0.5, mechanism.params)) / rtol
-    assert np.all(errors <= WITHIN), errors
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("rtol", exhaustive_but((1e-8,), (*TOLERANCES, 1e-12)))
-def test_singular_position_is_passed_or_reported(rtol):
-    """After the first singular position the end is right, or the integration reports that it failed."""
-    mechanism = n_four_bar.MECHANISM
-    traj = lj.integrate(
-        mechanism.system, mechanism.q0, mechanism.v0, mechanism.params,
-        ts=np.array([0.0, 1.0]), rtol=rtol, atol=rtol, throw=False,
-    )  # fmt: skip
-    right = np.all(relative_errors(traj, published.ladder_end(2, 1.0, mechanism.params)) <= WITHIN * rtol)
-    assert right or not bool(traj.result == lj.RESULTS.successful)
-
-
-@pytest.mark.exhaustive
-def test_motor_of_the_driven_crank():
-    """At all times the motion is that of the closed form, and the drive's multiplier is the motor's torque."""
-    mechanism = driven_crank.MECHANISM
-    ts = np.linspace(0.0, mechanism.end, 33)
-    traj = lj.integrate(mechanism.system, mechanism.q0, mechanism.v0, mechanism.params, ts=ts, rtol=1e-8, atol=1e-8)
-    q, v, torque = driven_crank.exact(ts, mechanism.params)
-    for ours, exact in zip(jax.tree.leaves((traj.q, traj.v)), jax.tree.leaves((q, v))):
-        np.testing.assert_allclose(ours, exact, atol=1e-13 * np.max(np.abs(exact)))
-    np.testing.assert_allclose(traj.multipliers["motor"], torque, atol=1e-13 * np.max(np.abs(torque)))
-
-
-@pytest.mark.exhaustive
-def test_fekete_multipliers():
-    """At rest every multiplier is -(N - 1)/4, for any arrangement."""
-    np.testing.assert_allclose(run(fekete.MECHANISM, 1e-10).multipliers["sphere"][-1], -19 / 4, rtol=1e-12)

@@ -17,11 +17,6 @@ STATE = (
 )
 
 
-def rod_square(q):
-    """The squared distance from the pivot."""
-    return q["x"] ** 2 + q["y"] ** 2
-
-
 def twice(factor):
     """The rod given again, in another scale."""
     again = lj.Holonomic(lambda t, q, params: factor * rod(t, q, params))
@@ -95,56 +90,6 @@ def test_door_on_three_hinges():
 
 
 @pytest.mark.exhaustive
-def test_report_names_dependent_constraints_and_counts_freedoms():
-    """`explain`: a pendulum on two rods has one degree of freedom, and both rods are named."""
-    pair = lj.explain(twice(2.0), *STATE)
-    assert pair.degrees_of_freedom == 1
-    assert set(pair.dependent[0]) == {"rod", "again"}
-    assert lj.explain(rod_pendulum, *STATE).dependent == ()
-
-
-@pytest.mark.exhaustive
-def test_report_of_a_rounded_state():
-    """The door has one degree of freedom and seven dependent equations, also at a state typed with six digits.
-
-    Such a state is moved onto the constraints first.
-    """
-    report = lj.explain(door, *DOOR_STATE)
-    assert report.degrees_of_freedom == report.position_freedoms == 1
-    assert len(report.dependent) == 7
-    assert "18, of which 11 independent" in repr(report)
-    rounded = {"corner": np.round(DOOR_STATE[1]["corner"], 6)}
-    assert lj.explain(door, 0.0, rounded, DOOR_STATE[2], DOOR_STATE[3]).degrees_of_freedom == 1
-
-
-@pytest.mark.exhaustive
-def test_report_of_a_state_with_other_velocities():
-    """Velocities off the constraints are reported first, and the nearest state on them is judged: no contradiction.
-
-    `accelerations` takes the state as it is, and its error says so too. If no state is on them, that is the problem.
-    """
-    length = lj.Holonomic(lambda t, q, params: jnp.sqrt(rod_square(q)) - params["l"])
-    pair = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "length": length})
-    along = {"x": STATE[2]["x"] + np.sin(2.0), "y": STATE[2]["y"] - np.cos(2.0)}
-    report = lj.explain(pair, 0.0, STATE[1], along, PARAMS)
-    assert report.problem is None and report.degrees_of_freedom == 1
-    labels = [label for label, _ in report.rows]
-    assert labels[:2] == ["at", "off the constraints"]
-    assert "d/dt 'length' = 1" in dict(report.rows)["off the constraints"]
-    words = r"(?s)is off them: d/dt 'length' = 1, .* instead of 0\..*Fix: q, v = lj.consistent_state"
-    with pytest.raises(ValueError, match=words):
-        lj.accelerations(pair, 0.0, STATE[1], along, PARAMS)
-    longer = lj.Holonomic(lambda t, q, params: rod_square(q) - 4.0 * params["l"] ** 2)
-    torn = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "longer": longer})
-    report = lj.explain(torn, *STATE)
-    assert "no state near it is on them" in repr(report) and "no consistent state" in str(report.problem)
-    # The velocities satisfy both, but only one of them can be followed: these do contradict each other.
-    moved = lj.Holonomic(lambda t, q, params: rod_square(q) - (params["l"] + t**2) ** 2)
-    against = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "moved": moved})
-    assert "contradict each other" in str(lj.explain(against, *STATE).problem)
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("mode", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
 def test_derivatives_of_shared_multipliers(mode):
     """Accelerations and shortest multipliers have the derivatives of their closed forms, in lanes too."""
@@ -168,22 +113,6 @@ def test_derivatives_of_shared_multipliers(mode):
     got, expected = jax.vmap(mode(outcome))(lanes), jax.vmap(jax.jacfwd(exact))(lanes)
     for name in lanes:
         np.testing.assert_allclose(got[name], expected[name], atol=1e-11)
-
-
-@pytest.mark.exhaustive
-def test_contradictory_accelerations_are_named():
-    """One coordinate driven by two motions that agree in position and velocity only: no acceleration satisfies both."""
-    drive = lambda rate: lj.Holonomic(lambda t, q, params: q["x"] - 0.5 * rate * t**2)
-    system = lj.System(cartesian_lagrangian, {"slow": drive(1.0), "fast": drive(2.0)})
-    at_rest = {"x": 0.0, "y": 0.0}
-    with pytest.raises(ValueError, match="(?s)'slow' and 'fast' contradict each other.*Fix:"):
-        lj.accelerations(system, 0.0, at_rest, at_rest, PARAMS)
-    with pytest.raises(ValueError, match="(?s)'slow' and 'fast' contradict each other.*Fix:"):
-        lj.integrate(system, at_rest, at_rest, PARAMS, ts=[0.0, 1.0])
-    traced = jax.jit(lambda x: lj.accelerations(system, 0.0, {"x": x, "y": 0.0}, at_rest, PARAMS))(0.0)
-    assert np.isnan(traced[0]["x"])
-    agreeing = lj.System(cartesian_lagrangian, {"slow": drive(1.0), "fast": drive(1.0)})
-    assert float(lj.accelerations(agreeing, 0.0, at_rest, at_rest, PARAMS)[0]["x"]) == pytest.approx(1.0, rel=1e-15)
 
 
 def test_equilibrium_is_no_contradiction():

@@ -12,14 +12,13 @@ import tracemalloc
 import warnings
 import zipfile
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.files import npz, tree_json
+from lagjax.files import npz
 from lagjax.files import table as file_table
 from lagjax.sweep import chunks, metadata, result, store
 from tests import mutated
@@ -179,51 +178,6 @@ def test_changed_stores(good, tmp_path):
     """Thirty changed stores, some of which can be read."""
     wrong, read = attack_stores(good / "store", tmp_path, range(30))
     assert wrong == [] and 0 < read < 25
-
-
-class Linear(eqx.Module):
-    """A class of the user's, named like one of the table."""
-
-    slope: jax.Array
-
-
-def test_the_table():
-    """Each class of the table exists, with its fields, wherever its package keeps it; nothing else is found.
-
-    A class of the user's is found by its full name, and by its own only if that is not in the table.
-    """
-    table = file_table.Table([Linear])
-    for key in file_table.LISTED:
-        package, name = key.split(".")
-        cls, fields, of_table = table.class_of(f"{package}._moved.elsewhere", name)
-        assert of_table and set(fields) <= {*(file_table.fields_of(cls) or ())} and cls.__name__ == name
-    assert table.class_of("equinox.nn._linear", "Linear")[0] is eqx.nn.Linear
-    assert table.class_of(__name__, "Linear")[0] is Linear and table.class_of("__main__", "Linear")[0] is Linear
-    assert table.function_of("jax._src.nn.functions", "softplus") is jax.nn.softplus
-    for module, name in (("os", "system"), ("jax", "jit"), ("equinox", "Partial"), ("lagjax", "System"), ("", "")):
-        with pytest.raises(file_table.UnknownClass, match="neither lagjax's nor passed"):
-            table.class_of(module, name)
-        with pytest.raises(ValueError, match="functions are not read from files"):
-            table.function_of(module, name)
-
-
-def test_a_network_comes_back(good, tmp_path):
-    """Layers with their activations come back, and a field of another kind is refused."""
-    net = lj.learned.Network({"x": 1.0}, key=jax.random.key(0), width=4, activation=jax.nn.softplus)
-    writer = tree_json.Writer()
-    node = writer.down(net, "net")
-    again = tree_json.Reader(dict(writer.arrays).pop).up(node)
-    assert eqx.tree_equal(net, again) and again({"x": 0.3}) == net({"x": 0.3})
-    for field, value in (
-        ("sizes", "wide"),
-        ("sizes", {"list": []}),
-        ("angular", {"dict": []}),
-        ("mlp", 3),
-        ("other", 1),
-    ):
-        wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
-        with pytest.raises(ValueError, match=f"field {field}"):
-            tree_json.Reader(dict(writer.arrays).pop).up(wrong)
 
 
 def changed(good, path, change):

@@ -108,7 +108,7 @@ EAGER = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp, numpy as np, lagjax as lj
-from tests.test_no_batch_of_library_calls import AT, end, OWN, RING
+from tests.behaviour.test_no_batch_of_library_calls import AT, end, OWN, RING
 ts, system, q, v = jnp.linspace(0.0, 0.2, 5), *AT["own"]
 lj.energy_ledger(lj.integrate(RING, AT["ring"][1], AT["ring"][2], {"k": 1.0}, ts=ts))
 motion = lj.integrate(OWN, q, v, {"k": 1.5}, ts=ts)
@@ -126,7 +126,7 @@ if hasattr(os, "sched_setaffinity"):
 
 def programs_of(script, folder, **environment):
     """The text of every program that a script compiles in a process with two cores and a time limit."""
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     environment = {**os.environ, "JAX_DUMP_IR_TO": str(folder), "OPENBLAS_NUM_THREADS": "1", **environment}
     subprocess.run([sys.executable, "-c", TWO_CORES + script], cwd=root, env=environment, check=True, timeout=LIMIT)
     return [path.read_text() for path in folder.glob("*.mlir")]

@@ -1,0 +1,27 @@
+"""Objects as JSON and arrays come back, and a field of another kind is refused."""
+
+import equinox as eqx
+import jax
+import pytest
+
+import lagjax as lj
+from lagjax.files import tree_json
+
+
+def test_a_network_comes_back():
+    """Layers with their activations come back, and a field of another kind is refused."""
+    net = lj.learned.Network({"x": 1.0}, key=jax.random.key(0), width=4, activation=jax.nn.softplus)
+    writer = tree_json.Writer()
+    node = writer.down(net, "net")
+    again = tree_json.Reader(dict(writer.arrays).pop).up(node)
+    assert eqx.tree_equal(net, again) and again({"x": 0.3}) == net({"x": 0.3})
+    for field, value in (
+        ("sizes", "wide"),
+        ("sizes", {"list": []}),
+        ("angular", {"dict": []}),
+        ("mlp", 3),
+        ("other", 1),
+    ):
+        wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
+        with pytest.raises(ValueError, match=f"field {field}"):
+            tree_json.Reader(dict(writer.arrays).pop).up(wrong)

@@ -1,0 +1,38 @@
+"""The driven crank against its closed form, and its motor's torque."""
+
+import jax
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.mechanisms import driven_crank
+from tests.mechanisms.test_mechanism import assert_reference, stacked
+
+
+def test_driven_crank():
+    """The closed form gives the stored start and end, and its velocity is its position's derivative."""
+    mechanism = driven_crank.MECHANISM
+    q, v, _ = driven_crank.exact(mechanism.end, mechanism.params)
+    assert_reference(mechanism, stacked(q), stacked(v))
+    q, v, _ = driven_crank.exact(0.0, mechanism.params)
+    np.testing.assert_allclose(stacked((q, v)), stacked((mechanism.q0, mechanism.v0)), atol=1e-14)
+    at = lambda t: stacked(driven_crank.exact(t, mechanism.params)[0])
+    step = 2.0**-20
+    np.testing.assert_allclose(
+        (at(0.03 + step) - at(0.03 - step)) / (2 * step),
+        stacked(driven_crank.exact(0.03, mechanism.params)[1]),
+        rtol=1e-6,
+        atol=1e-6,
+    )
+
+
+@pytest.mark.exhaustive
+def test_motor_of_the_driven_crank():
+    """At all times the motion is that of the closed form, and the drive's multiplier is the motor's torque."""
+    mechanism = driven_crank.MECHANISM
+    ts = np.linspace(0.0, mechanism.end, 33)
+    traj = lj.integrate(mechanism.system, mechanism.q0, mechanism.v0, mechanism.params, ts=ts, rtol=1e-8, atol=1e-8)
+    q, v, torque = driven_crank.exact(ts, mechanism.params)
+    for ours, exact in zip(jax.tree.leaves((traj.q, traj.v)), jax.tree.leaves((q, v))):
+        np.testing.assert_allclose(ours, exact, atol=1e-13 * np.max(np.abs(exact)))
+    np.testing.assert_allclose(traj.multipliers["motor"], torque, atol=1e-13 * np.max(np.abs(torque)))
