@@ -10,7 +10,6 @@ import json
 import re
 import subprocess
 import sys
-import textwrap
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -251,11 +250,3 @@ def test_the_site_builds(tmp_path):
     assert len(pages) > 100
     assert faults(pages) == []
     assert all((tmp_path / "html" / "api" / f"{api_pages.page_of(name)}.html").exists() for name in lj.__all__)
-
-
-def test_the_advice_for_notebooks_is_what_was_measured():
-    """The lines for Jupyter's configuration in the known gaps are those of the benchmark."""
-    source = (DOCS.parent / "benchmarks" / "speed" / "slider_response.py").read_text()
-    measured = re.search(r'WITHOUT_DELAY = """\n(.*?)"""', source, re.DOTALL)
-    advised = re.search(r"  ```py\n(.*?)  ```", (DOCS / "known-gaps.md").read_text(), re.DOTALL)
-    assert measured and advised and textwrap.dedent(advised[1]) == measured[1]

@@ -12,8 +12,7 @@ stands the processor time of the processes per press; the browser continues afte
 
 Presses come three tenths of a second apart, as from a hand that looks, and in quick succession. In quick succession a
 message of JupyterLab's server waits up to 40 ms until the browser's machine acknowledges the one before it (Nagle's
-algorithm and TCP's delayed acknowledgement); the rows "without delay" are measured with the remedy that
-`docs/known-gaps.md` shows.
+algorithm and TCP's delayed acknowledgement).
 
     python -m benchmarks.speed.slider_response [--json FILE] [--only TEXT]
 
@@ -54,20 +53,6 @@ PRESSES, DRAGGED = 60, 100
 PICTURE = ".widget-vbox .widget-html-content"
 # Seconds between a picture and the next press, and the key; back again, so that a slider's range suffices.
 PACES = {"": (0.3, "ArrowRight"), ", in quick succession": (0.05, "ArrowLeft")}
-# What `docs/known-gaps.md` advises for jupyter_server_config.py.
-WITHOUT_DELAY = """
-from jupyter_server.services.kernels.websocket import KernelWebsocketHandler
-
-opened = KernelWebsocketHandler.open
-
-
-async def open(self, kernel_id):
-    await opened(self, kernel_id)
-    self.set_nodelay(True)
-
-
-KernelWebsocketHandler.open = open
-"""
 # Variables that keep the run from reading or writing the user's own settings.
 OF_JUPYTER = ("JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR", "JUPYTERLAB_SETTINGS_DIR")
 # Times from the key to the end of the frame that shows the new picture, after scripts, layout and painting.
@@ -92,7 +77,6 @@ def rows(wanted):
         yield from in_this_process(space["knobs"])
     for what, measured in (
         ("notebook", in_the_notebook),
-        ("notebook without delay", without_delay),
         ("page", lambda: in_the_page(space["run"])),
     ):
         if wanted(what):
@@ -131,15 +115,9 @@ def milliseconds(function, repeats=30):
     return 1e3 * (time.process_time() - began) / repeats
 
 
-def without_delay():
-    """JupyterLab with a server that does not wait for acknowledgements."""
-    yield from in_the_notebook("notebook without delay", WITHOUT_DELAY)
-
-
-def in_the_notebook(what="notebook", config=""):
+def in_the_notebook():
     """JupyterLab with one notebook of one cell."""
     with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "jupyter_server_config.py").write_text(config)
         cell = {"cell_type": "code", "source": CELL + "knobs", "metadata": {}, "outputs": [], "execution_count": None}
         kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
         notebook = {"cells": [cell], "metadata": kernel, "nbformat": 4, "nbformat_minor": 4}
@@ -164,7 +142,7 @@ def in_the_notebook(what="notebook", config=""):
                 page.run("jupyterapp.commands.execute('notebook:run-all-cells').then(() => null)")
                 page.wait(f"document.querySelector('{PICTURE} svg')", 240)
                 roots = browser.process.pid, lab.pid
-                yield from measured(page, what, PICTURE, ".widget-slider .noUi-handle", 50, roots)
+                yield from measured(page, "notebook", PICTURE, ".widget-slider .noUi-handle", 50, roots)
                 if os.environ.get("LAGJAX_PICTURE"):
                     page.picture(os.environ["LAGJAX_PICTURE"])
         finally:
