@@ -12,12 +12,12 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.display.progress import meter, waiting
-from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit.problem.arguments import FitWarning, problem_of
 from lagjax.fit.problem.checks import check_motion
 from lagjax.fit.problem.parameters import FreeNumbers
 from lagjax.fit.problem.records import Record, Windows
 from lagjax.fit.problem.residuals import JOINING, FitProblem, Stage
-from lagjax.fit.result.result import Fit, FitWarning
+from lagjax.fit.result.result import Fit
 from lagjax.fit.result.warnings import caveats
 from lagjax.fit.search.search import Course, evaluate, listening, search
 from lagjax.integrate.solve.harvest import reported

@@ -14,7 +14,6 @@ from lagjax.fit.problem.initial_states import starts
 from lagjax.fit.problem.parameters import FreeNumbers, find, leaf_name
 from lagjax.fit.problem.records import KINDS, Record, Windows, channels, cut, spread
 from lagjax.fit.problem.residuals import LOSSES, FitProblem, replace
-from lagjax.fit.result.result import FitWarning
 from lagjax.integrate.events.event import Crossing, traced_guard
 from lagjax.integrate.solve.phases import traced_phases
 from lagjax.jaxtools.tracing import is_traced, numpy_of
@@ -30,6 +29,10 @@ from lagjax.system.user_errors import Call
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}
+
+
+class FitWarning(UserWarning):
+    """A fit has a result, but with reservations that the message states."""
 
 
 def problem_of(

@@ -21,6 +21,7 @@ from lagjax.display import plots as plot
 from lagjax.display.printable import by_line
 from lagjax.files import npz
 from lagjax.files.tree_json import NotGiven, NotWritable, Writer
+from lagjax.fit.problem.arguments import FitWarning
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.problem.residuals import LOSSES, WHOLE, FitProblem, dampened, equations, starts_at
 from lagjax.fit.search.search import Evaluation, Misfit
@@ -107,10 +108,6 @@ def _plus_minus(x: float, sd: float):
 
 # A number is at its bound if it is closer to it than this, relative to its start value.
 AT_BOUND = 1e-6
-
-
-class FitWarning(UserWarning):
-    """A fit has a result, but with reservations that the message states."""
 
 
 class Channel(NamedTuple):
