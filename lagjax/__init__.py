@@ -38,9 +38,9 @@ from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning
 from lagjax.integrate.integrate import integrate
+from lagjax.integrate.load import load_trajectory
 from lagjax.integrate.solve.over_jumps import JumpWarning
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
-from lagjax.integrate.trajectory.load import load_trajectory
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Snapshot, Trajectory
 from lagjax.numerics.methods.nystrom import Nystrom8, Nystrom12

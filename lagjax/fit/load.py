@@ -17,7 +17,7 @@ from lagjax.files.tree_json import NotGiven, Reader
 from lagjax.fit.problem.initial_states import unflatten_of
 from lagjax.fit.result.result import Fit
 from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.load import described_system, same_system
+from lagjax.integrate.load import described_system, same_system
 from lagjax.jaxtools.cache import kinds
 from lagjax.mechanics.diagnosis import listed
 from lagjax.system.hybrid import Hybrid

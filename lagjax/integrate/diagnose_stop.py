@@ -25,9 +25,9 @@ from jaxtyping import PyTree
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
 from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.projected_solver import Field
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import of_a_step

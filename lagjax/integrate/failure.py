@@ -16,8 +16,8 @@ from jaxtyping import PyTree
 from lagjax.integrate import arguments
 from lagjax.integrate.diagnose_guard import of_guards
 from lagjax.integrate.diagnose_stop import stopped_early
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import pack

@@ -20,13 +20,13 @@ from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
+from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.solve.backward_time import backward_trajectory_of, runs_backward
 from lagjax.integrate.solve.error_estimate import steps_to_repeat
 from lagjax.integrate.solve.harvest import report
 from lagjax.integrate.solve.over_jumps import warn_of_lost
 from lagjax.integrate.solve.phases import phases_in, refuse_beside_switches, traced_phases
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.solve.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory

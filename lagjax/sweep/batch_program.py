@@ -25,8 +25,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceShardin
 from jaxtyping import Array, PyTree
 
 from lagjax.display.progress import waiting
+from lagjax.integrate.settings import PATIENCE
 from lagjax.integrate.solve.harvest import reporting, watched
-from lagjax.integrate.solve.settings import PATIENCE
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools.cache import program_of

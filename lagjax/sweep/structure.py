@@ -20,7 +20,7 @@ from lagjax.display.printable import by_line, printable
 from lagjax.files.npz import MALFORMED
 from lagjax.files.table import Table
 from lagjax.files.tree_json import KINDS_OF_ARRAY, NotWritable, Reader, Writer
-from lagjax.integrate.trajectory.load import check_is_system, described_system, same_system, trajectory_from
+from lagjax.integrate.load import check_is_system, described_system, same_system, trajectory_from
 from lagjax.integrate.trajectory.save import described, parts
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.sweep.axes import Axes

@@ -28,12 +28,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.analysis.modes.eigenmodes import roots_beside_zeros
 from lagjax.jaxtools.without_lapack_batches import jitted
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.multiplier_forces import response
 from lagjax.numerics.linalg import dense, lapack
 from lagjax.numerics.linalg.dense import reciprocal_condition
+from lagjax.numerics.linalg.eigenvalues import roots_beside_zeros
 from lagjax.numerics.linalg.rank import independent_rows
 from lagjax.system import constraints
 from lagjax.system.model import Model
@@ -250,8 +250,8 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
     """All roots s of departures e^(st), (2n,), with NaN in place of the roots that constraints remove.
 
     Departures along the symmetry are left out: they lead to the same motion. All roots are NaN where the equations of
-    motion are singular. Derivatives follow `eigenmodes.py`, as for `lj.normal_modes`, which reports more about one
-    state; this function serves many states inside compiled programs, and any symmetry.
+    motion are singular. Derivatives are those of `numerics/linalg/eigenvalues.py`. `lj.normal_modes` reports more about
+    one state; this function serves many states inside compiled programs, and any symmetry.
     """
     d, n = departures(s, y, jacobian), s.n
     project, count = directions(s, d, y)

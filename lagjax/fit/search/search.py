@@ -50,7 +50,7 @@ from lagjax.fit.problem.residuals import (
     prior_and_hold,
     window_part,
 )
-from lagjax.integrate.solve.settings import PATIENCE
+from lagjax.integrate.settings import PATIENCE
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.tracing import WATCHED
 from lagjax.jaxtools.without_lapack_batches import jitted

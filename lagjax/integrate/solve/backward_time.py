@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.events.event import Guards
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.trajectory.parts import Snapshot, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.system.coordinates import is_traced

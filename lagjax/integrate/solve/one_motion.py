@@ -24,8 +24,8 @@ from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
 from lagjax.integrate.stepping.tolerances import (

@@ -30,6 +30,7 @@ from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import resolution, solved
 from lagjax.integrate.solve.segments import (
     AT_ONCE,
@@ -42,7 +43,6 @@ from lagjax.integrate.solve.segments import (
     unknown,
     with_those_of,
 )
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well

@@ -24,12 +24,12 @@ from lagjax.display.progress import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost
 from lagjax.integrate.solve.segments import solved_in_legs
-from lagjax.integrate.solve.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory

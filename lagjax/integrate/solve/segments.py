@@ -29,8 +29,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import Crossings, Guards
+from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import resolution, solved
-from lagjax.integrate.solve.settings import Settings
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, Switches
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well

@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
-from lagjax.integrate.solve.settings import Settings, patient
+from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
