@@ -24,9 +24,9 @@ import jax
 
 from lagjax import report, stability
 from lagjax.display import plots
-from lagjax.numerics.methods.runge_kutta import Dopri8
+from lagjax.numerics import Dopri8
 from lagjax.scenes import SCENES
-from lagjax.sweep.scheduler import usable_cores
+from lagjax.sweep import usable_cores
 
 STABILITY = "stability"
 

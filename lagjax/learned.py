@@ -22,12 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from lagjax.mechanics.accelerations import accelerations
-from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.lagrangian import mass_matrix
-from lagjax.system import coordinates
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.mechanics import accelerations, listed, mass_matrix
+from lagjax.system import Hybrid, System, coordinates
 
 # The points at which an activation is checked, the distance over which its curvature may not jump, and the size of a
 # jump relative to the largest curvature.

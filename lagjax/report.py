@@ -13,12 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.events.event import Crossing
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.system.system import System
+from lagjax.integrate import Crossing, Trajectory
+from lagjax.system import System
+from lagjax.work_precision import WorkPrecision, in_ms, table, usual_others
 from lagjax.work_precision import work_precision as comparison
-from lagjax.work_precision.other_solvers import usual_others
-from lagjax.work_precision.result import WorkPrecision, in_ms, table
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10

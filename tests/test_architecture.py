@@ -90,6 +90,74 @@ def test_the_import_checks_can_fail():
     assert nested_imports("def f():\n    import numpy") == ["numpy"]
 
 
+def door(module):
+    """The package through which what lies in a module is handed out; each part of `analysis` has its own."""
+    parts = module.split(".")
+    return ".".join(parts[: 3 if parts[1] == "analysis" and (ROOT / Path(*parts[1:3])).is_dir() else 2])
+
+
+def handed_out(package):
+    """The names that the `__init__` of a package imports or assigns."""
+    tree = ast.parse((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())
+    imported = [alias.asname or alias.name for x in tree.body if isinstance(x, ast.ImportFrom) for alias in x.names]
+    assigned = [target.id for x in tree.body if isinstance(x, ast.Assign) for target in x.targets]
+    return {*imported, *assigned}
+
+
+def past_the_door(name, source):
+    """The imports of a module from other rooms that these do not hand out."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("lagjax."):
+            if room(node.module) != room(name) and (ROOT / room(node.module)).is_dir():
+                names = handed_out(node.module) if node.module == door(node.module) else set()
+                found += [f"{node.module}: {alias.name}" for alias in node.names if alias.name not in names]
+    return found
+
+
+def test_rooms_have_doors():
+    """What a module imports from another room is handed out by the `__init__` of that room."""
+    for path in FILES:
+        assert past_the_door(module_name(path), path.read_text()) == [], module_name(path)
+
+
+def test_the_check_of_doors_can_fail():
+    """Twin: a module inside another room, and a name that its door does not hand out, are found."""
+    inside = "from lagjax.system.model import Model"
+    assert past_the_door("lagjax.fit.fit", inside) and not past_the_door("lagjax.system.system", inside)
+    assert past_the_door("lagjax.fit.fit", "from lagjax.system import unknown_name")
+    assert not past_the_door("lagjax.fit.fit", "from lagjax.system import Model")
+
+
+def circles_of_packages(imports):
+    """The packages that import one another, at any depth; `imports`: by module, the modules that it imports."""
+    graph = {}
+    for name, targets in imports.items():
+        for target in targets:
+            mine, theirs = name.split("."), target.split(".")
+            depth = next((i for i, (a, b) in enumerate(zip(mine, theirs)) if a != b), None)
+            if depth is not None:
+                graph.setdefault(tuple(mine[: depth + 1]), set()).add(tuple(theirs[: depth + 1]))
+
+    def reached(start):
+        seen, open_ = set(), [start]
+        while open_:
+            new = graph.get(open_.pop(), set()) - seen
+            seen |= new
+            open_ += new
+        return seen
+
+    return [".".join(package) for package in graph if package in reached(package)]
+
+
+def test_no_circles_of_packages():
+    """No two packages import from each other, at any depth. Twin: with one import turned round they do."""
+    imports = {module_name(path): internal_imports(path.read_text()) for path in FILES if path.name != "__init__.py"}
+    assert circles_of_packages(imports) == []
+    turned = imports | {"lagjax.system.model": {"lagjax.mechanics.structure"}}
+    assert set(circles_of_packages(turned)) >= {"lagjax.system", "lagjax.mechanics"}
+
+
 PAGE = ROOT.parent / "docs" / "architecture.md"
 STATION = re.compile(r"^\| `lagjax/(\S+\.py)` \| `(\w+)` \|", re.MULTILINE)
 

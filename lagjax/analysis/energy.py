@@ -23,18 +23,11 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import plots as plot
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
-from lagjax.integrate.trajectory.results import ENDED_WELL, is_among, message
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.mechanics.structure import sees_time
+from lagjax.integrate import ENDED_WELL, HybridTrajectory, Trajectory, integrate, is_among, message
+from lagjax.jaxtools import compiled, is_traced
+from lagjax.mechanics import sees_time
 from lagjax.numerics import quadrature
-from lagjax.system import constraints, coordinates
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.system import Hybrid, Model, System, constraints, coordinates, model_of
 
 FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.

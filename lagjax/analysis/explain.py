@@ -7,25 +7,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.display import by_line
 from lagjax.display import plots as plot
-from lagjax.display.printable import by_line
-from lagjax.integrate.jumps.find import found as jumps_found
-from lagjax.integrate.solve.programs import nystrom_for
-from lagjax.mechanics.accelerations import accelerations
-from lagjax.mechanics.consistent_state import consistent_state
-from lagjax.mechanics.diagnosis import dependencies, describe, explain_failure, listed
-from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.projection import departures, to_manifold, within
-from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.structure import Structure, are_angles, is_free_of_velocities, structure
-from lagjax.numerics.linalg.rank import independent_rows
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.integrate import found as jumps_found
+from lagjax.integrate import nystrom_for
+from lagjax.mechanics import (
+    Structure,
+    accelerations,
+    are_angles,
+    consistent_state,
+    departures,
+    dependencies,
+    describe,
+    equations_of,
+    examined,
+    explain_failure,
+    is_free_of_velocities,
+    listed,
+    structure,
+    to_manifold,
+    within,
+)
+from lagjax.numerics import independent_rows
+from lagjax.system import Hybrid, Model, State, System, check_system, coordinates, model_of, traced_system
 
 
 @dataclass(frozen=True, repr=False)

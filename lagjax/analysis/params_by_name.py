@@ -6,8 +6,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.diagnosis import listed
+from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.mechanics import listed
 
 
 class Number(eqx.Module):

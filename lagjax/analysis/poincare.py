@@ -22,16 +22,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.display import plots as plot
-from lagjax.integrate.events.event import Crossing, Crossings, crossings_of
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.drawing import curves
-from lagjax.integrate.trajectory.error_report import angle_mask
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import by_name
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.integrate import Crossing, Crossings, Trajectory, angle_mask, crossings_of, curves, integrate
+from lagjax.jaxtools import is_traced
+from lagjax.system import Hybrid, System, by_name, coordinates
 
 SECTION = "section"
 # The number of crossings that are kept if the section is given as a function.

@@ -1,1 +1,8 @@
 """Figures, films, progress."""
+
+from lagjax.display import plots
+from lagjax.display.animation import Animation, film
+from lagjax.display.plots import COLOURS, DrawnAxes
+from lagjax.display.printable import by_line, is_plain, printable
+from lagjax.display.progress import meter, waiting
+from lagjax.display.web_page.page import Page, encoded, fragment, in_bytes

@@ -30,11 +30,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from lagjax.jaxtools.cache import once
-from lagjax.mechanics.diagnosis import listed
-from lagjax.system.constraints import Holonomic, Nonholonomic
-from lagjax.system.function_arguments import OF_POSITION, OF_STATE
-from lagjax.system.system import System
+from lagjax.jaxtools import once
+from lagjax.mechanics import listed
+from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System
 
 # JAX's functions by SymPy's names, including those of two arguments.
 FUNCTIONS = {

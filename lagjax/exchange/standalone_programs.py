@@ -18,12 +18,9 @@ import numpy as np
 from jax import export as jax_export
 from jaxtyping import PyTree
 
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.results import in_words as result_in_words
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.fuse_cpu import calls_host, poisoned
-from lagjax.jaxtools.primitives import jaxpr_as_fun
-from lagjax.jaxtools.tracing import SILENT
+from lagjax.integrate import RESULTS, Trajectory
+from lagjax.integrate import in_words as result_in_words
+from lagjax.jaxtools import SILENT, calls_host, jaxpr_as_fun, poisoned
 
 # The containers that a process without lagjax can pass and receive.
 PLAIN = (dict, list, tuple)

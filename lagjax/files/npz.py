@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from lagjax.display.printable import by_line
+from lagjax.display import by_line
 from lagjax.files.tree_json import KINDS_OF_ARRAY
 
 FORMAT = 1

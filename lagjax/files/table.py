@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from lagjax.numerics.methods.radau import tolerance_of_the_controller
+from lagjax.numerics import tolerance_of_the_controller
 
 # A module, and the classes that are found there: their fields.
 CLASSES = """

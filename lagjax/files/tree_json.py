@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.display.printable import is_plain, printable
+from lagjax.display import is_plain, printable
 from lagjax.files.table import Table, check_field, fields_of, listed, name_of_function
-from lagjax.jaxtools.trees import without_init
-from lagjax.numerics.methods.radau import tolerance_of_the_controller
+from lagjax.jaxtools import without_init
+from lagjax.numerics import tolerance_of_the_controller
 
 # Structures are nested no deeper than this.
 DEEPEST = 100

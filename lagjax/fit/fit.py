@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.display.progress import meter, waiting
+from lagjax.display import meter, waiting
 from lagjax.fit.problem.arguments import FitWarning, problem_of
 from lagjax.fit.problem.checks import check_motion
 from lagjax.fit.problem.parameters import FreeNumbers
@@ -20,12 +20,10 @@ from lagjax.fit.problem.residuals import JOINING, FitProblem, Stage
 from lagjax.fit.result.result import Fit
 from lagjax.fit.result.warnings import caveats
 from lagjax.fit.search.search import Course, evaluate, listening, search
-from lagjax.integrate.solve.harvest import reported
-from lagjax.jaxtools.cache import once
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.diagnosis import listed
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.integrate import reported
+from lagjax.jaxtools import is_traced, numpy_of, once
+from lagjax.mechanics import listed
+from lagjax.system import Hybrid, System
 
 # Measurements per unknown in the first part of a record, which doubles stage by stage; the largest number of stages.
 FIRST_PART, STAGES = 4, 7

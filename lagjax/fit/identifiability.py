@@ -12,9 +12,8 @@ from lagjax.fit.problem.residuals import WHOLE
 from lagjax.fit.search.search import evaluate
 from lagjax.fit.uncertainty.identifiable import Identifiability
 from lagjax.fit.uncertainty.next_measurement import next_measurements, survey
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.jaxtools import is_traced
+from lagjax.system import Hybrid, System
 
 
 def identifiability(

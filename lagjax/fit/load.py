@@ -10,19 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax.display.printable import printable
-from lagjax.files import npz
-from lagjax.files.table import Table
-from lagjax.files.tree_json import NotGiven, Reader
+from lagjax.display import printable
+from lagjax.files import NotGiven, Reader, Table, npz
 from lagjax.fit.problem.initial_states import unflatten_of
 from lagjax.fit.result.result import Fit
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.load import described_system, same_system
-from lagjax.jaxtools.cache import kinds
-from lagjax.mechanics.diagnosis import listed
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.signature import UnknownSystem
-from lagjax.system.system import System
+from lagjax.integrate import described_system, integrate, same_system
+from lagjax.jaxtools import kinds
+from lagjax.mechanics import listed
+from lagjax.system import Hybrid, System, UnknownSystem
 
 
 def load_fit(

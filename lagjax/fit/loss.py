@@ -22,11 +22,10 @@ from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.checks import check_predicted
 from lagjax.fit.problem.records import Record
 from lagjax.fit.problem.residuals import JOINING, WHOLE, FitProblem, Stage, assemble, prior_and_hold, window_part
-from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.mechanics.diagnosis import listed
-from lagjax.numerics.windowed_least_squares import Unknowns
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.jaxtools import jitted
+from lagjax.mechanics import listed
+from lagjax.numerics import Unknowns
+from lagjax.system import Hybrid, System
 
 
 @dataclass(frozen=True, eq=False, repr=False)

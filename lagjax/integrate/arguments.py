@@ -12,13 +12,9 @@ from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.trajectory.error_report import account_of, warning_of
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Trajectory
-from lagjax.jaxtools.cache import once
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.projection import departures
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
-from lagjax.system.warn import warn
+from lagjax.jaxtools import is_traced, numpy_of, once
+from lagjax.mechanics import departures
+from lagjax.system import Model, State, coordinates, warn
 
 # Tolerances that each dtype reaches with a margin.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}

@@ -9,9 +9,8 @@ import numpy as np
 from lagjax.integrate.events.event import EventWarning, Guards
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, HybridTrajectory
 from lagjax.integrate.trajectory.results import RESULTS, is_among
-from lagjax.mechanics.diagnosis import describe
-from lagjax.system.coordinates import State
-from lagjax.system.warn import warn
+from lagjax.mechanics import describe
+from lagjax.system import State, warn
 
 # Outputs at which guards are evaluated; a change by the last digit that is no round-off, as a share of the guard, and
 # by how much more a linear one would change where all digits from the middle on change; round-offs that are zero.

@@ -33,13 +33,9 @@ from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import of_a_step
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.mechanics.consistent_state import unreachable_ahead
-from lagjax.mechanics.diagnosis import describe, explain_failure
-from lagjax.mechanics.equations import equations_of
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
+from lagjax.jaxtools import jitted
+from lagjax.mechanics import describe, equations_of, explain_failure, unreachable_ahead
+from lagjax.system import Model, State, coordinates
 
 # The number of steps that are examined, and the first of these, which only find their length.
 LOOKED_AT, SETTLED = 160, 40

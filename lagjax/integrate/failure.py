@@ -23,12 +23,9 @@ from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import pack
 from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.primitives import primitive
-from lagjax.mechanics.accelerations import accelerations
-from lagjax.mechanics.diagnosis import describe, explain_failure
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
+from lagjax.jaxtools import primitive
+from lagjax.mechanics import accelerations, describe, explain_failure
+from lagjax.system import Hybrid, State, coordinates
 
 
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:

@@ -15,10 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.warn import warn
+from lagjax.jaxtools import is_traced
+from lagjax.system import State, coordinates, warn
 
 # Round-off of an R with several terms, in units of the last place.
 ROUND_OFFS = 100

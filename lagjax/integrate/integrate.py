@@ -30,12 +30,8 @@ from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.tracing import SILENT, WATCHED, is_traced
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import by_name, check_system
-from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System
+from lagjax.jaxtools import SILENT, WATCHED, is_traced
+from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates
 
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")

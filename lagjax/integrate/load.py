@@ -9,9 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.files import npz
-from lagjax.files.table import Table, check_field, fields_of
-from lagjax.files.tree_json import Reader
+from lagjax.files import Reader, Table, check_field, fields_of, npz
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.solve.backward_time import backward_trajectory_of
 from lagjax.integrate.solve.phases import traced_phases
@@ -22,12 +20,8 @@ from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions,
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.trees import without_init
-from lagjax.system.argument_checks import SYSTEMS
-from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.signature import UnknownSystem, differences, signature
-from lagjax.system.system import System
+from lagjax.jaxtools import without_init
+from lagjax.system import SYSTEMS, Hybrid, State, System, UnknownSystem, differences, signature
 
 
 def load_trajectory(

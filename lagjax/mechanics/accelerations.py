@@ -10,18 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_saddle_point import Banded
-from lagjax.system import constraints, coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import prepare, traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare, traced_system
 
 
 def accelerations(

@@ -25,22 +25,14 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import compiled, is_traced, stop_gradient
 from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.projection import departures, within
 from lagjax.mechanics.saddle_point import displacement_map
-from lagjax.numerics.linalg import dense
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
-from lagjax.numerics.newton import largest, last_step, newton
-from lagjax.system import constraints, coordinates
-from lagjax.system.check_functions import prepare
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
-from lagjax.system.system import System
+from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, largest, last_step, newton
+from lagjax.system import Model, State, System, constraints, coordinates, prepare
 
 TO_REACH = 40
 STAGES, PER_STAGE = 16, 3

@@ -10,9 +10,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
-from lagjax.system import constraints, coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
+from lagjax.system import Model, State, constraints, coordinates
 
 # A row counts as part of a combination if it makes up more than this share of it.
 SHARE = 1e-6

@@ -16,18 +16,13 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.cache import once
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.fuse_cpu import kept_as_call
-from lagjax.jaxtools.tracing import WATCHED
-from lagjax.jaxtools.without_lapack_batches import jitted
+from lagjax.jaxtools import WATCHED, compiled, jitted, kept_as_call, once
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
 from lagjax.mechanics.sparse_saddle_point import Banded, plan
 from lagjax.mechanics.structure import is_diagonal
-from lagjax.system import coordinates
-from lagjax.system.model import Form, Model
+from lagjax.system import Form, Model, coordinates
 
 
 class Equations(eqx.Module):

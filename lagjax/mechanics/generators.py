@@ -19,12 +19,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.cache import shape_of
-from lagjax.jaxtools.tracing import is_traced
+from lagjax.jaxtools import is_traced, shape_of
 from lagjax.mechanics.diagnosis import listed
-from lagjax.system import coordinates
-from lagjax.system.function_arguments import OF_POSITION
-from lagjax.system.user_errors import Call, check_arguments, in_words
+from lagjax.system import OF_POSITION, Call, check_arguments, coordinates, in_words
 
 AXES = "xyz"
 NAMES = re.compile(r"(?P<before>(?:.*\.)?(?:\w+_)?)(?P<axis>[xyzXYZ])(?P<after>\d*|_\w+)")

@@ -18,12 +18,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools import compiled
 from lagjax.mechanics.multiplier_forces import response
-from lagjax.system.check_functions import prepare
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
-from lagjax.system.system import System
+from lagjax.system import Model, State, System, prepare
 
 
 class LinearEquation(NamedTuple):

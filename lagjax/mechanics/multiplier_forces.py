@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax.numerics.linalg.dense import solve_without_exchanges
-from lagjax.system.model import Model
+from lagjax.numerics import solve_without_exchanges
+from lagjax.system import Model
 
 # The pivots of I - R must be above this; without friction they are one.
 PIVOT_ABOVE = 1e-10

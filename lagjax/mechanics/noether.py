@@ -24,16 +24,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools import compiled
 from lagjax.mechanics.accelerations import accelerations_at
 from lagjax.mechanics.generators import Generator, as_generator
 from lagjax.mechanics.lagrangian import applied_force
-from lagjax.system import constraints, coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, traced_system
 
 
 class NoetherCharge(eqx.Module):

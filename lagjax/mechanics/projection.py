@@ -21,12 +21,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
-from lagjax.numerics.newton import largest, last_step, newton
-from lagjax.system import constraints, coordinates
-from lagjax.system.model import Model
+from lagjax.numerics import largest, last_step, newton
+from lagjax.system import Model, constraints, coordinates
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
 # below 1e-8 of the size of the state; a crude fixed step of 0.1 takes eight.

@@ -37,14 +37,11 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools import compiled
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
-from lagjax.numerics.linalg import dense
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
-from lagjax.system import constraints
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
+from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, unit_rows
+from lagjax.system import Model, State, constraints
 
 # A constraint whose derivative is this much smaller than nearby has none: it is written as a square.
 VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}

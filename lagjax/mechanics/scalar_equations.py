@@ -23,15 +23,13 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.scalarize import TooLong
+from lagjax.jaxtools import TooLong, is_plain
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers
 from lagjax.mechanics.structure import is_diagonal
-from lagjax.numerics.linalg import dense
-from lagjax.system import constraints
-from lagjax.system.model import Model
+from lagjax.numerics import dense
+from lagjax.system import Model, constraints
 
 # Coordinates and constraint equations together. Measured on chains: a full mass matrix of nine is as fast in arrays;
 # with constraints, whose matrix is mostly zeros, a step is seven times faster up to here, for twice the compile time.

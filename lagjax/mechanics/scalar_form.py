@@ -14,15 +14,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.cache import varies
-from lagjax.jaxtools.fuse_cpu import calls_host, poisoned
-from lagjax.jaxtools.jaxpr import length, needed, staged
-from lagjax.jaxtools.scalarize import written_out
-from lagjax.jaxtools.tracing import WATCHED
-from lagjax.jaxtools.without_lapack_batches import one_by_one
-from lagjax.system import coordinates
-from lagjax.system.function_arguments import takes_of
-from lagjax.system.model import Form, Model, unchecked
+from lagjax.jaxtools import WATCHED, calls_host, length, needed, one_by_one, poisoned, staged, varies, written_out
+from lagjax.system import Form, Model, coordinates, takes_of, unchecked
 
 # The most operations that are written out, before it is known which are needed. Writing a hundred thousand, as for an L
 # with tables or a quadrature in it, only to discard them takes 15 s.

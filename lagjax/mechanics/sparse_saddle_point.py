@@ -39,13 +39,11 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.jaxtools.cache import once
-from lagjax.jaxtools.sparsity import pattern
+from lagjax.jaxtools import once, pattern
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, slightly_off, vanishing
-from lagjax.numerics.linalg import banded, dense
-from lagjax.system import constraints
-from lagjax.system.model import Model
+from lagjax.numerics import banded, dense
+from lagjax.system import Model, constraints
 
 # The banded solve is faster from six unknowns on (a chain of two: 2.4 microseconds against 4.8; of twelve: 4 against
 # 24); the dense one exchanges rows, which suits any mass matrix, and is kept where little is to be gained.

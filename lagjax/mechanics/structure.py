@@ -25,16 +25,22 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.cache import varies
-from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, PERIODIC, Literal, depends, interpreted
-from lagjax.jaxtools.scalarize import TooLong
+from lagjax.jaxtools import (
+    ADDITIVE,
+    BILINEAR,
+    LINEAR_IN_FIRST,
+    PERIODIC,
+    Literal,
+    TooLong,
+    depends,
+    interpreted,
+    varies,
+)
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import force_with_ones
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
-from lagjax.numerics.linalg import banded
-from lagjax.system import coordinates
-from lagjax.system.model import Model, unchecked
-from lagjax.system.system import System
+from lagjax.numerics import banded
+from lagjax.system import Model, System, coordinates, unchecked
 
 # Coordinates and equations together; the programs of larger systems are not written out.
 UP_TO = 24

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, squared_distance
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 
 class Masses(NamedTuple):

@@ -23,8 +23,7 @@ from jaxtyping import PyTree
 from lagjax.mechanisms import slider_crank
 from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.mechanisms.slider_crank import Body, SliderCrankParts
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = slider_crank.PARAMS | {"rate": 150.0}
 

@@ -22,8 +22,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = {"alpha": 0.5}
 

@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lagjax.system.system import System
+from lagjax.system import System
 
 
 def rod_kinetic_energy(mass, start, end):

@@ -26,8 +26,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism, rod_kinetic_energy, squared_distance
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = {"m": 1.0, "l": 1.0, "g": 9.81}
 

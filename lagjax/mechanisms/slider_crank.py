@@ -31,8 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 
 class Body(NamedTuple):

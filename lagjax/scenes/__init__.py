@@ -14,6 +14,7 @@ from lagjax.scenes import (
     slipping_hoop,
     sphere_geodesic,
 )
+from lagjax.scenes.potentials import jacobi_elliptic
 
 SCENES = {
     module.SCENE.name: module.SCENE

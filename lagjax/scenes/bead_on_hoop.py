@@ -32,17 +32,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.continuation.equilibria import continue_equilibria
+from lagjax.analysis import continue_equilibria
 from lagjax.display import plots
-from lagjax.integrate.events.event import EventWarning
-from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
+from lagjax.integrate import EventWarning, integrate
+from lagjax.mechanics import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.scenes.potentials import agm, jacobi_elliptic
 from lagjax.sweep import sweep
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = {"m": 0.5, "a": 0.75, "g": 9.8125, "omega": 6.0}
 # Exactly at the critical speed: g/a = 16 = omega².

@@ -35,13 +35,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.modes.normal_modes import normal_modes
+from lagjax.analysis.modes import normal_modes
 from lagjax.display import plots
-from lagjax.integrate.integrate import integrate
+from lagjax.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.sweep import sweep
-from lagjax.system.system import System
+from lagjax.system import System
 
 PARAMS = {"m": 0.5, "K": 20.0, "k": 8.0, "R0": 0.75, "omega": 2.5}
 Q0 = {"R": 1.0, "r": 0.125}

@@ -28,12 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.symmetry.search import symmetries
+from lagjax.analysis import symmetries
 from lagjax.display import plots
-from lagjax.integrate.integrate import integrate
+from lagjax.integrate import integrate
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand, potentials
-from lagjax.system.system import System
+from lagjax.system import System
 
 PARAMS = {
     "plane": {"G": 1.0, "sigma": 0.75},

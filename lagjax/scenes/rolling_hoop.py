@@ -38,15 +38,12 @@ from jaxtyping import PyTree
 from scipy import special
 
 from lagjax.display import plots
-from lagjax.integrate.events.event import Crossing
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.accelerations import accelerations
+from lagjax.integrate import RESULTS, Crossing, integrate
+from lagjax.jaxtools import compiled
+from lagjax.mechanics import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
-from lagjax.system.constraints import Holonomic, Nonholonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, Nonholonomic, System
 
 PARAMS = {"m": 1.25, "R": 1.0, "a": 0.25, "g": 9.8125, "beta": 1.0}
 TOP = np.pi / 2

@@ -21,12 +21,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.display import plots
-from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
+from lagjax.integrate import integrate
+from lagjax.mechanics import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.sweep import sweep
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = {"m": 1.5, "M": 4.0, "alpha": 0.5, "g": 9.8125}
 Q0 = {"X": 0.0, "x": 0.0, "y": 0.0}

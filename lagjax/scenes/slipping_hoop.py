@@ -22,15 +22,11 @@ from jaxtyping import PyTree
 from scipy import optimize
 
 from lagjax.display import plots
-from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
+from lagjax.integrate import HybridTrajectory, integrate, releases, slips, sticks, touches
 from lagjax.report import Case, Scene, relative_error
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling
-from lagjax.system.constraints import Holonomic
-from lagjax.system.hybrid import Hybrid, Switch
-from lagjax.system.system import System
+from lagjax.system import Holonomic, Hybrid, Switch, System
 
 PARAMS = rolling_hoop.PARAMS | {"mu": 0.25}
 # The angle at which a motion from rest at the top is started: at the top itself it would stay.

@@ -34,13 +34,12 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from lagjax.display import plots
-from lagjax.integrate.integrate import integrate
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.accelerations import accelerations
+from lagjax.integrate import integrate
+from lagjax.jaxtools import compiled
+from lagjax.mechanics import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 PARAMS = {"R": 2.5}
 # The end points of the generic arc: ψ₁, θ₁, ψ₂, θ₂.

@@ -1,5 +1,3 @@
 """Sliders in a notebook: a motion that follows its parameters."""
 
 from lagjax.sliders.interact import Knobs, interact
-
-__all__ = ["interact", "Knobs"]

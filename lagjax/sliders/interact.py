@@ -17,11 +17,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lagjax.integrate.trajectory.results import in_words
+from lagjax.integrate import in_words
 from lagjax.sliders.picture import DPI, WIDTH, Picture
-from lagjax.sweep.axes import axes_of
-from lagjax.sweep.batch_program import LAYOUTS, TRUSTED, program_for
-from lagjax.sweep.web_page import drawn
+from lagjax.sweep import LAYOUTS, TRUSTED, axes_of, drawn, program_for
 
 # The number of steps of a slider for which none is given.
 STEPS = 200

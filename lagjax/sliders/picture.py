@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lagjax.display import plots
-from lagjax.sweep.web_page import MOST_CURVES, Drawn
+from lagjax.sweep import MOST_CURVES, Drawn
 
 DPI = 100
 # Inches: the width, the height of one panel, and of the words above.

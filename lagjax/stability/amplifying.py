@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.stability.trial import DEGRADED, REDUCED, Trial
-from lagjax.system.system import System
+from lagjax.system import System
 
 
 def attracted(t, q: PyTree, v: PyTree, params: PyTree):

@@ -6,8 +6,7 @@ from jaxtyping import PyTree
 
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.trial import REFUSED, Trial, by_parameter
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
+from lagjax.system import Holonomic, System
 
 
 def free_fall(t, q: PyTree, v: PyTree, params: PyTree):

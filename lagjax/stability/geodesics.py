@@ -7,7 +7,7 @@ from jaxtyping import PyTree
 
 from lagjax.scenes import sphere_geodesic
 from lagjax.stability.trial import FULL, REDUCED, REFUSED, Trial, zeros
-from lagjax.system.system import System
+from lagjax.system import System
 
 
 def angles_lagrangian(t, q: PyTree, v: PyTree, params: PyTree):

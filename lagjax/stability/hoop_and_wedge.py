@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.numerics.methods.runge_kutta import Dopri8
-from lagjax.scenes import bead_on_hoop, sliding_wedge
-from lagjax.scenes.potentials import jacobi_elliptic
+from lagjax.numerics import Dopri8
+from lagjax.scenes import bead_on_hoop, jacobi_elliptic, sliding_wedge
 from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
 
 

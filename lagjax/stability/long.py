@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 from lagjax.scenes import bead_on_hoop
 from lagjax.stability.hoop_and_wedge import by_both, swing
 from lagjax.stability.trial import DEGRADED, REDUCED, REFUSED, Trial
-from lagjax.system.system import System
+from lagjax.system import System
 
 
 def pendulum(t, q: PyTree, v: PyTree, params: PyTree):

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.integrate import integrate
+from lagjax.integrate import integrate
 from lagjax.stability.trial import ACCURATE, FULL, Outcome
-from lagjax.system.system import System
+from lagjax.system import System
 
 # A step is stable if the amplitude grows by less than GROWTH in STEPS steps; |R| of Dopri8 crosses 1 steeply.
 STEPS, GROWTH = 4000, 1.01

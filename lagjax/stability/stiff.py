@@ -6,12 +6,10 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanisms import car_axis, governor
-from lagjax.numerics.methods.radau import Radau5
-from lagjax.numerics.methods.runge_kutta import Dopri8
+from lagjax.numerics import Dopri8, Radau5
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, FULL, REDUCED, REFUSED, Trial, zeros
-from lagjax.system import coordinates
-from lagjax.system.system import System
+from lagjax.system import System, coordinates
 
 
 def spring(t, q: PyTree, v: PyTree, params: PyTree):

@@ -21,13 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.compiled import compiled
+from lagjax.integrate import Trajectory, integrate
+from lagjax.jaxtools import compiled
 from lagjax.report import relative_error
-from lagjax.system import coordinates
-from lagjax.system.system import System
-from lagjax.work_precision.result import table
+from lagjax.system import System, coordinates
+from lagjax.work_precision import table
 
 PER_PERIOD = 100.0
 # A result with fewer than two correct digits is never accurate, whatever the tolerance.

@@ -24,19 +24,22 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, PyTree
 
-from lagjax.display.progress import waiting
-from lagjax.integrate.settings import PATIENCE
-from lagjax.integrate.solve.harvest import reporting, watched
-from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.cache import program_of
-from lagjax.jaxtools.jaxpr import ClosedJaxpr, Jaxpr, bodies
-from lagjax.jaxtools.jaxpr_identity import Meaning, content_of, meaning_of
-from lagjax.jaxtools.tracing import REGULAR_FIRST
-from lagjax.jaxtools.without_lapack_batches import one_by_one
+from lagjax.display import waiting
+from lagjax.integrate import ENDED_WELL, PATIENCE, RESULTS, Trajectory, reporting, watched
+from lagjax.jaxtools import (
+    REGULAR_FIRST,
+    ClosedJaxpr,
+    Jaxpr,
+    Meaning,
+    bodies,
+    content_of,
+    meaning_of,
+    one_by_one,
+    program_of,
+)
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.chunks import nothing
-from lagjax.system.user_errors import Call, check_arguments, in_words
+from lagjax.system import Call, check_arguments, in_words
 
 NOT_RUN, LOST = -1, -2
 LAYOUTS = ("vmap", "map")

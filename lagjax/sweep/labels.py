@@ -13,8 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.trajectory.results import RESULTS, in_words
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate import RESULTS, Trajectory, in_words
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import LOST, NOT_RUN, Status
 

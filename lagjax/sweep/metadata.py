@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax.display.printable import by_line, printable
-from lagjax.files.npz import MALFORMED, Explained, parsed
+from lagjax.display import by_line, printable
+from lagjax.files import MALFORMED, Explained, parsed
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.batch_program import NOT_RUN, STATUS_TYPES, Program, Status, digest
 from lagjax.sweep.chunks import Spec, chunk_file, nothing, write_chunk

@@ -10,11 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
+from lagjax.display import Page, printable
 from lagjax.display import plots as plot
-from lagjax.display.printable import printable
-from lagjax.display.web_page import Page
-from lagjax.files.table import Table
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.files import Table
+from lagjax.integrate import Trajectory
 from lagjax.sweep import structure, tables
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import LOST, TRUSTED, Status

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.jaxtools.fuse_cpu import TOGETHER
+from lagjax.integrate import RESULTS
+from lagjax.jaxtools import TOGETHER
 from lagjax.sweep.axes import Axes
 from lagjax.sweep.batch_program import Program, program_for, raised
 

@@ -16,17 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display.printable import by_line, printable
-from lagjax.files.npz import MALFORMED
-from lagjax.files.table import Table
-from lagjax.files.tree_json import KINDS_OF_ARRAY, NotWritable, Reader, Writer
-from lagjax.integrate.load import check_is_system, described_system, same_system, trajectory_from
-from lagjax.integrate.trajectory.save import described, parts
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.display import by_line, printable
+from lagjax.files import KINDS_OF_ARRAY, MALFORMED, NotWritable, Reader, Table, Writer
+from lagjax.integrate import (
+    Trajectory,
+    check_is_system,
+    described,
+    described_system,
+    parts,
+    same_system,
+    trajectory_from,
+)
 from lagjax.sweep.axes import Axes
 from lagjax.sweep.labels import named_leaves, shapes_of
 from lagjax.sweep.store import Store
-from lagjax.system.signature import UnknownSystem
+from lagjax.system import UnknownSystem
 
 LEAF, MOTION = "leaf", "trajectory"
 

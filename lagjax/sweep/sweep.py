@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from lagjax.display.progress import meter
+from lagjax.display import meter
 from lagjax.sweep.axes import Axes, axes_of
 from lagjax.sweep.batch_program import LAYOUTS, Program, not_run
 from lagjax.sweep.fill_store import Filling, compare_versions, groups_of_blocks, new_store

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate import Trajectory
 from lagjax.sweep.batch_program import Status
 from lagjax.sweep.labels import Labels, labels_of, named_leaves, shared_times, status_attributes, words_of
 

@@ -11,18 +11,12 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display.animation import film
-from lagjax.display.plots import COLOURS
-from lagjax.display.web_page import Page, encoded, fragment
-from lagjax.display.web_page.page import in_bytes
-from lagjax.integrate.trajectory.drawing import film_of_lanes
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.display import COLOURS, Page, encoded, film, fragment, in_bytes
+from lagjax.integrate import RESULTS, Trajectory, film_of_lanes
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import NOT_RUN, TRUSTED
 from lagjax.sweep.labels import words_of
-from lagjax.system import coordinates
-from lagjax.system.user_errors import Call, check_arguments
+from lagjax.system import Call, check_arguments, coordinates
 
 # More curves than this in one panel cannot be told apart.
 MOST_CURVES = 14

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.cache import kinds, remembered
-from lagjax.jaxtools.linearity import is_linear
+from lagjax.jaxtools import is_linear, kinds, remembered
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.coordinates import State

@@ -24,8 +24,8 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.display.printable import printable
-from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
+from lagjax.display import printable
+from lagjax.jaxtools import is_eager, is_traced, numpy_of
 from lagjax.system.warn import warn
 
 SINGLE = np.dtype("float32")

@@ -17,9 +17,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
-from lagjax.display.printable import by_line
-from lagjax.jaxtools.cache import kinds, same
-from lagjax.jaxtools.trees import without_init
+from lagjax.display import by_line
+from lagjax.jaxtools import kinds, same, without_init
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System, check_functions
 

@@ -15,8 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jaxtools.cache import shape_of
-from lagjax.jaxtools.trees import without_init
+from lagjax.jaxtools import shape_of, without_init
 from lagjax.system import coordinates
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
 from lagjax.system.system import System

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools import compiled
 from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.hybrid import Hybrid

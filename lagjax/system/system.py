@@ -17,9 +17,8 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from lagjax.display.printable import by_line
-from lagjax.jaxtools.cache import kinds, same
-from lagjax.jaxtools.trees import without_init
+from lagjax.display import by_line
+from lagjax.jaxtools import kinds, same, without_init
 from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.traced_functions import Traced
 

@@ -22,8 +22,7 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools.cache import FACTS, is_array, once
-from lagjax.jaxtools.jaxpr_identity import Itself, Meaning, meaning_of, rules_of, with_own_constants
+from lagjax.jaxtools import FACTS, Itself, Meaning, is_array, meaning_of, once, rules_of, with_own_constants
 
 # Arrays of up to so many numbers, or of so many whole numbers (indices), that are read from outside are part of the
 # jaxpr: the equations can then leave out what is multiplied by their zeros.

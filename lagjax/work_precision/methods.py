@@ -6,14 +6,10 @@ from typing import Any
 import diffrax
 import numpy as np
 
-from lagjax.integrate import arguments
-from lagjax.integrate.solve.error_estimate import ROUND_OFFS
-from lagjax.mechanics.structure import is_free_of_velocities
-from lagjax.numerics.methods.nystrom import Nystrom, Nystrom12
-from lagjax.numerics.methods.runge_kutta import Dopri8, Tsit5
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.integrate import ROUND_OFFS, arguments
+from lagjax.mechanics import is_free_of_velocities
+from lagjax.numerics import Dopri8, Nystrom, Nystrom12, Tsit5
+from lagjax.system import State, System, model_of
 
 # From too loose for high orders to show, to where round-off dominates.
 LADDERS = {

@@ -13,9 +13,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, PyTree
-from scipy import integrate
 
 MAX_STEPS = 2**20
 
@@ -62,7 +62,7 @@ def dop853(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: n
     field, y0, as_states = _flat_problem(acceleration, q0, v0, params)
 
     def solve(tolerance: float):
-        solution = integrate.solve_ivp(
+        solution = scipy.integrate.solve_ivp(
             field, (ts[0], ts[-1]), y0, method="DOP853", t_eval=ts, rtol=tolerance, atol=tolerance
         )
         return *as_states(solution.y.T if solution.success else np.full((len(ts), len(y0)), np.nan)), solution.nfev
@@ -76,9 +76,9 @@ def lsoda(acceleration: Callable, q0: PyTree, v0: PyTree, params: PyTree, ts: np
 
     def solve(tolerance: float):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", integrate.ODEintWarning)
+            warnings.simplefilter("ignore", scipy.integrate.ODEintWarning)
             options = {"tfirst": True, "rtol": tolerance, "atol": tolerance, "mxstep": MAX_STEPS}
-            y, info = integrate.odeint(field, y0, ts, full_output=True, **options)
+            y, info = scipy.integrate.odeint(field, y0, ts, full_output=True, **options)
         well = info["message"] == "Integration successful."
         return *as_states(y if well else np.full_like(y, np.nan)), int(info["nfe"][-1])
 

@@ -13,15 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.solve.backward_time import runs_backward
-from lagjax.integrate.solve.harvest import reporting
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.cache import hashable_partition
-from lagjax.jaxtools.compiled import compiler_options
-from lagjax.jaxtools.tracing import REGULAR_FIRST
-from lagjax.system.coordinates import State
-from lagjax.system.system import System
+from lagjax.integrate import Trajectory, integrate, reporting, runs_backward
+from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition
+from lagjax.system import State, System
 
 # Seconds of measuring after which a call is not repeated; a single call that takes longer is timed twice, unless it is
 # very long.

@@ -20,11 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.events.event import Crossing
-from lagjax.integrate.solve.backward_time import runs_backward
-from lagjax.integrate.trajectory.results import ended_well, message
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.numerics.methods.radau import Radau5
+from lagjax.integrate import Crossing, Trajectory, ended_well, message, runs_backward
+from lagjax.numerics import Radau5
 from lagjax.system import coordinates
 from lagjax.work_precision.methods import TIGHTEST, usual
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax.display import DrawnAxes
 from lagjax.display import plots as plot
-from lagjax.display.plots import DrawnAxes
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate import Trajectory
 from lagjax.work_precision.methods import as_code
 from lagjax.work_precision.references import Reference
 

@@ -10,16 +10,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.integrate import arguments
-from lagjax.integrate.events.event import Crossing
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.results import ended_well, message
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.numerics.methods.nystrom import evaluations_a_step
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import by_name, check_system
-from lagjax.system.system import System
+from lagjax.integrate import Crossing, Trajectory, arguments, ended_well, integrate, message
+from lagjax.jaxtools import is_eager, is_traced
+from lagjax.numerics import evaluations_a_step
+from lagjax.system import System, by_name, check_system, coordinates
 from lagjax.work_precision import references
 from lagjax.work_precision.methods import chosen, ladder
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram, Times, interleaved_times, without_overhead

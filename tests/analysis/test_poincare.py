@@ -9,7 +9,7 @@ import pytest
 from scipy import special
 
 import lagjax as lj
-from lagjax.analysis import poincare
+from lagjax.analysis.poincare import _within_half_turns
 from tests.systems import PARAMS, double_pendulum, pendulum
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
@@ -255,7 +255,7 @@ def test_pictures():
 
 def test_angles_within_half_turns():
     """Angles are shifted by whole turns, and ±π within round-off is one value; twin: one degree short of it is not."""
-    found = poincare._within_half_turns(np.array([7.0, -7.0, np.pi - 1e-9, np.pi + 1e-9, -np.pi, 3.1241]))
+    found = _within_half_turns(np.array([7.0, -7.0, np.pi - 1e-9, np.pi + 1e-9, -np.pi, 3.1241]))
     np.testing.assert_allclose(found, [7 - 2 * np.pi, 2 * np.pi - 7, -np.pi, -np.pi, -np.pi, 3.1241], atol=2e-9)
 
 

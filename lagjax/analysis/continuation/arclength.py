@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lagjax.numerics.newton import newton_in_python
+from lagjax.numerics import newton_in_python
 
 ITERATIONS = 10
 # Step lengths: the first, the longest (relative to the distance from the origin) and the smallest.

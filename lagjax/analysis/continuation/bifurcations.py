@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis.continuation.arclength import BranchPoint
-from lagjax.analysis.continuation.equilibrium_equations import (  # fmt: skip
+from lagjax.analysis.continuation.equilibrium_equations import (
     BRANCH,
     COLLISION,
     ESCAPE,
@@ -33,7 +33,7 @@ from lagjax.analysis.continuation.equilibrium_equations import (  # fmt: skip
     extended_at,
     extended_by_params,
 )
-from lagjax.numerics.newton import newton_in_python
+from lagjax.numerics import newton_in_python
 
 NEWTON = 12
 # A direction whose component along the parameter is smaller leaves the parameter constant.

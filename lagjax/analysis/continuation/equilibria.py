@@ -25,15 +25,9 @@ from lagjax.analysis.equilibria.balance import VELOCITY, Steady
 from lagjax.analysis.equilibria.degenerate import unknowns
 from lagjax.analysis.equilibria.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
 from lagjax.analysis.equilibria.result import OK, WORDS
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.structure import are_angles, is_autonomous
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import by_name, check_system
-from lagjax.system.check_functions import checked
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
+from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.mechanics import are_angles, describe, is_autonomous
+from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 # Critical points closer than this are the same.
 SAME = 1e-5

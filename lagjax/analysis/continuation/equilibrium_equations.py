@@ -44,8 +44,8 @@ from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria.balance import Steady
 from lagjax.analysis.equilibria.equilibria import GROWS_ABOVE
 from lagjax.analysis.params_by_name import Number, no_such_number, numbers_in
-from lagjax.jaxtools.compiled import compiled
-from lagjax.numerics.linalg.rank import independent_rows
+from lagjax.jaxtools import compiled
+from lagjax.numerics import independent_rows
 
 FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
 

@@ -44,7 +44,7 @@ from lagjax.analysis.orbits.flow import Changes, Flow
 from lagjax.analysis.orbits.monodromy import Reasons, directions, orthonormal
 from lagjax.analysis.orbits.shooting import TURN, OrbitRequest, integral_at
 from lagjax.analysis.params_by_name import Number
-from lagjax.jaxtools.compiled import compiled
+from lagjax.jaxtools import compiled
 
 # Times, in periods, at which the accelerations of a driven system are compared.
 SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)

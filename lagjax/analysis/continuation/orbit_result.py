@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.continuation.orbit_equations import NUMBER, Along
-from lagjax.analysis.continuation.result import (  # fmt: skip
+from lagjax.analysis.continuation.result import (
     OTHER_MARK,
     STABLE,
     UNKNOWN,
@@ -19,7 +19,7 @@ from lagjax.analysis.continuation.result import (  # fmt: skip
 )
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.display import plots as plot
-from lagjax.jaxtools.cache import hashable_partition
+from lagjax.jaxtools import hashable_partition
 from lagjax.system import coordinates
 
 MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4)}

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.analysis.continuation.arclength import BranchPoint, Path
-from lagjax.analysis.continuation.orbit_equations import (  # fmt: skip
+from lagjax.analysis.continuation.orbit_equations import (
     ENERGY,
     ENTRY,
     NUMBER,
@@ -29,13 +29,8 @@ from lagjax.analysis.orbits.monodromy import OrbitProblem, problem_of, tolerance
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest, guessed
 from lagjax.analysis.params_by_name import no_such_number, numbers_in
-from lagjax.jaxtools.cache import hashable_partition
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.system import coordinates
-from lagjax.system.check_functions import checked
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
+from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
+from lagjax.system import State, checked, coordinates, model_of
 
 HALVINGS = 40
 # A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.

@@ -28,16 +28,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.mechanics.lagrangian import forcing_and_inertia
-from lagjax.mechanics.multiplier_forces import response
-from lagjax.numerics.linalg import dense, lapack
-from lagjax.numerics.linalg.dense import reciprocal_condition
-from lagjax.numerics.linalg.eigenvalues import roots_beside_zeros
-from lagjax.numerics.linalg.rank import independent_rows
-from lagjax.system import constraints
-from lagjax.system.model import Model
-from lagjax.system.system import System
+from lagjax.jaxtools import jitted
+from lagjax.mechanics import forcing_and_inertia, response
+from lagjax.numerics import dense, independent_rows, lapack, reciprocal_condition, roots_beside_zeros
+from lagjax.system import Model, System, constraints
 
 # The equations of motion count as singular below this reciprocal condition number.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}

@@ -22,7 +22,7 @@ import numpy as np
 
 from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria.balance import MOMENTUM, Steady
-from lagjax.analysis.equilibria.reduced_force import (  # fmt: skip
+from lagjax.analysis.equilibria.reduced_force import (
     SAMPLES,
     WINDOW,
     Bordered,
@@ -35,9 +35,9 @@ from lagjax.analysis.equilibria.reduced_force import (  # fmt: skip
     reduced_force,
     values_at,
 )
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.lagrangian import applied_force
-from lagjax.numerics.linalg.rank import null_space
+from lagjax.jaxtools import compiled
+from lagjax.mechanics import applied_force
+from lagjax.numerics import null_space
 
 STABLE, UNSTABLE, UNDECIDED, AS_LINEAR = range(4)
 # Rays of several zero modes; the smallest resistance of a minimum, relative to the largest.

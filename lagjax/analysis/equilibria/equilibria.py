@@ -23,7 +23,7 @@ from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria import degenerate
 from lagjax.analysis.equilibria.balance import MOMENTUM, VELOCITY, Steady, SteadySymmetries
 from lagjax.analysis.equilibria.reduced_force import CREEPS_BELOW, nearest, soft_below
-from lagjax.analysis.equilibria.result import (  # fmt: skip
+from lagjax.analysis.equilibria.result import (
     CONSTRAINED,
     NO_BALANCE,
     NOT_FINITE,
@@ -34,18 +34,10 @@ from lagjax.analysis.equilibria.result import (  # fmt: skip
     EquilibriumRow,
     merged,
 )
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.structure import angles, invariance, structure
-from lagjax.numerics.linalg import lapack
-from lagjax.numerics.newton import MOST, differentiable, least_squares_root, zero_below
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import by_name, check_system
-from lagjax.system.check_functions import checked
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
+from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
+from lagjax.mechanics import angles, invariance, listed, structure
+from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below
+from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
 

@@ -21,9 +21,8 @@ import numpy as np
 
 from lagjax.analysis.equilibria import balance as equations
 from lagjax.analysis.equilibria.balance import Steady
-from lagjax.jaxtools.compiled import compiled
-from lagjax.numerics.linalg.rank import null_space
-from lagjax.numerics.newton import newton_in_python, with_value
+from lagjax.jaxtools import compiled
+from lagjax.numerics import newton_in_python, null_space, with_value
 
 # Amplitudes that are evaluated together, half of them on each side.
 SAMPLES = 64

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis.equilibria.balance import SteadySymmetries
-from lagjax.display.printable import by_line
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.mechanics.diagnosis import describe
+from lagjax.display import by_line
+from lagjax.jaxtools import is_traced
+from lagjax.mechanics import describe
 from lagjax.system import coordinates
 
 OK, NO_BALANCE, CONSTRAINED, NOT_FINITE, NOT_LASTING, UNFINISHED = range(6)

@@ -16,15 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.energy import Motion
-from lagjax.integrate.trajectory.dense_output import in_one_solve
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.integrate import Trajectory, in_one_solve
+from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.numerics import quadrature
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.system import System
+from lagjax.system import System, check_system, coordinates, traced_system
 
 # Points of Gauss's rule on each piece, which is exact up to degree 15.
 POINTS = 8

@@ -22,20 +22,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.jaxpr import depends
-from lagjax.jaxtools.open_jumps import judging
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.lagrangian import applied_force
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW
-from lagjax.numerics.linalg import dense
-from lagjax.numerics.newton import newton
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import compiled, depends, is_traced, judging
+from lagjax.mechanics import SINGULAR_BELOW, applied_force, describe
+from lagjax.numerics import dense, newton
+from lagjax.system import System, check_system, coordinates, model_of, traced_system
 
 ITERATIONS = 60
 # The line search takes the best of these fractions of a Newton step, or none.

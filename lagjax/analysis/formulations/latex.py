@@ -25,14 +25,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from lagjax.exchange.from_sympy import sympy_itself
-from lagjax.jaxtools.jaxpr import MOVING, ClosedJaxpr, equations, interpreted
-from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
-from lagjax.mechanics.lagrangian import mass_and_forcing
-from lagjax.system import constraints, coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import checked
-from lagjax.system.model import Model, model_of
+from lagjax.exchange import sympy_itself
+from lagjax.jaxtools import LARGE, MOVING, ClosedJaxpr, TooLong, equations, interpreted, written_out
+from lagjax.mechanics import mass_and_forcing
+from lagjax.system import Model, check_system, checked, constraints, coordinates, model_of
 
 # Beyond these numbers of coordinates, of operations and of terms the equations are too long to read.
 COORDINATES, OPERATIONS, TERMS = 8, 2000, 400

@@ -19,15 +19,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from lagjax.analysis.formulations.hamiltonian import velocity_of
-from lagjax.jaxtools.cache import remembered
-from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.structure import forced_by, what_changes_momentum
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.constraints import Holonomic
-from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import remembered
+from lagjax.mechanics import forced_by, listed, what_changes_momentum
+from lagjax.system import WITH_MULTIPLIERS, Holonomic, Model, System, check_system, coordinates, model_of, takes_of
 
 
 class Routhian(eqx.Module):

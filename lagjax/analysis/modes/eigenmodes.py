@@ -24,8 +24,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from lagjax.analysis.modes.linearise import Linearisation
-from lagjax.numerics.linalg import dense, lapack
-from lagjax.numerics.linalg.eigenvalues import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
+from lagjax.numerics import Roots, dense, general_roots, lapack, roots_beside_zeros, symmetric_roots, zero_count
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)
 STEADY_BELOW = 1e-5

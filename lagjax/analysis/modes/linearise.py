@@ -18,17 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.modes.reduced_matrices import LinearisationKind, LinearParts, parts_of
-from lagjax.jaxtools.cache import remembered
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.mechanics.diagnosis import explain_failure, where
-from lagjax.mechanics.structure import invariance
-from lagjax.numerics.linalg import dense, lapack
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW
-from lagjax.system import constraints, coordinates
-from lagjax.system.check_functions import prepare
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
+from lagjax.jaxtools import compiled, is_eager, is_traced, remembered
+from lagjax.mechanics import explain_failure, invariance, where
+from lagjax.numerics import DEPENDENT_BELOW, dense, lapack
+from lagjax.system import Model, State, constraints, coordinates, prepare
 
 # A state given with seven digits is accepted; frequencies are then accurate to about as many.
 STEADY_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}

@@ -28,16 +28,11 @@ from lagjax.analysis.modes.eigenmodes import (
     motions_of,
 )
 from lagjax.analysis.modes.linearise import Linearisation, linearise, linearised
-from lagjax.display import plots
-from lagjax.display.animation import Animation
-from lagjax.integrate.trajectory.drawing import drawn
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.numerics.linalg.rank import null_space
-from lagjax.numerics.newton import newton_in_python
-from lagjax.system import coordinates
-from lagjax.system.model import model_of
-from lagjax.system.user_errors import Call, check_arguments
+from lagjax.display import Animation, plots
+from lagjax.integrate import drawn
+from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.numerics import newton_in_python, null_space
+from lagjax.system import Call, check_arguments, coordinates, model_of
 
 # The length of a film in periods, or in times of growth by a factor e.
 PERIODS, GROWTHS = 3.0, 3.0

@@ -30,13 +30,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.mechanics.lagrangian import forcing_and_inertia
-from lagjax.mechanics.multiplier_forces import response
-from lagjax.numerics.linalg import dense, lapack
-from lagjax.numerics.linalg.rank import independent_rows
-from lagjax.system import constraints
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model
+from lagjax.mechanics import forcing_and_inertia, response
+from lagjax.numerics import dense, independent_rows, lapack
+from lagjax.system import Model, State, constraints
 
 # The reduced mass matrix is singular if its reciprocal condition, after scaling, is below this.
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}

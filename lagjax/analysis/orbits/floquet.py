@@ -23,9 +23,8 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 from lagjax.analysis.orbits.monodromy import period_of, problem_of, refuse_singular
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.display import plots
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.system.coordinates import State
-from lagjax.system.system import System
+from lagjax.jaxtools import is_traced
+from lagjax.system import State, System
 
 # The largest extent of the axes: beyond this the circle would be too small to see.
 FAR = 4.0

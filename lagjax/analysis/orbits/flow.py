@@ -28,15 +28,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.mechanics.equations import equations_of
-from lagjax.numerics.methods.runge_kutta import Dopri8
-from lagjax.numerics.newton import last_step, newton
-from lagjax.system import constraints, coordinates
-from lagjax.system.model import Model
+from lagjax.integrate import solve_in_both_modes
+from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
+from lagjax.mechanics import equations_of
+from lagjax.numerics import Dopri8, last_step, newton
+from lagjax.system import Model, constraints, coordinates
 
 # Tight tolerances, because results about a cycle are differences after a whole period.
 TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}

@@ -25,12 +25,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from lagjax.analysis.orbits.flow import all_rows, flow_of
 from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular
 from lagjax.display import plots as plot
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.system.argument_checks import by_name
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import compiled, is_traced, numpy_of
+from lagjax.system import Model, State, System, by_name, model_of
 
 # Looser than for a cycle: averages over a motion that forgets its start do not depend on all its digits.
 TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}

@@ -30,16 +30,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, flow_of, independent_rows_of, scale_of
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import WATCHED, is_eager, is_traced, numpy_of
-from lagjax.mechanics.diagnosis import explain_failure
-from lagjax.mechanics.structure import are_angles, invariance
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import WATCHED, compiled, is_eager, is_traced, numpy_of
+from lagjax.mechanics import are_angles, explain_failure, invariance
+from lagjax.system import State, System, check_system, coordinates, model_of, traced_system
 
 # A direction shorter than this, relative to its possible length, is round-off.
 NO_DIRECTION = 1e-7

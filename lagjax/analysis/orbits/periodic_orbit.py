@@ -17,15 +17,10 @@ from lagjax.analysis.orbits import shooting
 from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular, tolerance_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest
-from lagjax.integrate.solve.harvest import Report, reported
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.jaxtools.cache import hashable_partition
-from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.mechanics.diagnosis import listed
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.system import System
+from lagjax.integrate import RESULTS, Report, reported
+from lagjax.jaxtools import hashable_partition, is_eager, is_traced, numpy_of, stop_gradient
+from lagjax.mechanics import listed
+from lagjax.system import State, System, coordinates
 
 # A driven system may change from one period to the next by this fraction of what it does in one.
 SAME = 1e-5

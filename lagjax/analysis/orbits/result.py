@@ -5,13 +5,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.analysis.orbits.shooting import OrbitRequest
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.cache import HashablePart
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.mechanics.diagnosis import describe
-from lagjax.system import coordinates
-from lagjax.system.system import System
+from lagjax.integrate import Trajectory, integrate
+from lagjax.jaxtools import HashablePart, is_traced
+from lagjax.mechanics import describe
+from lagjax.system import System, coordinates
 
 POINTS = 401
 

@@ -34,9 +34,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.analysis.orbits.flow import Flow, flow_of, scale_of
-from lagjax.jaxtools.compiled import compiled
-from lagjax.numerics.newton import damped_newton
-from lagjax.system.model import model_of
+from lagjax.jaxtools import compiled
+from lagjax.numerics import damped_newton
+from lagjax.system import model_of
 
 TURN = 2 * np.pi
 # Points of the path in a given period, and the number of given periods searched for a better one.

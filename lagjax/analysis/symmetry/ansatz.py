@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.analysis.symmetry.charge_rates import Affine
-from lagjax.mechanics.generators import AXES, points, turned
+from lagjax.mechanics import AXES, points, turned
 from lagjax.system import coordinates
 
 # Largest numbers of points rotated one by one, of coordinates boosted and scaled one by one, and of coordinates whose

@@ -21,14 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax.analysis.symmetry.random_states import States, around
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import numpy_of
-from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.generators import Generator
-from lagjax.mechanics.lagrangian import applied_force
-from lagjax.mechanics.noether import GeneratorFlow, flow
-from lagjax.system import constraints
-from lagjax.system.model import Model
+from lagjax.jaxtools import compiled, numpy_of
+from lagjax.mechanics import Generator, GeneratorFlow, applied_force, equations_of, flow
+from lagjax.system import Model, constraints
 
 
 class Precision(NamedTuple):

@@ -13,14 +13,9 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis.symmetry.charge_rates import Affine, precision_of, rates
 from lagjax.analysis.symmetry.random_states import draws
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.accelerations import accelerations_at
-from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.generators import as_generator
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.model import model_of
+from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.mechanics import accelerations_at, as_generator, describe
+from lagjax.system import check_system, coordinates, model_of, traced_system
 
 STATES, AT_LEAST = 64, 8
 

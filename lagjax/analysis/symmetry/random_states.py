@@ -14,14 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.cache import remembered
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import numpy_of
-from lagjax.mechanics.generators import points
-from lagjax.mechanics.structure import are_angles
-from lagjax.numerics.newton import newton
-from lagjax.system import constraints, coordinates
-from lagjax.system.model import Model
+from lagjax.jaxtools import compiled, numpy_of, remembered
+from lagjax.mechanics import are_angles, points
+from lagjax.numerics import newton
+from lagjax.system import Model, constraints, coordinates
 
 WIDTHS = np.array([1.5, 1.0, 0.5, 0.1])
 VELOCITY_WIDTHS = np.array([1.0, 0.3, 1.0, 0.0])

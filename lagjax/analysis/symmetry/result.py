@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.mechanics.noether import NoetherCharge
+from lagjax.mechanics import NoetherCharge
 from lagjax.system import coordinates
 
 # Parameters are recognised among at most so many, and at most so many terms of a combination are written.

@@ -33,16 +33,9 @@ from lagjax.analysis.symmetry.charge_rates import Affine, Precision, Rates, prec
 from lagjax.analysis.symmetry.is_symmetry import AT_LEAST, STATES, too_few
 from lagjax.analysis.symmetry.random_states import draws
 from lagjax.analysis.symmetry.result import Found, Scaling, Symmetries, Words, in_words, named_parameters
-from lagjax.jaxtools.cache import filled_up, remembered
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.generators import Generator, as_generator
-from lagjax.mechanics.noether import NoetherCharge
-from lagjax.mechanics.structure import conserved_momenta
-from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_system
-from lagjax.system.model import Model, model_of
+from lagjax.jaxtools import filled_up, is_traced, remembered
+from lagjax.mechanics import Generator, NoetherCharge, as_generator, conserved_momenta, describe
+from lagjax.system import Model, check_system, coordinates, model_of, traced_system
 
 PIVOT_ABOVE = 1e-2
 

@@ -14,18 +14,10 @@ from lagjax.fit.problem.initial_states import starts
 from lagjax.fit.problem.parameters import FreeNumbers, find, leaf_name
 from lagjax.fit.problem.records import KINDS, Record, Windows, channels, cut, spread
 from lagjax.fit.problem.residuals import LOSSES, FitProblem, replace
-from lagjax.integrate.events.event import Crossing, traced_guard
-from lagjax.integrate.solve.phases import traced_phases
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.diagnosis import listed
-from lagjax.system.argument_checks import check_system
-from lagjax.system.check_functions import traced_call, traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import model_of
-from lagjax.system.system import System
-from lagjax.system.user_errors import Call
+from lagjax.integrate import Crossing, traced_guard, traced_phases
+from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.mechanics import listed
+from lagjax.system import OF_STATE, Call, Hybrid, State, System, check_system, model_of, traced_call, traced_system
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, PyTree
 
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.problem.residuals import WHOLE, FitProblem
-from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.diagnosis import listed
-from lagjax.numerics.windowed_least_squares import Unknowns
-from lagjax.system.model import model_of
+from lagjax.integrate import integrate
+from lagjax.mechanics import listed
+from lagjax.numerics import Unknowns
+from lagjax.system import model_of
 
 
 def check_predicted(problem: FitProblem):

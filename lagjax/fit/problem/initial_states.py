@@ -22,22 +22,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.fit.problem.records import Record, Windows, spread
-from lagjax.integrate.integrate import integrate
-from lagjax.jaxtools.cache import kinds, once
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.mechanics.consistent_state import free_coordinates
-from lagjax.mechanics.diagnosis import listed
-from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.projection import departures, within
-from lagjax.numerics.linalg.rank import null_space
-from lagjax.numerics.newton import last_step, newton
-from lagjax.system import constraints, coordinates
-from lagjax.system.check_functions import traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.integrate import integrate
+from lagjax.jaxtools import compiled, is_traced, kinds, numpy_of, once, stop_gradient
+from lagjax.mechanics import departures, equations_of, free_coordinates, listed, within
+from lagjax.numerics import last_step, newton, null_space
+from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system
 
 # Position and velocity are read off a parabola through this many samples.
 SAMPLES = 7

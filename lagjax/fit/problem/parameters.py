@@ -21,8 +21,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.diagnosis import listed
+from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.mechanics import listed
 from lagjax.system import coordinates
 
 

@@ -11,8 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.jaxtools.cache import filled_up
-from lagjax.jaxtools.tracing import is_traced, numpy_of
+from lagjax.jaxtools import filled_up, is_traced, numpy_of
 
 # The kinds of measurement: `end` once per run, the others at each of its times.
 KINDS = ("q", "v", "multipliers", "observed", "end")

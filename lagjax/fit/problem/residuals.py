@@ -23,12 +23,10 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.fit.problem.initial_states import Starts
 from lagjax.fit.problem.parameters import FreeNumbers, leaf_name
 from lagjax.fit.problem.records import PADDING, Windows
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.trajectory.results import ended_well
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.compiled import compiled
-from lagjax.numerics.windowed_least_squares import Slopes, Unknowns, WindowedEquations
-from lagjax.system.model import model_of
+from lagjax.integrate import Trajectory, ended_well, integrate
+from lagjax.jaxtools import compiled
+from lagjax.numerics import Slopes, Unknowns, WindowedEquations
+from lagjax.system import model_of
 
 # The residual of a sample that the motion does not reach, in spreads of its data.
 NOT_REACHED = 10.0

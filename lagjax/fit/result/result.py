@@ -17,27 +17,20 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from lagjax.display import by_line
 from lagjax.display import plots as plot
-from lagjax.display.printable import by_line
-from lagjax.files import npz
-from lagjax.files.tree_json import NotGiven, NotWritable, Writer
+from lagjax.files import NotGiven, NotWritable, Writer, npz
 from lagjax.fit.problem.arguments import FitWarning
 from lagjax.fit.problem.records import channel_name
 from lagjax.fit.problem.residuals import LOSSES, WHOLE, FitProblem, dampened, equations, starts_at
 from lagjax.fit.search.search import Evaluation, Misfit
 from lagjax.fit.uncertainty.identifiable import Identifiability
 from lagjax.fit.uncertainty.laplace import Laplace, laplace
-from lagjax.integrate.integrate import integrate
-from lagjax.integrate.solve.harvest import Report
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced, numpy_of
-from lagjax.mechanics.diagnosis import listed
-from lagjax.numerics.windowed_least_squares import Unknowns
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.signature import UnknownSystem, signature
+from lagjax.integrate import RESULTS, Report, Trajectory, integrate
+from lagjax.jaxtools import compiled, is_traced, numpy_of
+from lagjax.mechanics import listed
+from lagjax.numerics import Unknowns
+from lagjax.system import State, UnknownSystem, coordinates, signature
 
 
 def lines_of(fit: "Fit") -> list[str]:

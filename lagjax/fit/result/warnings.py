@@ -7,7 +7,7 @@ from lagjax.fit.problem.records import channel_name
 from lagjax.fit.result.result import Fit
 from lagjax.fit.search.search import Evaluation
 from lagjax.fit.uncertainty.identifiable import rank_of
-from lagjax.mechanics.diagnosis import listed
+from lagjax.mechanics import listed
 
 # A search has gone astray if a number ends this many times as large as its guess.
 ASTRAY = 1e6

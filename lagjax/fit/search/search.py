@@ -50,11 +50,9 @@ from lagjax.fit.problem.residuals import (
     prior_and_hold,
     window_part,
 )
-from lagjax.integrate.settings import PATIENCE
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import WATCHED
-from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.numerics.windowed_least_squares import (
+from lagjax.integrate import PATIENCE
+from lagjax.jaxtools import WATCHED, compiled, jitted
+from lagjax.numerics import (
     ByWindows,
     Covariance,
     Slopes,

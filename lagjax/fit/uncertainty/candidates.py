@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lagjax.display.printable import by_line
+from lagjax.display import by_line
 
 # A number is determined if the undetermined directions hold no larger share than this of its squared slopes.
 NEGLIGIBLE_SHARE = 1e-8

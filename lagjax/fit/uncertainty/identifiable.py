@@ -17,10 +17,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.display.printable import by_line
+from lagjax.display import by_line
 from lagjax.fit.uncertainty.candidates import NextMeasurements
-from lagjax.mechanics.diagnosis import listed
-from lagjax.numerics.linalg.rank import null_space
+from lagjax.mechanics import listed
+from lagjax.numerics import null_space
 
 # A combination is written as a product of powers (m/M, k/m², but not m^0.37 M^-1.2) if its scaled exponents are
 # fractions with denominators up to the first number, to within the second.

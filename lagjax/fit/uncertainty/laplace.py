@@ -26,12 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.display.printable import by_line
+from lagjax.display import by_line
 from lagjax.fit.problem.residuals import WHOLE, FitProblem, over_windows, window_part
 from lagjax.fit.search.search import UNSEEN
 from lagjax.fit.uncertainty.candidates import NEGLIGIBLE_SHARE, seen_directions, units_of
-from lagjax.jaxtools.compiled import compiled
-from lagjax.numerics.windowed_least_squares import Unknowns
+from lagjax.jaxtools import compiled
+from lagjax.numerics import Unknowns
 from lagjax.system import coordinates
 
 # Standard deviations that differ by more than this fraction from Gauss-Newton's get a caveat.

@@ -21,11 +21,10 @@ from lagjax.fit.problem.records import Record, Windows, channel_name, closest, p
 from lagjax.fit.problem.residuals import WHOLE, FitProblem
 from lagjax.fit.search.search import UNSEEN, Evaluation, LinearisedResiduals, evaluation_from, linearised
 from lagjax.fit.uncertainty.candidates import Candidate, NextMeasurements, assess, eliminate_unknowns, sd_of, units_of
-from lagjax.integrate.integrate import integrate
-from lagjax.jaxtools.cache import filled_up
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.diagnosis import listed
-from lagjax.numerics.windowed_least_squares import Unknowns
+from lagjax.integrate import integrate
+from lagjax.jaxtools import compiled, filled_up
+from lagjax.mechanics import listed
+from lagjax.numerics import Unknowns
 
 
 class Survey(NamedTuple):

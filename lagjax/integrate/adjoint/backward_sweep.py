@@ -21,11 +21,8 @@ from jaxtyping import Array, Int, PyTree
 
 from lagjax.integrate.adjoint.step_record import Recorded, RecordRows, StepProblem, StepRecord, recorded_again
 from lagjax.integrate.stepping.projected_solver import ProjectedSolver
-from lagjax.jaxtools.fuse_cpu import PRODUCT
-from lagjax.jaxtools.jaxpr import length
-from lagjax.jaxtools.trees import like
-from lagjax.numerics.methods.nystrom import Nystrom, evaluations_a_step
-from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
+from lagjax.jaxtools import PRODUCT, length, like
+from lagjax.numerics import ExplicitRungeKutta, Nystrom, evaluations_a_step
 
 # Up to so many operations of a step pulled back, each stage gets a copy of the right-hand side instead of a loop. What
 # is not one machine function goes through memory at each turn of a loop, large matrices and their cotangents included:

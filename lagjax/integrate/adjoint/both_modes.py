@@ -35,8 +35,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.adjoint.second_order import Push, pull, turned
-from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split, stop_gradient
 
 # Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
 # back through checkpoints. From where on a replay is cheaper was not measured.

@@ -26,8 +26,7 @@ from jax.core import ShapedArray
 
 from lagjax.integrate.adjoint.backward_sweep import BackwardMotion, Lanes, filled, swept_back, together
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, recorded
-from lagjax.jaxtools.fuse_cpu import one_function
-from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, primitive, split
+from lagjax.jaxtools import ad, front, linear_map_primitive, one_function, primitive, split
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from jax.core import ShapedArray
 
 from lagjax.integrate.adjoint.backward_sweep import filled
 from lagjax.integrate.adjoint.replay import Replay
-from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, split
+from lagjax.jaxtools import ad, front, linear_map_primitive, split
 
 
 @eqx.filter_custom_jvp

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.stepping.projected_solver import ProjectedSolver
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs
-from lagjax.jaxtools.trees import like, where
+from lagjax.jaxtools import like, where
 
 # A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
 ROWS = 512

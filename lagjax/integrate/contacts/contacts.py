@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate.contacts.impacts import Impact, Opening
 from lagjax.integrate.solve.phases import OfPhases, Plastic
-from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS
+from lagjax.system import OF_STATE, WITH_MULTIPLIERS
 
 
 class Touches(eqx.Module):

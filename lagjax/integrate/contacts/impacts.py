@@ -39,15 +39,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate.solve.phases import OfPhases
-from lagjax.jaxtools.cache import shape_of
-from lagjax.jaxtools.jaxpr import depends
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.mechanics.projection import velocity_change
-from lagjax.system import constraints, coordinates
-from lagjax.system.constraints import Holonomic, Nonholonomic
-from lagjax.system.function_arguments import OF_POSITION, OF_STATE
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import depends, shape_of, stop_gradient
+from lagjax.mechanics import velocity_change
+from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System, constraints, coordinates, model_of
 
 # Names reserved for a contact's gap and sliding velocity among the constraints of a phase.
 GAP, SLIDING = "lagjax gap", "lagjax sliding"

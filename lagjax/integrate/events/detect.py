@@ -54,9 +54,8 @@ from lagjax.integrate.events.brackets import (
     next_node,
 )
 from lagjax.integrate.events.event import EventKind
-from lagjax.jaxtools.fuse_cpu import apart
-from lagjax.jaxtools.trees import like, stop_gradient
-from lagjax.mechanics.equations import all_finite
+from lagjax.jaxtools import apart, like, stop_gradient
+from lagjax.mechanics import all_finite
 
 # The most looks inside one step: an extremum takes three, a jump fifty.
 LOOKS = 400

@@ -17,15 +17,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.jaxtools.jaxpr import length
-from lagjax.jaxtools.trees import without_init
-from lagjax.system.check_functions import traced_call
-from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.system.model import model_of
-from lagjax.system.system import System, check_functions
-from lagjax.system.traced_functions import Traced
-from lagjax.system.user_errors import Call
+from lagjax.jaxtools import length, without_init
+from lagjax.system import (
+    OF_STATE,
+    WITH_MULTIPLIERS,
+    Call,
+    State,
+    System,
+    Traced,
+    check_functions,
+    model_of,
+    takes_of,
+    traced_call,
+)
 
 # A guard of more operations is compiled once for all places where it is evaluated.
 LONG = 100

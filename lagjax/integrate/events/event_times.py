@@ -25,8 +25,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.events.brackets import Watched, uneven
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Crossings, Guards
-from lagjax.jaxtools.trees import like
-from lagjax.mechanics.equations import Equations
+from lagjax.jaxtools import like
+from lagjax.mechanics import Equations
 
 # A guard jumps if, where its sign changes, it is this many times farther from zero than time resolution explains.
 JUMP_FACTOR = 64

@@ -22,12 +22,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools.jaxpr import outputs_of, run
-from lagjax.jaxtools.open_jumps import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps
-from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE, takes_of
-from lagjax.system.model import Model
-from lagjax.system.system import System
+from lagjax.jaxtools import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps, outputs_of, run
+from lagjax.system import OF_STATE, Model, State, System, takes_of
 
 # More modes than this are not followed: each adds to the program that watches the motion.
 MOST = 24

@@ -22,12 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.jumps.find import Given, Jumps, Smooth
-from lagjax.mechanics.lagrangian import applied_force, mass_and_forcing
-from lagjax.numerics.linalg import dense
-from lagjax.system import constraints, coordinates
-from lagjax.system.function_arguments import OF_STATE, WITH_MULTIPLIERS, takes_of
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.mechanics import applied_force, mass_and_forcing
+from lagjax.numerics import dense
+from lagjax.system import OF_STATE, WITH_MULTIPLIERS, Model, System, constraints, coordinates, model_of, takes_of
 
 # A force is evaluated once more for each jump along which a motion could slide.
 MOST_SLIDING = 8

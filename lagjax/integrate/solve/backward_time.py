@@ -31,9 +31,7 @@ from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.parts import Snapshot, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.system.coordinates import is_traced
-from lagjax.system.function_arguments import takes_of
-from lagjax.system.system import System
+from lagjax.system import System, is_traced, takes_of
 
 
 class Reflected(eqx.Module):

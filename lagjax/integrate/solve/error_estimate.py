@@ -27,8 +27,7 @@ from jaxtyping import Array
 from lagjax.integrate.trajectory.error_report import Errors, columns, scaled_error
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.tracing import is_eager
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import is_eager, stop_gradient
 
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8

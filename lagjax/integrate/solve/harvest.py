@@ -16,11 +16,20 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.fuse_cpu import poisoned
-from lagjax.jaxtools.jaxpr import ClosedJaxpr, anywhere, applied, bodies, interpreted, once_per_program, stands_for
-from lagjax.jaxtools.primitives import primitive
-from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import (
+    REGULAR_FIRST,
+    WATCHED,
+    ClosedJaxpr,
+    anywhere,
+    applied,
+    bodies,
+    interpreted,
+    once_per_program,
+    poisoned,
+    primitive,
+    stands_for,
+    stop_gradient,
+)
 
 
 class Report(NamedTuple):

@@ -42,18 +42,19 @@ from lagjax.integrate.stepping.tolerances import (
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import worst_drift
-from lagjax.jaxtools.fuse_cpu import calls_host, one_function
-from lagjax.jaxtools.trees import like, stop_gradient
-from lagjax.mechanics.equations import Equations, all_finite, equations_of
-from lagjax.mechanics.projection import returned, within, worst_residual
-from lagjax.mechanics.structure import are_angles, conserves_jacobi_integral
-from lagjax.numerics.methods.nystrom import Nystrom
-from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
-from lagjax.numerics.methods.runge_kutta import ExplicitRungeKutta
-from lagjax.system import coordinates
-from lagjax.system.coordinates import State
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import calls_host, like, one_function, stop_gradient
+from lagjax.mechanics import (
+    Equations,
+    all_finite,
+    are_angles,
+    conserves_jacobi_integral,
+    equations_of,
+    returned,
+    within,
+    worst_residual,
+)
+from lagjax.numerics import ExplicitRungeKutta, Nystrom, Radau5, SimplifiedNewton, with_tolerances
+from lagjax.system import State, System, coordinates, model_of
 
 # Packages whose checks at run time are known to pass, since `solve` examines their subjects itself.
 CHECKED_PACKAGES = {"lagjax", "diffrax", "optimistix"}

@@ -47,12 +47,8 @@ from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.fuse_cpu import apart
-from lagjax.jaxtools.open_jumps import IN_TIME
-from lagjax.jaxtools.trees import like, stop_gradient, where
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
-from lagjax.system.warn import warn
+from lagjax.jaxtools import IN_TIME, apart, like, stop_gradient, where
+from lagjax.system import Model, System, model_of, warn
 
 # The most jumps that are followed in a motion.
 MOST_JUMPS = 1000

@@ -16,15 +16,21 @@ from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_d
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.segments import Phase
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES
-from lagjax.mechanics.projection import velocity_change
-from lagjax.system import constraints
-from lagjax.system.check_functions import traced_call, traced_system
-from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE, takes_of
-from lagjax.system.hybrid import Hybrid, Switch, replace_fields
-from lagjax.system.model import model_of
-from lagjax.system.system import System
-from lagjax.system.user_errors import Call
+from lagjax.mechanics import velocity_change
+from lagjax.system import (
+    OF_STATE,
+    Call,
+    Hybrid,
+    State,
+    Switch,
+    System,
+    constraints,
+    model_of,
+    replace_fields,
+    takes_of,
+    traced_call,
+    traced_system,
+)
 
 
 class Reset(eqx.Module):

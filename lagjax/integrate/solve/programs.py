@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.display.progress import waiting
+from lagjax.display import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
@@ -33,18 +33,21 @@ from lagjax.integrate.solve.segments import solved_in_legs
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools.cache import HashablePart, filled_up, hashable_partition, program_of
-from lagjax.jaxtools.compiled import compiler_options
-from lagjax.jaxtools.tracing import is_eager, takes_for_regular
-from lagjax.jaxtools.trees import stop_gradient
-from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
-from lagjax.mechanics.scalar_equations import has_networks
-from lagjax.mechanics.structure import is_free_of_velocities
-from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, evaluations_a_step
-from lagjax.numerics.methods.runge_kutta import Dopri8, in_our_form
-from lagjax.system.coordinates import State
-from lagjax.system.model import Model, model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import (
+    HashablePart,
+    compiler_options,
+    filled_up,
+    hashable_partition,
+    is_eager,
+    jitted,
+    one_by_one,
+    program_of,
+    stop_gradient,
+    takes_for_regular,
+)
+from lagjax.mechanics import has_networks, is_free_of_velocities
+from lagjax.numerics import Dopri8, Nystrom, Nystrom8, Nystrom12, evaluations_a_step, in_our_form
+from lagjax.system import Model, State, System, model_of
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint

@@ -34,13 +34,9 @@ from lagjax.integrate.solve.one_motion import resolution, solved
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, Switches
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.jaxtools.fuse_cpu import apart
-from lagjax.jaxtools.trees import like, stop_gradient, where
-from lagjax.mechanics.equations import all_finite
-from lagjax.system import coordinates
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.jaxtools import apart, like, stop_gradient, where
+from lagjax.mechanics import all_finite
+from lagjax.system import Hybrid, System, coordinates, model_of
 
 
 def nothing(guards: Guards | None, names, q: PyTree, v: PyTree, multipliers: dict[str, Array]) -> dict[str, Crossings]:

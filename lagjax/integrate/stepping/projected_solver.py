@@ -20,11 +20,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.stepping.step_to_outputs import between_jumps
 from lagjax.integrate.stepping.tolerances import Tolerances
-from lagjax.jaxtools.fuse_cpu import kept_as_call
-from lagjax.mechanics.equations import Equations, all_finite
-from lagjax.mechanics.projection import to_manifold
-from lagjax.numerics.methods.radau import Radau5
-from lagjax.numerics.methods.runge_kutta import Interpolation
+from lagjax.jaxtools import kept_as_call
+from lagjax.mechanics import Equations, all_finite, to_manifold
+from lagjax.numerics import Interpolation, Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3

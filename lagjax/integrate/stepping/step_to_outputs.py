@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.stepping.tolerances import PerCoordinateTolerance
-from lagjax.mechanics.equations import Equations
+from lagjax.mechanics import Equations
 
 # `shares` with the first step as proposed, and no longest one; an infinite share of an empty interval would be NaN.
 WHOLE_STEPS = 1.0, 1e30

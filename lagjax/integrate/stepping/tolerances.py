@@ -24,7 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.settings import Settings
-from lagjax.jaxtools.trees import stop_gradient
+from lagjax.jaxtools import stop_gradient
 
 # The size of an angle counts up to this: a tolerance relative to a thousand turns would mean nothing.
 TURN = 2 * np.pi

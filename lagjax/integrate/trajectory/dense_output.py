@@ -25,11 +25,9 @@ from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
-from lagjax.jaxtools.cache import filled_up
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_eager, is_traced, numpy_of
-from lagjax.mechanics.accelerations import accelerations
-from lagjax.system.system import System
+from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of
+from lagjax.mechanics import accelerations
+from lagjax.system import System
 
 # Controllers that can begin at any time; others plan the steps of the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController

@@ -19,13 +19,10 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display.animation import Animation
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.generators import Generator
-from lagjax.mechanics.noether import NoetherCharge
-from lagjax.mechanics.structure import conserved_momenta, conserves_jacobi_integral
-from lagjax.system import coordinates
-from lagjax.system.user_errors import Call, check_arguments
+from lagjax.display import Animation
+from lagjax.jaxtools import compiled
+from lagjax.mechanics import Generator, NoetherCharge, conserved_momenta, conserves_jacobi_integral
+from lagjax.system import Call, check_arguments, coordinates
 
 
 def curves(tree: PyTree):

@@ -13,9 +13,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.integrate.stepping.tolerances import TURN
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, is_among, message
-from lagjax.mechanics.structure import are_angles
-from lagjax.system import coordinates
-from lagjax.system.signature import UnknownSystem
+from lagjax.mechanics import are_angles
+from lagjax.system import UnknownSystem, coordinates
 
 # An error of up to this many tolerances is expected, if it is also below this share of the number.
 EXPECTED, DIGITS_LEFT = 1e4, 5e-4

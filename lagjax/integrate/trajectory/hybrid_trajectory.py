@@ -12,15 +12,13 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.display import by_line
 from lagjax.display import plots as plot
-from lagjax.display.printable import by_line
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
-from lagjax.jaxtools.compiled import compiled
-from lagjax.mechanics.projection import worst_residual
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.model import Model
-from lagjax.system.signature import UnknownSystem, known_system
+from lagjax.jaxtools import compiled
+from lagjax.mechanics import worst_residual
+from lagjax.system import Hybrid, Model, UnknownSystem, known_system
 
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"

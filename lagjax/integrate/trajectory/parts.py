@@ -6,7 +6,7 @@ from typing import NamedTuple
 import diffrax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.jaxtools.cache import HashablePart, hashable_partition
+from lagjax.jaxtools import HashablePart, hashable_partition
 
 # The phase of an output that was not reached, and the number in unused places for switches.
 NO_PHASE = -1

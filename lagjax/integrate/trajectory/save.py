@@ -8,11 +8,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from lagjax.files import npz
-from lagjax.files.tree_json import Writer
+from lagjax.files import Writer, npz
 from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.system.signature import UnknownSystem, middle_state, signature
+from lagjax.system import UnknownSystem, middle_state, signature
 
 # Fields that are arrays or trees of arrays, the same in the trajectory and in the file.
 PLAIN = "t", "q", "v", "multipliers", "stats", "scaled_error", "tolerance"

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from lagjax.display import Animation, printable
 from lagjax.display import plots as plot
-from lagjax.display.animation import Animation
-from lagjax.display.printable import printable
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.trajectory import drawing, error_report
 from lagjax.integrate.trajectory.dense_output import at
@@ -22,14 +21,9 @@ from lagjax.integrate.trajectory.parts import Snapshot, SolveOptions, StaticPart
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, is_among, item, message
 from lagjax.integrate.trajectory.save import save
 from lagjax.integrate.trajectory.to_xarray import dataset
-from lagjax.jaxtools.compiled import compiled
-from lagjax.jaxtools.tracing import is_traced
-from lagjax.jaxtools.without_lapack_batches import jitted
-from lagjax.mechanics.projection import worst_residual
-from lagjax.mechanics.structure import what_changes_jacobi_integral
-from lagjax.system.model import Model, model_of
-from lagjax.system.signature import UnknownSystem, known_system
-from lagjax.system.system import System
+from lagjax.jaxtools import compiled, is_traced, jitted
+from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
+from lagjax.system import Model, System, UnknownSystem, known_system, model_of
 
 
 class AccuracyWarning(UserWarning):

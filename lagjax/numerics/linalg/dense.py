@@ -22,8 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lagjax.jaxtools.primitives import primitive
-from lagjax.jaxtools.without_lapack_batches import one_by_one
+from lagjax.jaxtools import one_by_one, primitive
 
 ELIMINATE_UP_TO = 6
 # The largest matrix inverted inside a program without LAPACK; larger ones are better off with it.
