@@ -12,7 +12,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import zarr
 
 import lagjax as lj
 from lagjax.sweep.store import Store
@@ -55,18 +54,6 @@ def test_written_resumed_and_read(tmp_path):
     assert alone.to_xarray()["value"].dims == ("g", "angle")
     with pytest.raises(ValueError, match="does not know the function that ran it"):
         alone.resweep(where=True)
-
-
-def test_only_what_is_missing(tmp_path):
-    """Unmarked blocks are computed again, whatever values they contain."""
-    path, whole = tmp_path / "sweep", swept(worker.quick)
-    swept(worker.quick, path)
-    store = Store(path)
-    store.unmark([1])
-    zarr.open_group(str(path))["value"][store.blocks.region(1)] = -1.0
-    again = swept(worker.quick, path)
-    assert again.ran == len(np.r_[store.blocks.points(1)])
-    same(again, whole)
 
 
 def test_another_sweep_is_refused(tmp_path):

@@ -12,7 +12,6 @@ import pytest
 import lagjax as lj
 from lagjax.display.progress import Silent
 from lagjax.integrate.solve.harvest import reporting
-from lagjax.sweep import scheduler
 
 pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
 rod = lj.System(
@@ -110,23 +109,6 @@ def test_a_lane_that_fails_keeps_its_reason():
 
 
 @pytest.mark.exhaustive
-def test_long_lanes_are_run_alone(monkeypatch):
-    """Other lanes do not wait for them; lanes that hit the user's own step limit are not run again."""
-    monkeypatch.setattr(scheduler, "PATIENCE", 30)
-    run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
-    alone = run(2**16)
-    swept = quiet(alone)
-    assert swept.ok.all() and 0 < np.sum(swept.status.steps > 30) < 10
-    # A function jitted by the user and traced in the sweep has no step limit outside the sweep.
-    for i, j in np.argwhere(swept.status.steps > 30):
-        np.testing.assert_allclose(
-            swept.values[i, j], alone({"g": AXES["g"][i], "angle": AXES["angle"][j]}), rtol=1e-14
-        )
-    few = quiet(run(28))
-    assert few.status.steps.max() == 28 and np.any(few.status.result == MAX_STEPS)
-
-
-@pytest.mark.exhaustive
 def test_starts_that_cannot_be_integrated():
     """Starts off the constraint, or NaN: each lane has its own result, none raises."""
     start = lambda point: ({"x": point["x"], "y": 0.0}, {"x": 0.0, "y": 0.0})
@@ -200,15 +182,6 @@ def test_whole_trajectories():
     flags = data["result"].attrs
     assert data["result"].dims == ("g", "angle") and (data["result"] == OK).all()
     assert dict(zip(flags["flag_values"], flags["flag_meanings"].split()))[OK] == "successful"
-
-
-def test_paired_and_labelled():
-    """The dimension is the point, and the axes are its coordinates."""
-    pairs = {"g": jnp.array([1.0, 4.0, 9.0]), "angle": jnp.array([0.1, 0.2, 0.3])}
-    swept = quiet(lambda point: swing(point).q[-1], pairs, paired=True)
-    data = swept.to_xarray()
-    assert data["value"].dims == ("point",) and data["g"].dims == ("point",)
-    np.testing.assert_allclose(swept.values, by_loop(lambda point: swing(point).q[-1], pairs).diagonal(), rtol=1e-7)
 
 
 def test_repr_and_pictures():

@@ -169,17 +169,3 @@ def test_without_the_extra(monkeypatch, name, export):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=rf'needs {name}(.|\n)*pip install "lagjax\[data\]"'):
         getattr(found, export)()
-
-
-def test_axes_with_names_that_are_taken(tmp_path):
-    """A value named like a dimension, axes named like a status, and axis names that a store cannot keep."""
-    axes = {"steps": np.arange(3.0), "y_0": np.arange(2.0)}
-    of = lambda point: {"y": point["y_0"] * jnp.ones(4), "result": point["steps"]}
-    data = swept(tmp_path / "store", of, axes).to_xarray()
-    assert data["status_steps"].dims == data["result"].dims == ("steps", "y_0") and "status_result" in data
-    assert data["y"].dims[:2] == ("steps", "y_0") and data["y"].shape == (3, 2, 4)
-    xarray.testing.assert_equal(data, xarray.open_zarr(tmp_path / "store").load())
-    for name in ("lagjax", "a/b"):
-        with pytest.raises(ValueError, match=f"axis '{name}' cannot be kept in a store"):
-            swept(tmp_path / "other", lambda point: 1.0, {name: np.arange(2.0)})
-    assert not (tmp_path / "other").exists()

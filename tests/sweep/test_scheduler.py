@@ -1,4 +1,4 @@
-"""A callback of the user's that raises at some points: these are NaN with their reason, and the others are kept."""
+"""Points that need a call of their own: long lanes, and those at which a callback of the user's raises."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.sweep import scheduler
+from tests.sweep.test_sweep import AXES, MAX_STEPS, quiet, swing
 
 free = lj.System(lambda t, q, v, p: 0.5 * v**2 + p["k"] * q)
 
@@ -43,3 +45,20 @@ def test_a_trajectory_knows():
         swept = lj.sweep(run, {"x": np.array([0.5, 1.0])}, progress=False)
     assert np.isnan(swept.values.q[1]).all() and np.isfinite(swept.values.q[0]).all()
     assert int(np.asarray(swept.values.result._value)[1]) == int(lj.RESULTS.raised._value)
+
+
+@pytest.mark.exhaustive
+def test_long_lanes_are_run_alone(monkeypatch):
+    """Other lanes do not wait for them; lanes that hit the user's own step limit are not run again."""
+    monkeypatch.setattr(scheduler, "PATIENCE", 30)
+    run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
+    alone = run(2**16)
+    swept = quiet(alone)
+    assert swept.ok.all() and 0 < np.sum(swept.status.steps > 30) < 10
+    # A function jitted by the user and traced in the sweep has no step limit outside the sweep.
+    for i, j in np.argwhere(swept.status.steps > 30):
+        np.testing.assert_allclose(
+            swept.values[i, j], alone({"g": AXES["g"][i], "angle": AXES["angle"][j]}), rtol=1e-14
+        )
+    few = quiet(run(28))
+    assert few.status.steps.max() == 28 and np.any(few.status.result == MAX_STEPS)
