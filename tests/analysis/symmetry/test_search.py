@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.scenes import cross_rails, mass_distributions, sliding_wedge
-from tests.analysis.test_symmetry import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, STONE, rolling
+from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, STONE, rolling
 
 SLOW = ("finite cylinder", "elliptic cylinder", "helix")
 TABLE = {

@@ -1,0 +1,75 @@
+"""Programs with the same meaning are equal, whatever objects they consist of; others are not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.jaxtools.jaxpr_identity import Itself, content_of, meaning_of, rules_of, with_own_constants
+
+TABLE = np.arange(300.0)
+
+
+def meaning(function, *args):
+    """The meaning of a function at some arguments, with the content of its constants."""
+    closed = jax.make_jaxpr(function)(*(args or (1.0,)))
+    return meaning_of(closed.jaxpr), tuple(map(content_of, closed.consts))
+
+
+def scaled(factor):
+    """A function that is made anew at each call, with a function and a loop inside."""
+    inner = jax.jit(lambda x: jnp.sin(x) * factor)
+    return lambda x: jax.lax.fori_loop(0, 3, lambda _, x: inner(x), x)
+
+
+def test_the_same_again():
+    """Functions made anew with the same numbers are equal, and so are their hashes."""
+    assert meaning(scaled(2.0)) == meaning(scaled(2.0)) and hash(meaning(scaled(2.0))) == hash(meaning(scaled(2.0)))
+    assert meaning(lambda x: x + TABLE) == meaning(lambda x: x + TABLE.copy())
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (scaled(2.0), scaled(3.0)),
+        (lambda x: x - 1.0, lambda x: 1.0 - x),
+        (lambda x: x * 0.0, lambda x: x * -0.0),
+        (lambda x: x + TABLE, lambda x: x + TABLE[::-1]),
+        (lambda x: (x, 2 * x), lambda x: (2 * x, x)),
+        (lambda x: jnp.sum(x * jnp.ones((2, 3)), axis=0), lambda x: jnp.sum(x * jnp.ones((2, 3)), axis=1)),
+    ],
+    ids=["number", "order", "sign of zero", "table", "results", "axis"],
+)
+def test_others_differ(one, other):
+    """Twins: another number, order, sign of zero, table, order of results, or parameter of a primitive."""
+    assert meaning(one) != meaning(other)
+
+
+def test_types_count():
+    """1 is not True, and single precision is not double."""
+    assert content_of(1) != content_of(True) and content_of(np.float32(1.0)) != content_of(1.0)
+    assert meaning(lambda x: 2 * x, 1.0) != meaning(lambda x: 2 * x, np.float32(1.0))
+    assert Itself(TABLE) == Itself(TABLE) != Itself(TABLE.copy())
+
+
+def test_constants_of_inner_functions_become_its_own():
+    """An array that a function inside holds is then a constant of the program, which computes the same."""
+    inner = jax.jit(lambda x: x + TABLE)
+    own = with_own_constants(jax.make_jaxpr(lambda x: 2 * inner(x))(1.0))
+    assert any(np.array_equal(x, TABLE) for x in own.consts)
+    np.testing.assert_array_equal(jax.core.eval_jaxpr(own.jaxpr, own.consts, 1.0)[0], 2 * (1.0 + TABLE))
+
+
+def with_rule(slope):
+    """x², with a rule of its own for the derivative."""
+    square = jax.custom_jvp(lambda x: x * x)
+    square.defjvps(lambda dx, value, x: slope(x) * dx)
+    return square
+
+
+def test_rules_of_differentiation_count():
+    """Equal values with other rules are told apart by `rules_of` alone; without rules there is nothing to compare."""
+    right, wrong = with_rule(lambda x: 2 * x), with_rule(lambda x: 3 * x)
+    rules = lambda function: rules_of(function, jax.make_jaxpr(function)(1.0), 1.0)
+    assert meaning(right) == meaning(wrong) and rules(right) != rules(wrong)
+    assert rules(right) == rules(with_rule(lambda x: 2 * x)) and rules(jnp.sin) == ()

@@ -1,0 +1,48 @@
+"""Operations on all arrays of a tree: they choose, stop derivatives, and leave the rest as it is."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lagjax.jaxtools.trees import like, stop_gradient, where, without_init
+
+
+class Checked(eqx.Module):
+    """A module whose `__init__` refuses everything."""
+
+    x: float
+
+    def __init__(self, x):
+        raise ValueError("refused")
+
+
+def test_each_array_is_chosen():
+    """Arrays come from one of two trees, in the dtypes of the second; what is no array stays."""
+    a, b = {"x": jnp.arange(3.0), "name": "a"}, {"x": jnp.zeros(3, jnp.float32), "name": "b"}
+    chosen = where(jnp.array([True, False, True]), a, b)
+    assert chosen["name"] == "b" and chosen["x"].dtype == np.float32 and chosen["x"].tolist() == [0.0, 0.0, 2.0]
+    assert where(False, a, b)["x"].tolist() == [0.0] * 3
+
+
+def test_a_mask_has_the_axes_of_what_it_masks():
+    """A mask of lanes selects whole lanes; twin: without it the shapes do not fit."""
+    mask, x = jnp.array([True, False]), jnp.ones((2, 3))
+    assert jnp.where(like(mask, x), x, 0.0).sum(axis=1).tolist() == [3.0, 0.0] and like(mask, mask).shape == (2,)
+    with pytest.raises((TypeError, ValueError)):
+        jnp.where(mask, x, 0.0)
+
+
+def test_derivatives_stop():
+    """x · x has the slope x where one factor is held; twin: 2 x where none is."""
+    assert jax.grad(lambda x: x * stop_gradient({"x": x, "name": "x"})["x"])(3.0) == 3.0
+    assert jax.grad(lambda x: x * x)(3.0) == 6.0
+
+
+def test_no_init_is_called():
+    """The fields are set without a check; twin: the usual way refuses."""
+    made = without_init(Checked, {"x": 2.0})
+    assert isinstance(made, Checked) and jax.tree.leaves(made) == [2.0]
+    with pytest.raises(ValueError, match="refused"):
+        Checked(2.0)
