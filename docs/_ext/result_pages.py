@@ -23,7 +23,7 @@ closed forms (for the helix: against SciPy).
 ORDERS = """# Orders, as measured
 
 The order of each method with constant steps, on outputs between its steps, from `benchmarks/results/orders.json`. The
-slow tests assert the same, and must fail for tableaus with misprints: `tests/integrate/test_orders.py`, and
+slow tests assert the same, and must fail for tableaus with misprints: `tests/behaviour/test_orders.py`, and
 `test_nystrom.py`, `test_radau.py` and `test_runge_kutta.py` in `tests/numerics/methods`.
 
 | method | motion | claimed | measured | least error |

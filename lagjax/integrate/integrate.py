@@ -143,7 +143,7 @@ def integrate(
     - Warns of what is hardly ever intended: a `dissipation` that is odd in v, as a force is; once in a process
       (`lj.PrecisionWarning`), float32 that is used only because nothing else was requested.
 
-    Order and accuracy: those of `method`; `tests/integrate/test_orders.py` measures them.
+    Order and accuracy: those of `method`; `tests/behaviour/test_orders.py` measures them.
 
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """

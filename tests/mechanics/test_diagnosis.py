@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.behaviour.test_bad_input import refusal, sphere
 from tests.mechanics.test_saddle_point import DOOR_STATE, STATE, door, twice
-from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+from tests.systems import HORIZONTAL, PARAMS, TS, cartesian_lagrangian, rod, rod_pendulum
 
 
 def rod_square(q):
@@ -79,3 +80,48 @@ def test_contradictory_accelerations_are_named():
     assert np.isnan(traced[0]["x"])
     agreeing = lj.System(cartesian_lagrangian, {"slow": drive(1.0), "fast": drive(1.0)})
     assert float(lj.accelerations(agreeing, 0.0, at_rest, at_rest, PARAMS)[0]["x"]) == pytest.approx(1.0, rel=1e-15)
+
+
+def test_nan_from_the_lagrangian():
+    """L is NaN at the start, although its derivatives are finite: the log of a negative number."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.log(q))
+    with refusal(ValueError, "L is nan", "q = -1"):
+        lj.integrate(system, -1.0, 1.0, ts=TS)
+
+
+def test_nan_in_a_derivative():
+    """L is finite but its derivative is not: sqrt at zero; the message names the coordinate."""
+    system = lj.System(lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - jnp.sqrt(q["b"]))
+    with refusal(ValueError, "coordinate 'b'", "sqrt"):
+        lj.integrate(system, {"a": 1.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, ts=TS)
+
+
+def test_pole():
+    """Polar coordinates at the pole: the azimuth's mass vanishes."""
+    for act in (
+        lambda q, v: lj.integrate(sphere, q, v, ts=TS),
+        lambda q, v: lj.accelerations(sphere, 0.0, q, v, None),
+    ):
+        with refusal(ValueError, "singular in coordinate 'theta'", "Cartesian"):
+            act({"psi": 0.0, "theta": 0.0}, {"psi": 1.0, "theta": 0.0})
+
+
+def test_missing_velocity():
+    """A coordinate without kinetic energy."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - q["b"] ** 2)
+    with refusal(ValueError, "singular in coordinate 'b'"):
+        lj.integrate(system, {"a": 1.0, "b": 0.5}, {"a": 0.0, "b": 0.0}, ts=TS)
+
+
+@pytest.mark.exhaustive
+def test_constraint_without_a_derivative():
+    """A squared constraint has no derivative where it holds: it is named, and does not count as redundant."""
+    rod = rod_pendulum.constraints["rod"]
+    assert isinstance(rod, lj.Holonomic)
+    squared = lj.Holonomic(lambda t, q, params: rod.g(t, q, params) ** 2)
+    system = lj.System(rod_pendulum.lagrangian, {"rod": rod, "squared": squared})
+    with refusal(ValueError, "constraint 'squared' does not act independently"):
+        lj.accelerations(system, 0.0, *HORIZONTAL, PARAMS)
+    alone = lj.System(rod_pendulum.lagrangian, {"squared": squared})
+    with refusal(ValueError, "constraint 'squared' does not act independently"):
+        lj.integrate(alone, *HORIZONTAL, PARAMS, ts=TS)

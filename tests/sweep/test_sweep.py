@@ -11,7 +11,6 @@ import pytest
 
 import lagjax as lj
 from lagjax.display.progress import Silent
-from lagjax.integrate.solve.harvest import reporting
 
 pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
 rod = lj.System(
@@ -146,21 +145,6 @@ def test_a_drifting_motion_is_marked():
     swept = quiet(lambda point: swing(point, **settings).q[-1], {"g": jnp.array([1.0]), "angle": jnp.array([2.0])})
     assert not swept.ok.any() and np.isfinite(swept.values).all()
     assert swept.status.scaled_error > 1 and "the change of what must stay constant" in repr(swept)
-
-
-@pytest.mark.exhaustive
-def test_reports_are_found_in_every_kind_of_program():
-    """Reports are found in plain, jitted, differentiated and batched programs; the worst of several counts."""
-    program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
-    _, alone, _ = program(lambda f: f)(4.0)
-    assert int(alone.steps) > 0
-    for wrap in (jax.jit, jax.grad, lambda f: jax.jit(jax.jit(f)), jax.value_and_grad):
-        assert int(program(wrap)(4.0)[1].steps) == int(alone.steps)
-    twice = program(lambda f: lambda g: f(g) + f(g))(4.0)[1]
-    assert int(twice.steps) == 2 * int(alone.steps)
-    some = program(lambda f: lambda g: jax.vmap(f)(jnp.array([g, jnp.nan])))(4.0)[1]
-    assert int(some.result) == int(lj.RESULTS.start_not_finite._value)
-    assert jax.jit(reporting(lambda x: 2 * x))(1.0)[1] is None
 
 
 def test_without_an_integration():

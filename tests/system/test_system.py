@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import pytest
 
 import lagjax as lj
+from tests.behaviour.test_bad_input import refusal
 from tests.behaviour.test_copies import spring, system
+from tests.systems import PARAMS, pendulum
 
 
 def rod(t, q, params):
@@ -62,3 +64,17 @@ def test_functions_that_pickle_cannot_find():
         assert "Fix: define it with def" in str(raised.value)
         assert copy.deepcopy(thing) == thing
     assert pickle.loads(pickle.dumps(lj.System(spring, {"rod": lj.Holonomic(rod)}))).constraints["rod"].g is rod
+
+
+def test_called_lagrangian_and_bare_constraint():
+    """`System` refuses a value instead of a function, and a constraint without a kind."""
+    with refusal(TypeError, "lagrangian must be a function"):
+        lj.System(3.0)
+    with refusal(TypeError, "'rod'", "lj.Holonomic"):
+        lj.System(pendulum.lagrangian, {"rod": lambda t, q, params: q})
+    with refusal(TypeError, "kinetic and potential energy given separately", "return kinetic - potential"):
+        lj.System(pendulum.lagrangian, pendulum.lagrangian)
+    with refusal(TypeError, "params in the place of constraints", "each call takes them"):
+        lj.System(pendulum.lagrangian, PARAMS)
+    with refusal(TypeError, "named 3, but its name must be text"):
+        lj.System(pendulum.lagrangian, {3: lj.Holonomic(lambda t, q, params: q)})

@@ -7,17 +7,13 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.adjoint import backward_sweep, both_modes, replay, step_record
 from tests.tiers import exhaustive_but
 
 TS = np.linspace(0.0, 2.0, 9)
 PARAMS = {"g": 9.81, "l": 2.0}
 
 
-@pytest.fixture(autouse=True)
-def in_reverse(monkeypatch):
-    """Replay also with few parameters; each test makes its own systems, since JAX caches what it has transformed."""
-    monkeypatch.setattr(both_modes, "PUSH_UP_TO", 0)
+pytestmark = pytest.mark.usefixtures("in_reverse")
 
 
 def pendulum(drag=0.05):
@@ -54,74 +50,6 @@ def test_a_pendulum_by_parameters_state_and_times():
     """The modes agree on derivatives by g, l, the first state and all output times."""
     system = pendulum()
     modes_agree(lambda x: end(system, *x[:2], x[2], x[3]), (0.75, 0.25, PARAMS, jnp.asarray(TS)))
-
-
-@pytest.mark.slow
-def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
-    """Twin: without the cotangent of one output the modes disagree."""
-    swept = replay.swept_back
-
-    def dropped(leaves, found, asked, **params):
-        outputs = jax.tree.map(lambda ct: ct.at[4].set(0.0), asked[0])
-        return swept(leaves, found, (outputs, *asked[1:]), **params)
-
-    monkeypatch.setattr(replay, "swept_back", dropped)
-    system = pendulum()
-    with pytest.raises(AssertionError):
-        modes_agree(lambda p: end(system, 0.75, 0.25, p), PARAMS)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("room", exhaustive_but(((4, 2),), ((16, 64), (16, 4), (4, 2))))
-def test_more_steps_than_there_is_room_for(monkeypatch, room):
-    """Steps run again from checkpoints, from all of them or from every other one, are the same steps."""
-    of = lambda system: jax.grad(lambda p: end(system, 0.75, 0.25, p, method=lj.Tsit5()))(PARAMS)
-    expected, (rows, places) = of(pendulum()), room
-    monkeypatch.setattr(step_record, "ROWS", rows)
-    monkeypatch.setattr(step_record, "PLACES", places)
-    system = pendulum()
-    steps = lj.integrate(system, 0.75, 0.25, PARAMS, ts=TS, rtol=1e-10, method=lj.Tsit5()).stats["num_accepted_steps"]
-    assert steps > rows * places or room != (4, 2)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), of(system), expected)
-
-
-@pytest.mark.exhaustive
-def test_lanes_that_fail_have_no_part():
-    """A lane without mass does not start: it adds nothing to derivatives by shared parameters, and its own are zero."""
-    heavy = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)
-    one = lambda k, m: end(heavy, 0.5, 0.0, {"k": k, "m": m})
-    derivatives = jax.jit(jax.grad(lambda k, m, w: jnp.sum(w * jax.vmap(one, (None, 0))(k, m)), (0, 1)))
-    by_k, by_m = derivatives(2.0, jnp.array([1.0, 0.0, 2.0]), jnp.ones(3))
-    k, m = derivatives(2.0, jnp.array([1.0, 1.5, 2.0]), jnp.array([1.0, 0.0, 1.0]))
-    np.testing.assert_allclose(by_k, k, rtol=1e-12)
-    np.testing.assert_allclose(by_m, m, rtol=1e-12)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", exhaustive_but(((8, 3), (72, 1)), ((8, 3), (72, 1), (72, 3), (8, 1))))
-def test_networks_as_matrices(kind):
-    """Stages in a loop and as copies; two coordinates of different masses; by the weights, the masses and the start."""
-    hidden, lanes = kind
-    random = np.random.default_rng(0)
-    w = [random.normal(size=(2, hidden)), random.normal(size=(hidden, hidden)) / hidden, random.normal(size=hidden)]
-
-    def lagrangian(t, q, v, p):
-        w, m = p
-        return 0.5 * jnp.sum(m * v**2) - 0.5 * jnp.sum(q**2) - jnp.tanh(jnp.tanh(q @ w[0]) @ w[1]) @ w[2]
-
-    system, q0 = lj.System(lagrangian), random.normal(size=(3, 2))
-    directions = jax.tree.map(lambda x: random.normal(size=np.shape(x)), (w, np.ones(2), q0))
-
-    def total(x):
-        *p, q = x
-        of = lambda q: end(system, q, jnp.zeros(2), p)
-        return jnp.sum(jax.vmap(of)(q)) if lanes == 3 else of(q[0])
-
-    at = (w, np.array([1.0, 3.0]), q0)
-    gradient = jax.jit(jax.grad(total))(at)
-    _, along = jax.jit(lambda x, d: jax.jvp(total, (x,), (d,)))(jax.tree.map(jnp.asarray, at), directions)
-    back = sum(jnp.sum(g * d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(directions)))
-    np.testing.assert_allclose(back, along, rtol=1e-10)
 
 
 @pytest.mark.exhaustive
@@ -199,45 +127,3 @@ def test_two_switches():
     at = np.array([0.0, 0.25, 0.75, 1.0])
     function = lambda p: jnp.sum(lj.integrate(bouncing, p["h"], 0.0, p, ts=at, rtol=1e-10).q ** 2)
     modes_agree(function, {"g": 9.81, "e": 0.5, "h": 1.0})
-
-
-def long_swing():
-    """The derivative of a pendulum's last angle, after a time of 2000, by its thirty parameters."""
-    system = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
-    end = lambda p, adjoint: lj.integrate(system, 1.0, 0.0, p, ts=np.array([0.0, 2e3]), adjoint=adjoint).q[-1]
-    return lambda adjoint: jax.jit(jax.grad(lambda p: end(p, adjoint)))
-
-
-@pytest.mark.exhaustive
-def test_a_budget_of_memory(monkeypatch):
-    """A record has the requested size, and pieces that are run again meet whatever the round-off."""
-    at, swing = jnp.full(30, 1 / 30), long_swing()
-    whole, pieces = (swing(lj.Replay(memory=memory)) for memory in (1e6, 1e5))
-    assert 0.8e6 < whole.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e6
-    assert 0.8e5 < pieces.lower(at).compile().memory_analysis().temp_size_in_bytes < 1.2e5
-    np.testing.assert_allclose(pieces(at), whole(at), rtol=1e-6)
-    until = step_record._until
-    # The repeated steps are longer, from the first one on.
-    longer = lambda p, run, *rest: until(
-        p, run._replace(place=run.place._replace(t1=run.place.t + 1.01 * (run.place.t1 - run.place.t))), *rest
-    )
-    again = step_record.recorded_again
-
-    def otherwise(*args):
-        with monkeypatch.context() as patch:
-            patch.setattr(step_record, "_until", longer)
-            return again(*args)
-
-    monkeypatch.setattr(backward_sweep, "recorded_again", otherwise)
-    np.testing.assert_allclose(long_swing()(lj.Replay(memory=1e5))(at), whole(at), rtol=1e-5)
-
-
-def test_a_budget_that_is_none():
-    """A budget that is too small, not positive or not usable is refused with a remedy."""
-    with pytest.raises(ValueError, match=r"(?s)has no room.*Fix: lj.Replay\(memory=5e3\)"):
-        long_swing()(lj.Replay(memory=100.0))(jnp.ones(30))
-    with pytest.raises(ValueError, match="positive number of bytes"):
-        lj.Replay(memory=-1.0)
-    constant = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
-    with pytest.raises(ValueError, match="none is kept with a stepsize_controller"):
-        lj.integrate(pendulum(), 1.0, 0.0, PARAMS, ts=TS, adjoint=lj.Replay(memory=1e6), **constant)

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.events import brackets as pieces
-from lagjax.integrate.events import brackets as sampling
 from tests.systems import PARAMS, pendulum, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -55,63 +53,7 @@ def test_a_ball_bounces_fifty_times():
     np.testing.assert_allclose(t, 2 * 3.0 / G * (1 - restitution**50) / (1 - restitution), rtol=1e-12)
 
 
-def test_the_first_of_two_crossings_in_a_step_ends_the_motion():
-    """q = sin t passes 0.9 at arcsin 0.9 and comes back within a step; outputs are NaN from there on."""
-    level = diffrax.Event(lambda t, y, p, **kwargs: y[0] - 0.9)
-    ts = jnp.linspace(0.0, 20.0, 401)
-    traj = lj.integrate(oscillator, 0.0, 1.0, ts=ts, event=level)
-    assert float(traj.end.t) == pytest.approx(np.arcsin(0.9), abs=1e-9)
-    assert np.array_equal(np.isfinite(traj.q), ts <= np.arcsin(0.9))
-    assert traj.events["event"].found().t.shape == (1,)
-
-
 # The positions of crossings.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-4, 1e-9, 1e-12])
-def test_levels_just_below_the_extremum(rtol):
-    """Two crossings in one step, 0.3 to 1e-8 below the top, are found as precisely as the motion's error allows."""
-    for below in 10.0 ** -np.arange(0.5, 8.5, 0.5):
-        first = np.arcsin(1 - below)
-        with warnings.catch_warnings():
-            # Closer than the tolerance it is unknown whether the level is above or below the top.
-            warnings.simplefilter("default" if below > 100 * rtol else "ignore", lj.EventWarning)
-            traj = swing(0.0, 1.0, 1 - below, [0.0, 3.0, 6.0], rtol=rtol)
-        if below > 100 * rtol:
-            np.testing.assert_allclose(times(traj), [first, np.pi - first], atol=20 * rtol / np.cos(first))
-        elif len(times(traj)) != 2:
-            assert bool(traj.events["level"].uncertain)
-    assert len(times(swing(0.0, 1.0, 1.001 + 100 * rtol, [0.0, 3.0, 6.0], rtol=rtol))) == 0
-
-
-def test_a_start_on_the_guard_does_not_fire():
-    """A start within round-off of the guard, or at a top, is no crossing; coming back through the guard is one."""
-    for hair in (0.0, 1e-16, -1e-16, 1e-15, -1e-15):
-        traj = swing(0.5 * (1 + hair), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5])
-        np.testing.assert_allclose(times(traj), [2 * np.pi / 3, 2 * np.pi], atol=1e-8)
-        np.testing.assert_allclose(times(traj, "up"), [2 * np.pi], atol=1e-8)
-        assert len(times(swing(1.0 + hair, 0.0, 1.0, [0.0, 3.0, 6.0]))) == 0
-    with doubt:
-        swing(1.0, 0.0, 1.0, [0.0, 3.0, 7.0])
-    # Twin: a start that is off by more lies before the guard and crosses it.
-    assert len(times(swing(0.5 * (1 - 1e-9), np.sqrt(0.75), 0.5, [0.0, 3.0, 6.5]))) == 3
-
-
-@pytest.mark.slow
-def test_a_guard_that_is_left_without_speed(monkeypatch):
-    """A guard that leaves zero as t³ costs no extra steps. Twin: without the rule for it, bisection does."""
-
-    def steps(guard):
-        events = {"cubic": lj.Crossing(guard, direction=-1, terminal=False)}
-        traj = lj.integrate(oscillator, 0.0, 1.0, ts=[0.0, 2.0], events=events, estimate_error=False)
-        assert int(traj.events["cubic"].count) == 0 and not bool(traj.events["cubic"].uncertain)
-        return int(traj.stats["num_steps"])
-
-    assert steps(lambda t, q, v, p: q**3) < 20
-    monkeypatch.setattr(pieces, "FLAT", -1.0)
-    # Another guard, since an equal one would reuse the first program.
-    assert steps(lambda t, q, v, p: 2.0 * q**3) > 40
 
 
 def test_a_section_by_going_on_where_it_ended():
@@ -202,25 +144,6 @@ def test_refused_crossings():
 # Slow tests: each compiles a program.
 
 
-def at_ends_of_steps(*between, pieces=sampling.pieces_of):
-    """Return the pieces of a twin that looks only at the ends of steps."""
-    found, no = pieces(*between), jnp.asarray(False)
-    ends = [0.0 * x for x in found.sign[:-1]] + found.sign[-1:]
-    return found._replace(sign=ends, doubt=[no] * len(found.doubt))
-
-
-@pytest.mark.slow
-def test_twin_ends_of_steps(monkeypatch):
-    """Looking only at the ends of steps misses two crossings in one step."""
-    run = lambda guard: lj.integrate(
-        oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"level": lj.Crossing(guard, terminal=False)}
-    )
-    assert len(times(run(lambda t, q, v, p: q - 0.99))) == 2
-    monkeypatch.setattr(sampling, "pieces_of", at_ends_of_steps)
-    # Another guard, since an equal one would reuse the first program.
-    assert len(times(run(lambda t, q, v, p: q - 0.991))) == 0
-
-
 @pytest.mark.exhaustive
 def test_lanes():
     """Lanes with two crossings, with none, started on the guard, refused, and ended give the same as single runs."""
@@ -255,89 +178,6 @@ def test_pendulum_by_its_elliptic_integral():
     np.testing.assert_allclose(times(many, "bottom"), half * (2 * np.arange(4) + 0.5), rtol=1e-8)
 
 
-@pytest.mark.exhaustive
-def test_multipliers_in_a_guard():
-    """A mass on a string goes slack where its tension vanishes, at the height that the energy gives."""
-    tension = lj.Crossing(lambda t, q, v, multipliers, p: multipliers["rod"])
-    loaded = lj.Crossing(lambda t, q, v, multipliers, p: multipliers["rod"] + p["load"], terminal=False)
-    l, g = PARAMS["l"], PARAMS["g"]
-
-    def slack(v0, load=1e9):
-        return lj.integrate(
-            rod_pendulum, {"x": 0.0 * v0, "y": -l + 0.0 * v0}, {"x": v0, "y": 0.0 * v0}, PARAMS | {"load": load},
-            ts=jnp.array([0.0, 5.0]), events={"slack": tension, "loaded": loaded}, rtol=1e-11, atol=1e-11,
-        )  # fmt: skip
-
-    # Slack at the height y where v² = g y, and v² = v0² - 2 g (y + l).
-    height = lambda v0: (v0**2 - 2 * g * l) / (3 * g)
-    v0 = np.sqrt(3.5 * g * l)
-    end = slack(v0).end
-    np.testing.assert_allclose(end.q["y"], height(v0), rtol=1e-9)
-    assert abs(float(end.multipliers["rod"])) < 1e-12
-    slope = jax.jacfwd(lambda v0: slack(v0).end.q["y"])(v0)
-    np.testing.assert_allclose(slope, 2 * v0 / (3 * g), rtol=1e-7)
-    load = float(-slack(v0).multipliers["rod"][0]) / 2
-    found = slack(v0, load).events["loaded"]
-    np.testing.assert_allclose(found.multipliers["rod"][0], -load, rtol=1e-12)
-    assert int(found.count) == 1
-
-
-@pytest.mark.exhaustive
-def test_derivatives():
-    """Times and states at recorded and terminal crossings, forward and reverse, with respect to all their inputs."""
-
-    def crossed(x, which=slice(2)):
-        level = lambda t, q, v, p: q - x["level"]
-        events = {
-            "level": lj.Crossing(level, terminal=False, most=3),
-            "end": lj.Crossing(lambda t, q, v, p: v + p["stop"], direction=-1),
-        }
-        system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["w"] ** 2 * q**2)
-        params = {"w": x["w"], "stop": x["stop"]}
-        traj = lj.integrate(
-            system, x["q0"], x["v0"], params, ts=jnp.array([0.0, 4.0]), events=events, rtol=1e-11, atol=1e-11
-        )
-        found = traj.events["level"]
-        return jnp.concatenate([found.t[which], found.v[which], jnp.stack([traj.end.t, traj.end.q])])
-
-    x = {"level": 0.6, "w": 1.3, "q0": 0.1, "v0": 1.2, "stop": 1.1}
-
-    def exact(x):
-        # q = A sin(w t + phase)
-        amplitude = jnp.sqrt(x["q0"] ** 2 + (x["v0"] / x["w"]) ** 2)
-        phase = jnp.arctan2(x["q0"], x["v0"] / x["w"])
-        up = jnp.arcsin(x["level"] / amplitude)
-        last = jnp.arccos(-x["stop"] / amplitude / x["w"])
-        angles = jnp.stack([up, jnp.pi - up])
-        state = jnp.stack([(last - phase) / x["w"], amplitude * jnp.sin(last)])
-        return jnp.concatenate([(angles - phase) / x["w"], amplitude * x["w"] * jnp.cos(angles), state])
-
-    np.testing.assert_allclose(crossed(x), exact(x), rtol=1e-9)
-    close = lambda a, b: jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-8), a, b)
-    close(jax.jacfwd(crossed)(x), jax.jacfwd(exact)(x))
-    weights = jnp.array([1.0, -0.5, 0.25, 2.0, 0.75, -1.5])
-    total = lambda function: jax.grad(lambda x: jnp.dot(weights, function(x)))
-    close(total(crossed)(x), total(exact)(x))
-
-
-@pytest.mark.exhaustive
-def test_derivative_by_many_numbers():
-    """Reverse mode through a recorded crossing, with a guard and L that read forty numbers."""
-    weights = jnp.linspace(0.5, 1.5, 40) / 40
-    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * jnp.sum(p) * q**2)
-    events = {"level": lj.Crossing(lambda t, q, v, p: q - 0.5 * jnp.sum(p), terminal=False)}
-
-    def second(p, dt0=None):
-        return lj.integrate(system, 0.0, 1.0, p, ts=[0.0, 3.0], events=events, dt0=dt0).events["level"].t[1]
-
-    # At Σp = 1: t = (π - arcsin(w · w²/2)) / w with w² = Σp.
-    by_sum = lambda s: (jnp.pi - jnp.arcsin(0.5 * s**1.5)) / jnp.sqrt(s)
-    np.testing.assert_allclose(second(weights), by_sum(jnp.sum(weights)), rtol=1e-8)
-    # The state there is computed by other steps than the time, and is on the level only to the tolerance.
-    for dt0 in (None, 0.05, 0.3):
-        np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
-
-
 @pytest.mark.optimised
 @pytest.mark.slow
 def test_what_jumps():
@@ -355,57 +195,6 @@ def test_what_jumps():
     top = np.arcsin(0.9)
     np.testing.assert_allclose(times(traj, "sign"), [top, np.pi - top], atol=1e-8)
     np.testing.assert_allclose(times(traj, "true"), [np.pi - top], atol=1e-8)
-
-
-SAID = {
-    "zero": lambda t, q, v, p: 0.0 * q,
-    "conserved": lambda t, q, v, p: 0.5 * v**2 + 0.5 * q**2 - 0.5,
-    "a touch": lambda t, q, v, p: q - 1.0,
-    "a square": lambda t, q, v, p: (q - 0.5) ** 2,
-    "not a number": lambda t, q, v, p: jnp.sqrt(q - 0.5),
-    "far above": lambda t, q, v, p: jnp.sin(3e3 * t),
-    "by the state": lambda t, q, v, p: jnp.sin(1e3 * q) + 0.5,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", exhaustive_but(("a touch", "by the state"), SAID))
-def test_found_or_said(name):
-    """Crossings that cannot be resolved are either found after all, or a warning is given."""
-    exact = {"far above": 3e3 * 6 // np.pi}.get(name)
-    with warnings.catch_warnings(record=True) as raised:
-        warnings.simplefilter("always")
-        traj = lj.integrate(
-            oscillator, 0.0, 1.0, ts=[0.0, 6.0], events={"guard": lj.Crossing(SAID[name], terminal=False)}
-        )
-    found = traj.events["guard"]
-    said = bool(found.uncertain)
-    assert said == any("may be missing" in str(warning.message) for warning in raised)
-    if name == "by the state":
-        t = np.linspace(0.0, 6.0, 10**6)
-        exact = np.count_nonzero(np.diff(np.sign(np.sin(1e3 * np.sin(t)) + 0.5)))
-    assert said or int(found.count) == exact, found
-
-
-OPTIONS = {
-    "fixed steps": {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.2},
-    "a controller": {"stepsize_controller": diffrax.PIDController(rtol=1e-8, atol=1e-8, pcoeff=0.2, icoeff=0.4)},
-    "Tsit5": {"method": lj.Tsit5()},
-    "Radau5": {"method": lj.Radau5()},
-    "diffrax": {"method": diffrax.Dopri5()},
-    "implicit": {"method": diffrax.Kvaerno5()},
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", exhaustive_but(("Radau5",), OPTIONS))
-def test_methods_and_controllers(name):
-    """Any method or controller finds two crossings near the top, and then the one that ends the motion."""
-    traj = swing(0.0, 1.0, 0.9999, [0.0, 1.2, 12.0], np.cos(2.5), rtol=1e-8, **OPTIONS[name])
-    top = np.arcsin(0.9999)
-    np.testing.assert_allclose(times(traj), [top, np.pi - top], atol=2e-5)
-    np.testing.assert_allclose(traj.end.t, 2.5, atol=1e-6)
-    assert np.isfinite(traj.q).tolist() == [True, True, False]
 
 
 @pytest.mark.slow
@@ -431,22 +220,6 @@ def test_float32():
     assert found.t.dtype == found.q.dtype == jnp.float32
     np.testing.assert_allclose(times(traj), [top, np.pi - top], atol=1e-3)
     np.testing.assert_allclose(traj.end.t, np.arccos(-0.9), atol=1e-3)
-
-
-floor = {"floor": lj.Crossing(lambda t, q, v, p: q - p)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("level", [0.0, 1e-15, 1e-14, 1e-12, -1e-11])
-def test_at_the_last_time(level):
-    """A crossing at `ts[-1]` is found once, there or when continuing from there: q = 5 (1 - t²) is zero at 1."""
-    first = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 1.0], events=floor)
-    found, end = int(first.events["floor"].count), first.end
-    if not found:
-        found = int(lj.integrate(ball, end.q, end.v, level, ts=[1.0, 2.0], events=floor).events["floor"].count)
-    assert found == 1
-    through = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 2.0], events=floor)
-    assert float(through.end.t) == pytest.approx(np.sqrt(1.0 - level / 5.0), abs=1e-14)
 
 
 @pytest.mark.exhaustive

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.solve import over_jumps
 
 kinetic = lambda t, q, v, params: 0.5 * v**2
 # A brake of 3 from q = edge on: with the start at q = 0 and s = t - edge/v0, q = edge + v0 s - 3/2 s².
@@ -96,53 +95,6 @@ def test_a_rocket_switched_off():
 MASS, SPRING, GRAVITY = 1.0, 100.0, 9.81
 
 
-def rest_of_block(mu, amplitude=0.5):
-    """Where a block on a spring with dry friction comes to rest, after how many half swings."""
-    lost = mu * MASS * GRAVITY / SPRING
-    n = np.ceil((amplitude / lost - 1) / 2)
-    return (-1) ** n * (amplitude - 2 * n * lost), n
-
-
-def block(force=None, dissipation=None):
-    """A block on a spring."""
-    return lj.System(lambda t, q, v, p: 0.5 * MASS * v**2 - 0.5 * SPRING * q**2, force=force, dissipation=dissipation)
-
-
-@pytest.mark.slow
-def test_dry_friction():
-    """`sign(v)`: the block rests where it must, from when it must, with the derivative by the coefficient of friction.
-
-    Twins: without sliding the motion is not followed to its rest; the usual tanh creeps 9 % off.
-    """
-    rubbed = block(lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.sign(v))
-    right, n = rest_of_block(0.3)
-    stop = n * np.pi / np.sqrt(SPRING / MASS)
-    end = lambda mu: lj.integrate(rubbed, 0.5, 0.0, mu, ts=jnp.array([0.0, stop - 1e-3, stop, 4.0]))
-    traj = end(0.3)
-    np.testing.assert_allclose(traj.q[2:], right, rtol=1e-7)
-    assert abs(traj.v[1]) > 1e-3 and np.max(np.abs(traj.v[2:])) < 1e-9 and not traj.stats["lost_jumps"]
-    slope = -((-1) ** n) * 2 * n * MASS * GRAVITY / SPRING
-    np.testing.assert_allclose(jax.grad(lambda mu: end(mu).q[-1])(0.3), slope, rtol=1e-8)
-    creeping = block(lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.tanh(v / 1e-3))
-    crept = lj.integrate(creeping, 0.5, 0.0, 0.3, ts=[0.0, 4.0], method=lj.Radau5()).q[-1]
-    assert abs(crept - right) > 0.05 * abs(right)
-
-
-@pytest.mark.slow
-def test_friction_in_other_words(monkeypatch):
-    """Nested `where`, and |v| in Rayleigh's function; twin: a motion that may not slide is not followed to its rest."""
-    size = 0.3 * MASS * GRAVITY
-    nested = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
-    rayleigh = block(dissipation=lambda t, q, v, p: size * jnp.abs(v))
-    for system in (nested, rayleigh):
-        traj = lj.integrate(system, 0.5, 0.0, ts=[0.0, 4.0])
-        np.testing.assert_allclose(traj.q[-1], rest_of_block(0.3)[0], rtol=1e-7)
-    monkeypatch.setattr(over_jumps, "slidable", lambda jumps, system: ())
-    other = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
-    lost = lj.integrate(other, 0.5, 0.0, ts=[0.0, 4.0], throw=False, max_steps=10_000)
-    assert not lost.q[-1] == traj.q[-1]
-
-
 @pytest.mark.slow
 def test_stick_and_slip():
     """A block pulled by a spring on a floor with friction: it sticks, and slips u (s - sin(ω s)/ω) at a time.
@@ -170,34 +122,6 @@ def test_stick_and_slip():
     np.testing.assert_allclose(traj.q, [right(t, 0.5, 1.0) for t in ts], rtol=1e-8, atol=1e-9)
     assert traj.stats["num_jumps"] >= 6
     assert abs(traj.q[-1] - right(12.0, 1.0, 1.0)) > 1
-
-
-@pytest.mark.slow
-def test_a_relay_that_slides():
-    """u = -4 sign(q + v/2): after the first jump the motion stays on q + v/2 = 0, where q decays by e in 1/2.
-
-    Twin: with a force of 1 it cannot stay at first.
-    """
-    relay = lj.System(kinetic, force=lambda t, q, v, p: -p * jnp.sign(q + 0.5 * v))
-    ts = np.array([0.0, 1.0, 2.0, 4.0])
-    begin = (-2 + np.sqrt(12)) / 4
-    right = (1 - 2 * begin**2) * np.exp(-2 * (ts[1:] - begin))
-    np.testing.assert_allclose(lj.integrate(relay, 1.0, 0.0, 4.0, ts=ts).q[1:], right, rtol=1e-8)
-    assert abs(lj.integrate(relay, 1.0, 0.0, 1.0, ts=ts).q[1] - right[0]) > 0.01
-
-
-@pytest.mark.slow
-def test_two_blocks_at_once():
-    """Two blocks that slide and rest together, from one array of signs, in lanes of different friction."""
-    blocks = lj.System(
-        lambda t, q, v, p: 0.5 * MASS * jnp.sum(v**2) - 0.5 * SPRING * jnp.sum(q**2),
-        force=lambda t, q, v, mu: -mu * MASS * GRAVITY * jnp.sign(v),
-    )
-    end = lambda mu: lj.integrate(blocks, jnp.array([0.5, 0.45]), jnp.zeros(2), mu, ts=jnp.array([0.0, 4.0])).q[-1]
-    coefficients = np.array([0.3, 0.35])
-    found = jax.jit(jax.vmap(end))(jnp.asarray(coefficients))
-    right = [[rest_of_block(mu, x)[0] for x in (0.5, 0.45)] for mu in coefficients]
-    np.testing.assert_allclose(found, right, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -278,19 +202,3 @@ def test_what_cannot_be_followed_is_said():
     assert traj.stats["num_jumps"] == 1000 and np.isfinite(traj.q[-1])
     with pytest.raises(ValueError, match="jumps must be 'found' or 'ignored'"):
         lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 1.0], jumps=[0.5])
-
-
-@pytest.mark.slow
-def test_a_push_sets_a_block_free():
-    """A block rests until a push in time is stronger than friction; derivatives by the push's ends and strength.
-
-    With d the duration it slides (F - 1) d²/2 during the push and ((F - 1) d)²/2 afterwards. Twin: a weak push.
-    """
-    pushed = lj.System(kinetic, force=lambda t, q, v, p: -jnp.sign(v) + jnp.where((t > p[0]) & (t < p[1]), p[2], 0.0))
-    end = lambda *p: lj.integrate(pushed, 0.0, 0.0, p, ts=jnp.array([0.0, 1.2, 3.0])).q[-1]
-    right = lambda a, b, strength: (strength - 1) / 2 * (b - a) ** 2 + ((strength - 1) * (b - a)) ** 2 / 2
-    at = (1.0, 1.5, 2.0)
-    np.testing.assert_allclose(end(*at), right(*at), rtol=1e-12)
-    found = jax.jacfwd(end, argnums=(0, 1, 2))(*at)
-    np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1, 2))(*at), rtol=1e-9)
-    assert abs(end(1.0, 1.5, 0.5)) < 1e-12

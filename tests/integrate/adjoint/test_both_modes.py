@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.adjoint import both_modes
 from lagjax.mechanisms import MECHANISMS
 from lagjax.scenes import SCENES
 from tests.tiers import exhaustive_but
@@ -21,10 +20,7 @@ SHOWN = (
 OUTPUTS = 7
 
 
-@pytest.fixture(autouse=True)
-def in_reverse(monkeypatch):
-    """Replay also with few parameters."""
-    monkeypatch.setattr(both_modes, "PUSH_UP_TO", 0)
+pytestmark = pytest.mark.usefixtures("in_reverse")
 
 
 def modes_agree(system, q0, v0, params, ts, lanes=0, **options):

@@ -1,0 +1,67 @@
+"""The loop back over the steps: no cotangent is dropped, lanes that failed add nothing, networks as matrices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.adjoint import replay
+from tests.integrate.adjoint.test_replay import PARAMS, end, modes_agree, pendulum
+from tests.tiers import exhaustive_but
+
+pytestmark = pytest.mark.usefixtures("in_reverse")
+
+
+@pytest.mark.slow
+def test_a_cotangent_that_is_dropped_is_seen(monkeypatch):
+    """Twin: without the cotangent of one output the modes disagree."""
+    swept = replay.swept_back
+
+    def dropped(leaves, found, asked, **params):
+        outputs = jax.tree.map(lambda ct: ct.at[4].set(0.0), asked[0])
+        return swept(leaves, found, (outputs, *asked[1:]), **params)
+
+    monkeypatch.setattr(replay, "swept_back", dropped)
+    system = pendulum()
+    with pytest.raises(AssertionError):
+        modes_agree(lambda p: end(system, 0.75, 0.25, p), PARAMS)
+
+
+@pytest.mark.exhaustive
+def test_lanes_that_fail_have_no_part():
+    """A lane without mass does not start: it adds nothing to derivatives by shared parameters, and its own are zero."""
+    heavy = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2)
+    one = lambda k, m: end(heavy, 0.5, 0.0, {"k": k, "m": m})
+    derivatives = jax.jit(jax.grad(lambda k, m, w: jnp.sum(w * jax.vmap(one, (None, 0))(k, m)), (0, 1)))
+    by_k, by_m = derivatives(2.0, jnp.array([1.0, 0.0, 2.0]), jnp.ones(3))
+    k, m = derivatives(2.0, jnp.array([1.0, 1.5, 2.0]), jnp.array([1.0, 0.0, 1.0]))
+    np.testing.assert_allclose(by_k, k, rtol=1e-12)
+    np.testing.assert_allclose(by_m, m, rtol=1e-12)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kind", exhaustive_but(((8, 3), (72, 1)), ((8, 3), (72, 1), (72, 3), (8, 1))))
+def test_networks_as_matrices(kind):
+    """Stages in a loop and as copies; two coordinates of different masses; by the weights, the masses and the start."""
+    hidden, lanes = kind
+    random = np.random.default_rng(0)
+    w = [random.normal(size=(2, hidden)), random.normal(size=(hidden, hidden)) / hidden, random.normal(size=hidden)]
+
+    def lagrangian(t, q, v, p):
+        w, m = p
+        return 0.5 * jnp.sum(m * v**2) - 0.5 * jnp.sum(q**2) - jnp.tanh(jnp.tanh(q @ w[0]) @ w[1]) @ w[2]
+
+    system, q0 = lj.System(lagrangian), random.normal(size=(3, 2))
+    directions = jax.tree.map(lambda x: random.normal(size=np.shape(x)), (w, np.ones(2), q0))
+
+    def total(x):
+        *p, q = x
+        of = lambda q: end(system, q, jnp.zeros(2), p)
+        return jnp.sum(jax.vmap(of)(q)) if lanes == 3 else of(q[0])
+
+    at = (w, np.array([1.0, 3.0]), q0)
+    gradient = jax.jit(jax.grad(total))(at)
+    _, along = jax.jit(lambda x, d: jax.jvp(total, (x,), (d,)))(jax.tree.map(jnp.asarray, at), directions)
+    back = sum(jnp.sum(g * d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(directions)))
+    np.testing.assert_allclose(back, along, rtol=1e-10)
