@@ -1,13 +1,12 @@
 """Branches of cycles: against elliptic integrals, Mathieu's boundaries, SciPy's shooting and averaging."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, optimize, special
 
 import lagjax as lj
-from tests.systems import PARAMS, pendulum, rod_pendulum
+from tests.systems import PARAMS, pendulum
 
 UNIT = {"g": 1.0, "l": 1.0}
 
@@ -60,33 +59,6 @@ def test_pendulum_by_its_amplitude():
     by_period = lj.continue_orbits(orbit, along="period", to=9.0)
     np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
     np.testing.assert_allclose(by_period.period, swinging(by_period.q), rtol=1e-11)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
-def test_pendulum_on_a_rod(along, to):
-    """With a constraint: along the energy, and along the rod's length at constant energy; the rod keeps its length."""
-    start = {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"x": 0.0, "y": 0.0}
-    orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
-    branch = lj.continue_orbits(orbit, along=along, to=to)
-    energy, length = (branch.parameter, 1.0) if along == "energy" else (-np.cos(1.0), branch.parameter)
-    np.testing.assert_allclose(branch.period, swinging(np.arccos(-energy / length), length), rtol=1e-10)
-    np.testing.assert_allclose(np.hypot(branch.q["x"], branch.q["y"]), length, rtol=1e-12)
-    assert branch.status == "the end of the range" and branch.stable.all()
-
-
-@pytest.mark.exhaustive
-def test_relative_orbits():
-    """In a central force, along the exponent of its law: the harmonic oscillator, at r², has the period π in r."""
-
-    def lagrangian(t, q, v, p):
-        return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) - q["r"] ** p["power"] / p["power"]
-
-    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.5}
-    orbit = lj.periodic_orbit(lj.System(lagrangian), start, 1.8, {"power": 1.0}, relative="phi")
-    branch = lj.continue_orbits(orbit, along="power", to=2.0)
-    np.testing.assert_allclose(branch.period[-1], np.pi, rtol=1e-11)
-    assert abs(branch.period[0] - np.pi) > 0.03
 
 
 # Driven systems.
@@ -175,33 +147,6 @@ def test_tongues_of_a_parametric_pendulum():
     np.testing.assert_array_equal(branch.stable[off], ~inside[off])
 
 
-@pytest.mark.slow
-def test_combination_resonance():
-    """Two oscillators coupled by a drive near the sum of their frequencies: two pairs meet, by SciPy's multipliers."""
-
-    def lagrangian(t, q, v, p):
-        springs = 0.5 * (q[0] ** 2 + p["k"] * q[1] ** 2)
-        return 0.5 * v @ v - springs - p["e"] * jnp.cos(p["omega"] * t) * q[0] * q[1]
-
-    params = {"k": 2.0, "e": 0.25, "omega": 2.1}
-    orbit = lj.periodic_orbit(lj.System(lagrangian), (np.zeros(2), np.zeros(2)), 2 * np.pi / 2.1, params)
-    branch = lj.continue_orbits(orbit, along="omega", to=2.7)
-    assert [c.kind for c in branch.critical] == ["torus", "torus"]
-
-    def growth(omega):
-        coupling = lambda t: params["e"] * np.cos(omega * t)
-        rate = lambda t, y: [y[2], y[3], -y[0] - coupling(t) * y[1], -params["k"] * y[1] - coupling(t) * y[0]]
-        columns = [integrate.solve_ivp(rate, [0, 2 * np.pi / omega], e, rtol=1e-12, atol=1e-13).y[:, -1]
-                   for e in np.eye(4)]  # fmt: skip
-        return np.abs(np.linalg.eigvals(np.stack(columns, axis=1))).max() - 1
-
-    first, second = (float(c.parameter) for c in branch.critical)
-    assert first < 1 + np.sqrt(2.0) < second
-    for edge, out in ((first, -1), (second, 1)):
-        assert growth(edge + out * 1e-6) < 1e-5 < growth(edge - out * 1e-6) < 1e-2
-    assert "a pair at ±" in repr(branch)
-
-
 # Cycles of autonomous systems.
 
 
@@ -268,32 +213,6 @@ def test_torus_of_a_driven_van_der_pol():
 
 
 # Plots and messages.
-
-
-@pytest.mark.slow
-def test_what_is_drawn_and_refused():
-    """Stable parts are solid, unstable dashed, folds are marked; unknown names and an empty range are refused."""
-    orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
-    branch = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=400)
-    (axis,) = branch.plot().axes
-    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
-    assert dashes == {"-", "--"} and axis.get_ylabel() == "largest q" and axis.get_xlabel() == "omega"
-    assert {"stable", "unstable", "fold"} <= set(axis.get_legend_handles_labels()[1])
-    assert branch.plot("period").axes[0].get_ylabel() == "period" and "fold" in repr(branch)
-    short = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=5)
-    assert short.status == "the limit of 5 points" and len(short) == 5
-    with pytest.raises(ValueError, match="names no coordinate; there are q, and 'period'"):
-        branch.plot("theta")
-    with pytest.raises(ValueError, match="along='speed' is no number in params; there are 'b', 'c', 'f' and 'omega'"):
-        lj.continue_orbits(orbit, along="speed", to=1.0)
-    with pytest.raises(ValueError, match="along='period': the system depends on time"):
-        lj.continue_orbits(orbit, along="period", to=1.0)
-    with pytest.raises(ValueError, match="leaves the parameter 'omega' no range: it starts at 0.5"):
-        lj.continue_orbits(orbit, along="omega", to=0.5)
-    with pytest.raises(TypeError, match="JAX is tracing"):
-        jax.jit(lambda orbit: lj.continue_orbits(orbit, along="omega", to=1.0).period)(orbit)
-    with pytest.raises(IndexError, match="branch\\[0\\] to branch"):
-        branch[len(branch)]
 
 
 def test_no_orbit_to_begin_with():

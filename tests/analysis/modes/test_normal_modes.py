@@ -2,14 +2,12 @@
 
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 import pytest
 
 import lagjax as lj
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
-from tests.systems import DOUBLE_PARAMS, double_pendulum, double_rods, rod_pendulum
 
 BEAD = {"a": 1.25, "g": 9.8125, "omega": 2.0}
 STILL = {"x": 0.0, "y": 0.0}
@@ -69,32 +67,6 @@ def test_verdicts_of_the_bead():
 # Constraints.
 
 
-def test_the_force_of_a_constraint_is_in_the_stiffness():
-    """A rod pendulum in Cartesian coordinates gets g/l from λ·∂²g alone; L itself has no stiffness."""
-    params = {"g": 9.8125, "l": 1.25}
-    modes = lj.normal_modes(rod_pendulum, 0.0, {"x": 0.0, "y": -1.25}, {"x": 0.0, "y": 0.0}, params)
-    found = modes.linearisation
-    np.testing.assert_allclose(modes.frequency, [np.sqrt(params["g"] / params["l"])], **EQUAL)
-    np.testing.assert_allclose(found.stiffness[0, 0], -2 * found.multipliers["rod"], rtol=1e-13)
-    assert len(modes) == 1 and np.abs(modes.shapes["y"][0]) < 1e-12
-
-
-@pytest.mark.exhaustive
-def test_the_double_pendulum_by_angles_and_by_rods():
-    """The roots of det(K - ω² M), in angles, with two constraints, and with one constraint given twice."""
-    m1, m2, l1, l2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "l1", "l2", "g"))
-    M = np.array([[(m1 + m2) * l1**2, m2 * l1 * l2], [m2 * l1 * l2, m2 * l2**2]])
-    K = np.diag([(m1 + m2) * g * l1, m2 * g * l2])
-    exact = np.sqrt(np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real))
-    by_angles = lj.normal_modes(double_pendulum, 0.0, np.zeros(2), np.zeros(2), DOUBLE_PARAMS)
-    hanging = {"first": np.array([0.0, -l1]), "second": np.array([0.0, -l1 - l2])}
-    at = 0.0, hanging, jax.tree.map(np.zeros_like, hanging), DOUBLE_PARAMS
-    twice = lj.System(double_rods.lagrangian, {**double_rods.constraints, "again": double_rods.constraints["inner"]})
-    for modes in (by_angles, lj.normal_modes(double_rods, *at), lj.normal_modes(twice, *at)):
-        np.testing.assert_allclose(modes.frequency, exact, **EQUAL)
-        assert modes.verdict == "stable"
-
-
 # Many degrees of freedom.
 
 
@@ -122,34 +94,6 @@ def test_a_free_chain_and_a_hard_one():
     n = 100
     modes = lj.normal_modes(small.chain, 0.0, np.zeros(n), np.zeros(n), {"m": 1.0, "k": 1.0})
     np.testing.assert_allclose(modes.frequency, 2 * np.sin(np.arange(1, n + 1) * np.pi / (2 * (n + 1))), rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_symmetries_are_told_from_critical_points():
-    """A molecule free to move and turn in the plane is stable; so is q⁴, and twin: -q⁴ is not."""
-
-    def spring(t, q, v, params):
-        return 0.5 * jnp.sum(v**2) - 0.5 * params["k"] * (jnp.sqrt(jnp.sum((q[0] - q[1]) ** 2)) - 1.0) ** 2
-
-    ends = np.array([[0.0, 0.0], [1.0, 0.0]])
-    modes = lj.normal_modes(lj.System(spring), 0.0, ends, 0.0 * ends, {"k": 3.0})
-    assert modes.verdict == "stable" and list(modes.zero) == [True, True, True, False]
-    np.testing.assert_allclose(modes.frequency[3], np.sqrt(6.0), rtol=1e-12)
-    quartic = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["c"] * q["x"] ** 4 - q["y"] ** 2)
-    modes = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": 1.0})
-    assert modes.verdict == "stable" and list(modes.zero) == [True, False]
-    hill = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": -1.0})
-    assert hill.verdict == "divergence" and "first term that does not vanish" in repr(hill)
-
-
-def test_what_is_free_and_what_is_held():
-    """A free mass at any speed has one zero mode; a mass held by a constraint has no motion, which is an error."""
-    free = lj.System(lambda t, q, v, params: 0.5 * v**2)
-    modes = lj.normal_modes(free, 0.0, 1.0, 2.0, None)
-    assert modes.verdict == "stable" and "any q and any speed" in repr(modes)
-    held = lj.System(free.lagrangian, {"wall": lj.Holonomic(lambda t, q, params: q - 1.0)})
-    with pytest.raises(ValueError, match="leave no motion at all"):
-        lj.normal_modes(held, 0.0, 1.0, 0.0, None)
 
 
 # Gyroscopic forces.
@@ -185,18 +129,6 @@ def test_derivatives_of_the_rails():
 
 
 @pytest.mark.slow
-def test_damping_what_gyroscopic_forces_hold():
-    """A little damping makes the mode of negative energy grow, and the other one decay."""
-    damped = lj.System(
-        cross_rails.rotating_lagrangian, dissipation=lambda t, q, v, p: 0.05 * (v["R"] ** 2 + v["r"] ** 2)
-    )
-    p = cross_rails.PARAMS | {"omega": 8.0}
-    at = {"R": cross_rails.equilibrium_length(p), "r": 0.0}
-    modes = lj.normal_modes(damped, 0.0, at, {"R": 0.0, "r": 0.0}, p)
-    assert modes.growth[0] > 1e-4 and modes.growth[1] < -1e-4 and modes.verdict == "flutter"
-
-
-@pytest.mark.slow
 def test_stability_of_a_hundred_thousand_rails():
     """Stable exactly if (1 - ω²m/K)(1 - ω²m/k) > 0; twin: with only one factor thousands differ."""
     random, count = np.random.default_rng(0), 100_000
@@ -209,22 +141,6 @@ def test_stability_of_a_hundred_thousand_rails():
     params = cross_rails.PARAMS | drawn
     assert np.sum(stable != cross_rails.is_stable(params)) == 0
     assert np.sum(stable != (params["m"] * params["omega"] ** 2 < params["K"])) > 10_000
-
-
-@pytest.mark.slow
-def test_small_roots_have_all_digits():
-    """Near critical speeds at large ω the small root agrees with mpmath's to 1e-10."""
-    m = 1.0
-    for omega, over_K, over_k in ((1e4, 1e-3, 0.5), (1e4, 1e-4, 1e-4), (1e6, 0.5, 1e-3), (1e3, -1e-3, -0.5)):
-        params = {"m": m, "K": m * omega**2 * (1 + over_K), "k": m * omega**2 * (1 + over_k), "R0": 0.0, "omega": omega}
-        with mpmath.workdps(50):
-            K, k, squared = (mpmath.mpf(float(x)) for x in (params["K"], params["k"], omega**2))
-            half = (K + k) / 2 + squared
-            fast = half + mpmath.sqrt(half**2 - (K - squared) * (k - squared))
-            exact = mpmath.sqrt((K - squared) * (k - squared) / fast)
-        got = np.min(rails(params).frequency)
-        # The exact root uses ω² and K as rounded to double precision.
-        assert abs(got / float(exact) - 1) < 1e-10, (omega, over_K, over_k)
 
 
 @pytest.mark.slow
@@ -241,18 +157,6 @@ def test_foucault_and_a_charge():
 
 
 # Steady motions.
-
-
-def test_the_conical_pendulum():
-    """It oscillates with Ω √(1 + 3 cos²θ) at any azimuth; twin: at another speed it is not steady."""
-    theta, params = 0.7, {"l": 1.25, "g": 9.8125}
-    turn = np.sqrt(params["g"] / (params["l"] * np.cos(theta)))
-    at = {"theta": theta, "phi": 0.3}
-    modes = lj.normal_modes(small.spherical, 0.0, at, {"theta": 0.0, "phi": turn}, params)
-    np.testing.assert_allclose(modes.frequency, [0.0, turn * np.sqrt(1 + 3 * np.cos(theta) ** 2)], **EQUAL)
-    assert modes.verdict == "stable" and modes.linearisation.shifts == ("phi",)
-    with pytest.raises(ValueError, match="no steady motion: 'theta' accelerates"):
-        lj.linearise(small.spherical, 0.0, at, {"theta": 0.0, "phi": 1.01 * turn}, params)
 
 
 def test_a_sleeping_top():
@@ -297,65 +201,10 @@ def test_a_rolling_disk():
 # Forces and dissipation.
 
 
-def test_damping_and_circulation():
-    """Damped and overdamped roots; stable up to 2n = |k₁ - k₂| and flutter above it, as Ziegler found."""
-    at = lambda **params: lj.normal_modes(small.circulating, 0.0, STILL, STILL, params)
-    modes = at(k1=1.0, k2=4.0, n=0.0, c=0.5)
-    np.testing.assert_allclose(modes.roots, [-0.25 + 1j * np.sqrt(k - 0.0625) for k in (1.0, 4.0)], rtol=1e-12)
-    assert modes.verdict == "asymptotically stable"
-    modes = at(k1=1.0, k2=4.0, n=0.0, c=5.0)
-    np.testing.assert_allclose(modes.roots, np.sort([*np.roots([1, 5, 1]), *np.roots([1, 5, 4])])[::-1], rtol=1e-10)
-    assert at(k1=1.0, k2=1.5, n=0.249, c=0.0).verdict == "stable"
-    modes = at(k1=1.0, k2=1.5, n=0.251, c=0.0)
-    assert modes.verdict == "flutter"
-    np.testing.assert_allclose(modes.linearisation.circulatory, [[0.0, -0.251], [0.251, 0.0]])
-    np.testing.assert_allclose(at(k1=1.0, k2=1.5, n=0.0, c=0.5).linearisation.damping, 0.5 * np.eye(2))
-
-
 # Double roots, and compiled programs.
 
 
-@pytest.mark.exhaustive
-def test_a_double_root_is_reported():
-    """An isotropic oscillator has finite derivatives, those of the mean, and is reported as double."""
-    at = lambda k1: lj.normal_modes(small.circulating, 0.0, STILL, STILL, {"k1": k1, "k2": 4.0, "n": 0.0, "c": 0.0})
-    modes = at(4.0)
-    assert list(modes.double) == [True, True] and "double" in repr(modes)
-    slope = jax.jacfwd(lambda k1: at(k1).frequency)(4.0)
-    assert np.isfinite(slope).all()
-    np.testing.assert_allclose(np.sort(np.abs(slope))[-2:], 0.125, rtol=1e-8)
-    np.testing.assert_allclose(np.max(jax.jacfwd(lambda k1: at(k1).frequency)(4.1)), 1 / (2 * np.sqrt(4.1)), rtol=1e-8)
-
-
-def test_programs_never_hold_nan():
-    """In a program, states off equilibrium and NaN inputs give codes and residuals, never NaN."""
-    codes = jax.jit(jax.vmap(lambda at, omega: lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega})))
-    modes = codes(np.array([0.0, 0.5, np.nan, 0.0]), np.array([1.0, 1.0, 1.0, np.nan]))
-    assert all(np.isfinite(x).all() for x in (modes.roots, modes.shapes, modes.code))
-    assert [lj.NormalModes.VERDICTS[code] for code in modes.code] == ["stable", *["no steady motion"] * 3]
-    assert modes.linearisation.residual[0] < 1e-12 < 0.1 < modes.linearisation.residual[1]
-    assert list(modes.stable) == [True, False, False, False]
-
-
 # Bad input.
-
-
-def test_messages():
-    """No equilibrium, no mass, explicit time, a violated constraint, wrong types: each error is clear."""
-    with pytest.raises(ValueError, match="not an equilibrium: 'q' accelerates by"):
-        lj.linearise(small.bead, 0.0, 0.3, 0.0, BEAD)
-    massless = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - 0.5 * (q["a"] ** 2 + q["b"] ** 2))
-    with pytest.raises(ValueError, match="mass matrix is singular in coordinate 'b'"):
-        lj.linearise(massless, 0.0, {"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, None)
-    parametric = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (1 + 0.1 * jnp.cos(t)) * q**2)
-    with pytest.raises(ValueError, match="change along the motion: the matrix of positions"):
-        lj.linearise(parametric, 0.0, 0.0, 0.0, None)
-    with pytest.raises(ValueError, match="constraint 'rod'"):
-        lj.linearise(rod_pendulum, 0.0, {"x": 0.0, "y": -1.0}, {"x": 0.0, "y": 0.0}, {"g": 9.8125, "l": 1.25})
-    with pytest.raises(TypeError, match="bool"):
-        lj.linearise(small.bead, 0.0, True, 0, BEAD)
-    with pytest.raises(IndexError, match="there are 1 modes"):
-        lj.normal_modes(small.bead, 0.0, 0.0, 0.0, BEAD)[1]
 
 
 def test_it_draws_itself():

@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate, special
 
 import lagjax as lj
-from tests.systems import PARAMS, pendulum, rod_pendulum
+from tests.systems import PARAMS, pendulum
 
 
 def mathieu_lagrangian(t, q, v, p):
@@ -124,86 +124,6 @@ def test_kapitza_on_a_moving_constraint():
         assert bool(rod.stable) == (Omega == 100.0)
 
 
-def elliptic(amplitude, params):
-    """The pendulum's period, 4 √(l/g) K(sin²(amplitude/2))."""
-    return 4 * np.sqrt(params["l"] / params["g"]) * special.ellipk(np.sin(amplitude / 2) ** 2)
-
-
-def test_pendulum():
-    """M = 1 + (dT/dE) f dEᵀ in closed form, and both multipliers are 1 for a known reason."""
-    amplitude = 2.0
-    found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, elliptic(amplitude, PARAMS))
-    g_over_l = PARAMS["g"] / PARAMS["l"]
-    m = np.sin(amplitude / 2) ** 2
-    k, e = special.ellipk(m), special.ellipe(m)
-    slope = 4 / np.sqrt(g_over_l) * (e - (1 - m) * k) / (2 * m * (1 - m)) * np.sin(amplitude) / 2
-    # With v = 0, f = (0, -g/l sin q). A start shifted by dq returns after T + T'dq, so after T it is off by -f T' dq.
-    exact = np.array([[1.0, 0.0], [slope * g_over_l * np.sin(amplitude), 1.0]])
-    np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
-    np.testing.assert_array_equal(found.multipliers, [1.0, 1.0])
-    assert found.trivial.all() and "1 (along the motion), 1 (across energies)" in repr(found)
-    assert bool(found.stable) and "linearly stable" in found.verdict
-    # Twin: at the equilibrium no multiplier is trivial; they are e^{±i ω T}.
-    rest = lj.floquet(pendulum, 0.0, 0.0, 0.0, PARAMS, 1.0)
-    np.testing.assert_allclose(rest.multipliers, np.exp([1j * np.sqrt(g_over_l), -1j * np.sqrt(g_over_l)]), rtol=1e-9)
-    assert not rest.trivial.any()
-
-
-def kepler_lagrangian(t, q, v, p):
-    """A unit mass attracted by -μ/r."""
-    return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
-
-
-@pytest.mark.exhaustive
-def test_kepler():
-    """All four multipliers are 1, two of them for known reasons, the others to 1e-5; and M is not the identity."""
-    mu, speed = 1.25, 1.25
-    period = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
-    found = lj.floquet(
-        lj.System(kepler_lagrangian), 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, speed]), {"mu": mu}, period
-    )
-    np.testing.assert_allclose(found.multipliers, 1.0, atol=1e-5)
-    assert found.trivial.sum() == 2 and bool(found.stable)
-    # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
-    np.testing.assert_allclose(np.linalg.svd(found.monodromy - np.eye(4))[1][1:], 0.0, atol=1e-8)
-    assert np.abs(found.monodromy - np.eye(4)).max() > 1
-
-
-def on_a_sphere(t, q, v, p):
-    """A unit mass under gravity in three dimensions."""
-    return 0.5 * v @ v - p["g"] * q[2]
-
-
-@pytest.mark.slow
-def test_conical_pendulum():
-    """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, with a constraint given twice.
-
-    Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The rotation is a symmetry that the
-    coordinates do not show, and here it is the motion itself.
-    """
-    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
-    again = lj.Holonomic(lambda t, q, p: 1.0 - q @ q / p["l"] ** 2)
-    theta, g, l = 1.0, 9.8125, 1.25
-    rate = np.sqrt(g / (l * np.cos(theta)))
-    start = l * np.array([np.sin(theta), 0.0, -np.cos(theta)]), rate * l * np.array([0.0, np.sin(theta), 0.0])
-    system = lj.System(on_a_sphere, {"rod": rod, "again": again})
-    found = lj.floquet(system, 0.0, *start, {"g": g, "l": l}, 2 * np.pi / rate)
-    phase = 2 * np.pi * np.sqrt(1 + 3 * np.cos(theta) ** 2)
-    assert found.multipliers.shape == (4,) and found.trivial.tolist() == [True, True, False, False]
-    np.testing.assert_allclose(
-        found.multipliers[2:], np.cos(phase) + 1j * np.abs(np.sin(phase)) * np.array([1, -1]), atol=1e-9
-    )
-    assert bool(found.stable) and not bool(found.attracts)
-    with pytest.raises(ValueError, match="nothing is left to move.*\n.*depend on each other"):
-        jax.jit(lambda g: lj.floquet(doubled(3), 0.0, *start, {"g": g, "l": l}, 1.0).multipliers)(g)
-
-
-def doubled(count):
-    """The same rod several times."""
-    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
-    return lj.System(on_a_sphere, {f"rod {i}": rod for i in range(count)})
-
-
 def van_der_pol_lagrangian(t, q, v, p):
     """A unit mass on a unit spring."""
     return 0.5 * v**2 - 0.5 * q**2
@@ -231,26 +151,6 @@ def test_van_der_pol():
     away = lj.floquet(van_der_pol, 0.0, orbit.q, -orbit.v, {"mu": -1.0}, orbit.period)
     np.testing.assert_allclose(away.multipliers[1], np.exp(-end), rtol=1e-8)
     assert not bool(away.stable) and "above 1" in away.verdict
-
-
-@pytest.mark.slow
-def test_liouville_with_damping():
-    """With and without a rod, R = ½ c v² gives the product e^(-cT) for each freedom; twin: 2R gives its square."""
-    c, period = 0.375, 1.25
-    for factor in (1.0, 2.0):
-        damped = lj.System(
-            pendulum.lagrangian, dissipation=lambda t, q, v, p, factor=factor: 0.5 * factor * p["c"] * v**2
-        )
-        found = lj.floquet(damped, 0.0, 0.0, 0.0, PARAMS | {"c": c}, period)
-        np.testing.assert_allclose(found.liouville, np.exp(-factor * c * period), rtol=1e-11)
-        np.testing.assert_allclose(found.product, found.liouville, rtol=1e-10)
-    start = {"x": 0.0, "y": -PARAMS["l"]}, {"x": 0.0, "y": 0.0}
-    drag = lambda t, q, v, p: 0.5 * p["c"] * (v["x"] ** 2 + v["y"] ** 2)
-    rod = lj.System(rod_pendulum.lagrangian, dict(rod_pendulum.constraints), dissipation=drag)
-    on_rod = lj.floquet(rod, 0.0, *start, PARAMS | {"c": c}, period)
-    assert on_rod.multipliers.shape == (2,)
-    np.testing.assert_allclose(on_rod.liouville, np.exp(-c * period), rtol=1e-11)
-    np.testing.assert_allclose(on_rod.product, np.exp(-c * period), rtol=1e-10)
 
 
 @pytest.mark.exhaustive
@@ -304,16 +204,3 @@ def test_refused_in_words():
         lj.floquet(pendulum, 0.0, 2.0, 0.0, PARAMS)
     with pytest.raises(TypeError, match="a lj.System or a periodic orbit, not dict"):
         lj.floquet(PARAMS)
-
-
-@pytest.mark.exhaustive
-def test_equations_that_fail():
-    """A degenerate L and a NaN parameter are named in the message, also in the search for an orbit."""
-    massless = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2 - q["x"] ** 2 - (q["y"] - q["x"]) ** 2)
-    start = {"x": 1.0, "y": 1.0}, {"x": 0.0, "y": 0.0}
-    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
-        lj.floquet(massless, 0.0, *start, None, 1.0)
-    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
-        lj.periodic_orbit(massless, start, 4.0)
-    with pytest.raises(ValueError, match="L is nan at t = 0"):
-        lj.periodic_orbit(pendulum, (1.0, 0.0), 2.0, PARAMS | {"g": np.nan})

@@ -175,28 +175,6 @@ def test_knife_edge_on_a_slope():
     assert found.multipliers.shape == (5,) and "shift of x" in repr(found) and bool(found.stable)
 
 
-def inverted_lagrangian(t, q, v, p):
-    """A pendulum by its angle from the upward vertical, pushed back and forth."""
-    return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
-
-
-@pytest.mark.slow
-def test_unstable_orbit_by_parts():
-    """A pushed pendulum stays up for two periods of the push, in which neighbours leave it e^(4π)-fold.
-
-    For small pushes f, q = -f cos(t)/(1 + k) up to f³; the motion from a guess of zero leaves it at once.
-    """
-    inverted, f = lj.System(inverted_lagrangian), 0.01
-    orbit = lj.periodic_orbit(inverted, (0.0, 0.0), 4 * np.pi, {"k": 1.0, "f": f}, parts=8)
-    assert bool(orbit.converged) and orbit.nodes.shape == (8, 2)
-    np.testing.assert_allclose(orbit.q, -f / 2, atol=f**3)
-    np.testing.assert_allclose(orbit.nodes[:, 0], -f / 2 * np.cos(np.pi / 2 * np.arange(8)), atol=f**3)
-    found = lj.floquet(orbit)
-    np.testing.assert_allclose(found.multipliers[0], np.exp(4 * np.pi), rtol=1e-3)
-    np.testing.assert_allclose(found.product, 1.0, rtol=1e-5)
-    assert not bool(found.stable)
-
-
 @pytest.mark.exhaustive
 def test_nonlinear_mode_of_the_double_pendulum():
     """The slow mode of equal rods: a small swing has the linear period, 2π/√((2 - √2) g/l), a large one takes longer.
@@ -275,22 +253,6 @@ def test_derivative_of_a_shift():
         np.testing.assert_allclose(jax.jit(mode(shift))(x), exact, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_stiff_cycle():
-    """Van der Pol's at μ = 10: states fall onto the cycle; the other multiplier is almost 0, and reported as unknown.
-
-    The period of 19.07836957: Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382.
-    """
-    system = lj.System(duffing_free, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
-    orbit = lj.periodic_orbit(system, (2.0, 0.0), 18.0, {"mu": 10.0})
-    np.testing.assert_allclose(orbit.period, 19.07836957, atol=1e-8)
-    found = lj.floquet(orbit)
-    assert bool(found.attracts) and float(found.liouville) < 1e-100
-    assert "1 of the multipliers is not known" in repr(found)
-    # Twin: at μ = 1 the multiplier is 9e-4, and known.
-    assert "not known" not in repr(lj.floquet(van_der_pol_orbit(1.0)))
-
-
 @pytest.mark.exhaustive
 def test_lanes_and_sweeps():
     """A batch over μ agrees with a loop, and a sweep reports which points did not converge."""
@@ -337,17 +299,6 @@ def test_refused_in_words(system, given, error, words):
     with pytest.raises(error, match=words) as raised:
         lj.periodic_orbit(system, given.pop("start"), given.pop("period"), PARAMS | DRIVEN, **given)
     assert "Fix:" in str(raised.value)
-
-
-@pytest.mark.slow
-def test_no_cycle_of_a_damped_pendulum():
-    """There is only rest, which does not count as an orbit; the best candidate is returned, with a warning."""
-    damped = lj.System(pendulum.lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
-    with pytest.raises(ValueError, match="the Jacobi integral is not conserved here"):
-        lj.periodic_orbit(damped, (2.0, 0.0), 3.0, PARAMS | {"c": 0.5}, hold="energy")
-    with pytest.warns(lj.OrbitWarning, match="a state of rest"):
-        orbit = lj.periodic_orbit(damped, (2.0, 0.0), 3.0, PARAMS | {"c": 0.5})
-    assert not bool(orbit.converged) and np.isfinite(float(orbit.period)) and float(orbit.residual) > 1e-3
 
 
 @pytest.mark.exhaustive

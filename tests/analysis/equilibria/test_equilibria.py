@@ -9,19 +9,8 @@ import lagjax as lj
 from lagjax.analysis.equilibria.result import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
-from tests.analysis.steady_systems import (
-    DISK,
-    TOP,
-    UPRIGHT,
-    UPRIGHT_DISK,
-    about_z,
-    conical,
-    disk,
-    slowest_sleeping_spin,
-    straight_on,
-    top,
-)
-from tests.systems import PARAMS, cartesian_lagrangian, double_pendulum, pendulum, rod, rod_pendulum
+from tests.analysis.steady_systems import TOP, UPRIGHT, about_z, conical, slowest_sleeping_spin, top
+from tests.systems import PARAMS, double_pendulum, pendulum, rod_pendulum
 
 BEAD = bead_on_hoop.PARAMS
 CHAIN = {"m1": 1.0, "m2": 2.0, "l1": 1.0, "l2": 0.5, "g": 9.8125}
@@ -57,23 +46,6 @@ def test_double_pendulum():
     roots = lj.linearise(double_pendulum, *found[int(np.argmax(found.stable))]).eigenvalues()
     mine = found.eigenvalues[int(np.argmax(found.stable))]
     np.testing.assert_allclose(np.sort(np.abs(mine)), np.sort(np.abs(roots)), rtol=1e-10)
-
-
-@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_multiplier_and_redundant_rods(times):
-    """2 y λ = g, shared by redundant rods as multipliers of least norm; twin: λ has the other sign above."""
-    again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
-    two = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
-    starts = [{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}]
-    g, l = PARAMS["g"], PARAMS["l"]
-    system, share = (rod_pendulum, 1.0) if times == 1 else (two, 0.2)
-    found = lj.equilibria(system, PARAMS, starts=starts)
-    np.testing.assert_allclose(found.q["y"], [-l, l], rtol=1e-14)
-    np.testing.assert_allclose(found.multipliers["rod"], share * g / (2 * found.q["y"]), rtol=1e-13)
-    assert found.stable.tolist() == [True, False]
-    if times == 2:
-        np.testing.assert_allclose(found.multipliers["again"], 0.4 * g / (2 * found.q["y"]), rtol=1e-13)
-    assert found.multipliers["rod"][0] < 0 < found.multipliers["rod"][1]
 
 
 @pytest.mark.exhaustive
@@ -210,63 +182,6 @@ def test_governor():
     np.testing.assert_allclose([hanging.q.C[0, 0], hanging.q.C[0, 2]], [p["b"], 0.0], atol=1e-9)
 
 
-@pytest.mark.exhaustive
-def test_roots_have_derivatives():
-    """Derivatives of a damped pendulum's s = -c/2 ± i√(±g - c²/4), both modes, also on a rod; twin: with another c."""
-    damped = lj.System(
-        lambda t, q, v, p: 0.5 * v**2 + p["g"] * jnp.cos(q), dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
-    )
-    params = {"g": 9.81, "c": 0.5}
-    at = lambda p: lj.equilibria(damped, p, starts=[0.3, 3.0]).eigenvalues
-    below = lambda p: jnp.imag(at(p)[0, 0])
-    frequency, fastest = np.sqrt(9.81 - 0.0625), np.sqrt(9.81 + 0.0625)
-    slope = jax.jit(jax.jacfwd(at))(params)
-    np.testing.assert_allclose(slope["g"][:, 0], [0.5j / frequency, 0.5 / fastest], atol=1e-10)
-    np.testing.assert_allclose(slope["c"][:, 0], [-0.5 - 0.125j / frequency, -0.5 + 0.125 / fastest], atol=1e-10)
-    np.testing.assert_allclose(jax.grad(below)(params)["g"], 0.5 / frequency, rtol=1e-10)
-    assert abs(jax.grad(below)(params | {"c": 1.0})["g"] - 0.5 / frequency) > 1e-4
-    g = 9.8125
-
-    def on_a_rod(l):
-        found = lj.equilibria(rod_pendulum, {"m": 1.5, "g": g, "l": l}, starts=[{"x": 0.3, "y": -1.2}])
-        return jnp.nansum(jnp.abs(jnp.imag(found.eigenvalues))) / 2
-
-    np.testing.assert_allclose(jax.grad(on_a_rod)(1.25), -0.5 * np.sqrt(g / 1.25**3), rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_roots_are_those_of_the_linearisation():
-    """Two derivations agree: gyroscopic, holonomic and velocity constraints, all kinds of forces."""
-    rng = np.random.default_rng(3)
-    matrices = {name: rng.normal(size=(4, 4)) for name in "KMDGN"}
-    params = {name: x @ x.T + np.eye(4) if name in "KMD" else x for name, x in matrices.items()}
-    params |= {"f": rng.normal(size=4), "c": rng.normal(size=4)}
-
-    def lagrangian(t, q, v, p):
-        return 0.5 * (v @ p["M"] @ v - q @ p["K"] @ q) + q @ p["G"] @ v + p["f"] @ q - 0.1 * jnp.sum(q**4)
-
-    surface = lj.Holonomic(lambda t, q, p: p["c"] @ q - 0.3 + 0.2 * q @ q)
-    general = lj.System(
-        lagrangian, {"surface": surface}, lambda t, q, v, p: 0.1 * p["N"] @ q, lambda t, q, v, p: 0.05 * v @ p["D"] @ v
-    )
-    straight = {name: np.asarray(x) * 3.0 for name, x in straight_on(UPRIGHT_DISK, DISK).items()}
-    cases = [
-        (general, params, np.zeros(4), {}),
-        (cross_rails.rotating_system, cross_rails.PARAMS | {"omega": 8.0}, {"R": -0.8, "r": 0.0}, {}),
-        (disk, DISK, UPRIGHT_DISK, {"velocities": straight, "cyclic": straight_on}),
-    ]
-    for system, p, start, settings in cases:
-        found = lj.equilibria(system, p, starts=[start], **settings)
-        theirs = np.asarray(lj.linearise(system, *found[0]).eigenvalues())
-        mine = np.asarray(found.eigenvalues[0])
-        mine = mine[np.isfinite(mine)]
-        largest = np.max(np.abs(theirs))
-        mine, theirs = (x[np.abs(x) > 1e-6 * largest] for x in (mine, theirs))
-        assert mine.size == theirs.size > 0
-        off = np.abs(mine[:, None] - theirs[None, :])
-        assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
-
-
 # Searches that find no equilibrium.
 
 
@@ -351,69 +266,3 @@ HILLS = lj.System(
     lambda t, q, v, p: 0.5 * v**2 - sum(c * (q - p["at"]) ** k for k, c in enumerate(p["c"], 3)),
     dissipation=lambda t, q, v, p: 0.5 * p["friction"] * v**2 + p["cubic"] * v**4,
 )
-HILL = {"c": np.zeros(4), "at": 0.0, "friction": 0.0, "cubic": 0.0}
-
-
-@pytest.mark.parametrize(
-    "power, factor, verdict", [(4, -1.0, "unstable"), (4, 1.0, "stable"), (3, 1.0, "unstable"), (6, -1.0, "unstable")]
-)
-def test_hills_of_any_order(power, factor, verdict):
-    """V = c q^k at 0 and elsewhere: one equilibrium from nine starts, stable exactly for even k and c > 0."""
-    c = factor * np.eye(4)[power - 3]
-    for changes in ({}, {"at": 0.75}, {"friction": 0.5}):
-        found = one(HILL | {"c": c} | changes)
-        assert words(found) == [verdict] and found.zero_modes.tolist() == [1]
-        np.testing.assert_allclose(found.q, [changes.get("at", 0.0)], atol=1e-8)
-        assert np.all(found.of_start[found.status == 0] == 0)
-
-
-def test_what_decides_nothing():
-    """Friction that gives energy is undecided; a term that is there decides; a free particle is a family."""
-    quartic = HILL | {"c": np.array([0.0, 1.0, 0.0, 0.0])}
-    assert words(one(quartic | {"cubic": 1.0})) == ["stable"]
-    assert words(one(quartic | {"cubic": -1.0})) == ["undecided"]
-    assert words(one(HILL)) == ["stable"] * 9
-    traced = jax.jit(lambda p: one_traced(p))(quartic)
-    assert bool(traced[1]) and not bool(traced[0])
-
-
-def one_traced(params):
-    """Stable, and undecided, from one start in a program."""
-    found = lj.equilibria(HILLS, params, starts=[0.5])
-    return found.stable[0], found.undecided[0]
-
-
-VALLEY = lj.System(
-    lambda t, q, v, p: (
-        0.5 * (v["x"] ** 2 + v["y"] ** 2) + p["turn"] * q["x"] * v["y"]
-        - p["k"] * (q["y"] - p["bend"] * q["x"] ** 2) ** 2 - p["x4"] * q["x"] ** 4 - p["y4"] * q["y"] ** 4
-        - p["apart"] * (q["x"] - q["y"]) ** 4
-    )
-)  # fmt: skip
-FLAT = {"turn": 0.0, "k": 0.0, "bend": 0.0, "x4": 0.0, "y4": 0.0, "apart": 0.0}
-BESIDE = [{"x": 0.3, "y": 0.2}, {"x": -0.4, "y": 0.5}]
-
-
-@pytest.mark.slow
-def test_the_centre_manifold_decides():
-    """V = (y - x²)² + c x⁴ has the reduced potential c x⁴, though c - 1 stands in its x⁴; twin: the other sign of c."""
-    at = lambda **changes: lj.equilibria(VALLEY, FLAT | changes, starts=BESIDE)
-    for c, verdict in ((0.5, "stable"), (-0.5, "unstable")):
-        found = at(k=1.0, bend=1.0, x4=c)
-        assert words(found) == [verdict] and abs(float(found.q["x"][0])) < 1e-6
-    # All of the valley's floor is in equilibrium.
-    assert words(at(k=1.0, bend=1.0)) == ["stable"] * 2
-    # With gyroscopic forces a minimum is stable, a hill beside a valley unstable, and two hills are undecided.
-    assert words(at(k=1.0, x4=1.0, turn=1.0)) == ["stable"]
-    assert words(at(k=1.0, x4=-1.0, turn=1.0)) == ["unstable"]
-    assert words(at(k=-1.0, x4=-1.0, turn=3.0)) == ["undecided"]
-
-
-@pytest.mark.slow
-def test_several_zero_modes():
-    """x⁴ + y⁴ is stable, x⁴ - y⁴ not; of (x - y)⁴ the shift of both is a family, and the rest decides."""
-    at = lambda **changes: lj.equilibria(VALLEY, FLAT | changes, starts=BESIDE)
-    assert words(at(x4=1.0, y4=1.0)) == ["stable"]
-    assert words(at(x4=1.0, y4=-1.0)) == ["unstable"]
-    assert words(at(x4=-1.0, y4=-1.0, turn=1.0)) == ["undecided"]
-    assert words(at(apart=1.0)) == ["stable"] * 2 and words(at(apart=-1.0)) == ["unstable"] * 2

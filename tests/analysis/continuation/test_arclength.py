@@ -1,0 +1,79 @@
+"""Following a branch past its folds: none missed, no jump to another branch, and where it stalls."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.analysis.continuation.test_equilibria import check
+from tests.analysis.steady_systems import TRUSS, snap_through, truss  # fmt: skip
+
+
+def test_truss():
+    """It snaps through at folds in both directions, at the load of the closed form; between them it is unstable."""
+    found = lj.continue_equilibria(truss, TRUSS, 0.6, along="P", to=6.0)
+    assert [c.kind for c in found.critical] == ["fold", "fold"] and len(found) == 1
+    lower, upper = sorted(found.critical, key=lambda c: c.parameter)
+    check(upper, snap_through, TRUSS, "P")
+    check(lower, lambda p: -snap_through(p), TRUSS, "P")
+    branch = found[0]
+    between = (branch.q < float(upper.q) - 1e-6) & (branch.q > float(lower.q) + 1e-6)
+    outside = (branch.q > float(upper.q) + 1e-6) | (branch.q < float(lower.q) - 1e-6)
+    assert not branch.stable[between].any() and branch.stable[outside].all()
+    rest = np.hypot(TRUSS["a"], TRUSS["h"])
+    load = -2 * TRUSS["k"] * (1 - rest / np.hypot(TRUSS["a"], branch.q)) * branch.q
+    np.testing.assert_allclose(branch.parameter, load, rtol=1e-11, atol=1e-11)
+    assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
+
+
+@pytest.mark.exhaustive
+def test_folds_of_random_curves():
+    """Branches that are graphs mu(q): exactly the folds between their ends are found, by a fine grid of mu'."""
+
+    def potential(t, q, v, p):
+        waves = p["a"] * jnp.cos(q) + p["b"] * jnp.cos(2 * q + p["shift"]) / 2 + p["d"] * jnp.cos(5 * q) / 5
+        return 0.5 * v**2 + p["mu"] * q + waves - 0.5 * p["c"] * q**2
+
+    system, rng, start, counted = lj.System(potential), np.random.default_rng(5), -20.0, 0
+    for _ in range(12):
+        p = dict(zip("abd", rng.normal(size=3) * [2, 2, 0.5])) | {"c": 0.3 + 0.5 * rng.uniform(), "shift": rng.normal()}
+        mu = lambda q, p=p: (
+            p["a"] * np.sin(q) + p["b"] * np.sin(2 * q + p["shift"]) + p["d"] * np.sin(5 * q) + p["c"] * q
+        )
+        first = mu(start)
+        found = lj.continue_equilibria(system, p | {"mu": first}, start, along="mu", to=first + 12.0)
+        towards = np.sign(mu(start + 1e-6) - first)
+        values = mu(start + towards * np.linspace(1e-9, 80.0, 400001))
+        outside = np.flatnonzero((values < first - 1e-12) | (values > first + 12.0))
+        slopes = np.diff(values[: outside[0] if len(outside) else None])
+        turns = values[1:-1][: len(slopes) - 1][slopes[1:] * slopes[:-1] < 0]
+        folds = [float(c.parameter) for c in found.critical]
+        assert {c.kind for c in found.critical} <= {"fold"} and found[0].status == "the end of the range"
+        np.testing.assert_allclose(np.sort(folds), np.sort(turns), atol=1e-6)
+        counted += len(folds)
+    assert counted > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("e", [1e-3, 1e-6])
+def test_nearly_a_pitchfork(e):
+    """With a small push there is no crossing, steps do not jump to the other branch, and the branch stays stable."""
+    pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
+    found = lj.continue_equilibria(pushed, {"mu": -1.0, "e": e}, 0.0, along="mu", to=1.0)
+    assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.9
+    back = lj.continue_equilibria(pushed, {"mu": 1.0, "e": e}, -1.0, along="mu", to=-1.0)
+    # The other branch folds where mu³ = 27 e²/4.
+    (critical,) = back.critical
+    assert critical.kind == "fold"
+    np.testing.assert_allclose(critical.parameter, np.cbrt(6.75 * e**2), rtol=1e-10)
+    np.testing.assert_allclose(critical.derivative["e"], 2 / 3 * np.cbrt(6.75 / e), rtol=1e-8)
+
+
+def test_a_branch_that_stalls():
+    """It stops where L is undefined, says so, and returns its points so far; twin: a shorter range is completed."""
+    edge = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 - p["s"] * jnp.sqrt(1.0 - q) ** 3 + p["f"] * q
+    system, params = lj.System(edge), {"f": 0.0, "s": 0.1}
+    found = lj.continue_equilibria(system, params, 0.0, along="f", to=3.0)
+    assert len(found[0]) > 10 and "Newton's method does not converge" in found[0].status
+    np.testing.assert_allclose([found[0].parameter[-1], found[0].q[-1]], 1.0, atol=1e-2)
+    assert lj.continue_equilibria(system, params, 0.0, along="f", to=0.9)[0].status == "the end of the range"

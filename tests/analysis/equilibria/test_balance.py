@@ -1,0 +1,85 @@
+"""The balance of forces and its small departures: shared multipliers, roots and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.scenes import cross_rails
+from tests.analysis.steady_systems import DISK, UPRIGHT_DISK, disk, straight_on
+from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+
+
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_multiplier_and_redundant_rods(times):
+    """2 y λ = g, shared by redundant rods as multipliers of least norm; twin: λ has the other sign above."""
+    again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
+    two = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
+    starts = [{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}]
+    g, l = PARAMS["g"], PARAMS["l"]
+    system, share = (rod_pendulum, 1.0) if times == 1 else (two, 0.2)
+    found = lj.equilibria(system, PARAMS, starts=starts)
+    np.testing.assert_allclose(found.q["y"], [-l, l], rtol=1e-14)
+    np.testing.assert_allclose(found.multipliers["rod"], share * g / (2 * found.q["y"]), rtol=1e-13)
+    assert found.stable.tolist() == [True, False]
+    if times == 2:
+        np.testing.assert_allclose(found.multipliers["again"], 0.4 * g / (2 * found.q["y"]), rtol=1e-13)
+    assert found.multipliers["rod"][0] < 0 < found.multipliers["rod"][1]
+
+
+@pytest.mark.exhaustive
+def test_roots_have_derivatives():
+    """Derivatives of a damped pendulum's s = -c/2 ± i√(±g - c²/4), both modes, also on a rod; twin: with another c."""
+    damped = lj.System(
+        lambda t, q, v, p: 0.5 * v**2 + p["g"] * jnp.cos(q), dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
+    )
+    params = {"g": 9.81, "c": 0.5}
+    at = lambda p: lj.equilibria(damped, p, starts=[0.3, 3.0]).eigenvalues
+    below = lambda p: jnp.imag(at(p)[0, 0])
+    frequency, fastest = np.sqrt(9.81 - 0.0625), np.sqrt(9.81 + 0.0625)
+    slope = jax.jit(jax.jacfwd(at))(params)
+    np.testing.assert_allclose(slope["g"][:, 0], [0.5j / frequency, 0.5 / fastest], atol=1e-10)
+    np.testing.assert_allclose(slope["c"][:, 0], [-0.5 - 0.125j / frequency, -0.5 + 0.125 / fastest], atol=1e-10)
+    np.testing.assert_allclose(jax.grad(below)(params)["g"], 0.5 / frequency, rtol=1e-10)
+    assert abs(jax.grad(below)(params | {"c": 1.0})["g"] - 0.5 / frequency) > 1e-4
+    g = 9.8125
+
+    def on_a_rod(l):
+        found = lj.equilibria(rod_pendulum, {"m": 1.5, "g": g, "l": l}, starts=[{"x": 0.3, "y": -1.2}])
+        return jnp.nansum(jnp.abs(jnp.imag(found.eigenvalues))) / 2
+
+    np.testing.assert_allclose(jax.grad(on_a_rod)(1.25), -0.5 * np.sqrt(g / 1.25**3), rtol=1e-9)
+
+
+@pytest.mark.exhaustive
+def test_roots_are_those_of_the_linearisation():
+    """Two derivations agree: gyroscopic, holonomic and velocity constraints, all kinds of forces."""
+    rng = np.random.default_rng(3)
+    matrices = {name: rng.normal(size=(4, 4)) for name in "KMDGN"}
+    params = {name: x @ x.T + np.eye(4) if name in "KMD" else x for name, x in matrices.items()}
+    params |= {"f": rng.normal(size=4), "c": rng.normal(size=4)}
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v @ p["M"] @ v - q @ p["K"] @ q) + q @ p["G"] @ v + p["f"] @ q - 0.1 * jnp.sum(q**4)
+
+    surface = lj.Holonomic(lambda t, q, p: p["c"] @ q - 0.3 + 0.2 * q @ q)
+    general = lj.System(
+        lagrangian, {"surface": surface}, lambda t, q, v, p: 0.1 * p["N"] @ q, lambda t, q, v, p: 0.05 * v @ p["D"] @ v
+    )
+    straight = {name: np.asarray(x) * 3.0 for name, x in straight_on(UPRIGHT_DISK, DISK).items()}
+    cases = [
+        (general, params, np.zeros(4), {}),
+        (cross_rails.rotating_system, cross_rails.PARAMS | {"omega": 8.0}, {"R": -0.8, "r": 0.0}, {}),
+        (disk, DISK, UPRIGHT_DISK, {"velocities": straight, "cyclic": straight_on}),
+    ]
+    for system, p, start, settings in cases:
+        found = lj.equilibria(system, p, starts=[start], **settings)
+        theirs = np.asarray(lj.linearise(system, *found[0]).eigenvalues())
+        mine = np.asarray(found.eigenvalues[0])
+        mine = mine[np.isfinite(mine)]
+        largest = np.max(np.abs(theirs))
+        mine, theirs = (x[np.abs(x) > 1e-6 * largest] for x in (mine, theirs))
+        assert mine.size == theirs.size > 0
+        off = np.abs(mine[:, None] - theirs[None, :])
+        assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
