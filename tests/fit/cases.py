@@ -45,6 +45,11 @@ class Case(NamedTuple):
         return jax.tree.unflatten(structure, noisy)
 
 
+def noisy(x, sigma=0.01, seed=0):
+    """Values with normal errors."""
+    return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
+
+
 def swing(t, q, v, params):
     """L of a pendulum in its angle."""
     return 0.5 * params["m"] * params["l"] ** 2 * v**2 + params["m"] * params["g"] * params["l"] * jnp.cos(q)
@@ -57,6 +62,10 @@ def air(t, q, v, params):
 
 pendulum = lj.System(swing, dissipation=air)
 PENDULUM = {"m": 1.0, "l": 1.25, "g": 9.81, "c": 0.05}
+# Measurements of the pendulum, and what is not known of it.
+TS = np.linspace(0.0, 5.0, 100)
+GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
+FREE = ["c", "l"]
 
 
 def hanging(t, q, v, params):

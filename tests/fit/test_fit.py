@@ -1,8 +1,5 @@
 """What a fit finds, and what it says about what it cannot find."""
 
-from typing import Any, NamedTuple
-
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,37 +7,14 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
-from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
 import lagjax as lj
-from lagjax.fit.problem.arguments import problem_of
-from lagjax.fit.problem.initial_states import _parabola
-from lagjax.fit.problem.residuals import WHOLE, _counts, equations
 from lagjax.fit.result.warnings import caveats
 from lagjax.fit.search import search
-from lagjax.fit.search.search import linearised
-from lagjax.numerics.windowed_least_squares import Unknowns
 from lagjax.scenes import rolling_hoop
 from tests.counting import compiles
-from tests.fit.cases import CASES, HUNG, PENDULUM, hung, pendulum, swing
-from tests.tiers import exhaustive_but
-
-TS = np.linspace(0.0, 5.0, 100)
-GUESS = PENDULUM | {"l": 1.4, "c": 0.1}
-FREE = ["c", "l"]
-
-
-@pytest.fixture(scope="module")
-def swinging():
-    """A pendulum's angle and rate at `TS`."""
-    traj = lj.integrate(pendulum, 1.0, 0.0, PENDULUM, ts=TS)
-    return np.asarray(traj.q), np.asarray(traj.v)
-
-
-def noisy(x, sigma=0.01, seed=0):
-    """Values with normal errors."""
-    return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
+from tests.fit.cases import CASES, FREE, GUESS, HUNG, PENDULUM, TS, hung, noisy, pendulum, swing
 
 
 def test_finds_parameters_and_start(swinging, capsys):
@@ -105,44 +79,6 @@ def test_gaps_and_several_runs(swinging):
 
 
 @pytest.mark.exhaustive
-def test_identifiability_before_and_after(swinging):
-    """A swing determines g/l and c/(m l²); what is not determined gets no uncertainty."""
-    record = lj.Record(TS, q=noisy(swinging[0]))
-    told = lj.identifiability(pendulum, record, PENDULUM)
-    assert told.rank == 2 and told.combined()[0] == "g/l"
-    assert "g/l" in repr(told)
-    with pytest.warns(lj.FitWarning, match="do not determine"):
-        found = lj.fit(pendulum, record, PENDULUM)
-    assert np.isnan(found.sd).all() and np.isfinite(found.start_sd[0][0])
-    assert "not determined" in repr(found)
-    np.testing.assert_allclose(found.values[1] / found.values[2], 9.81 / 1.25, rtol=0.01)
-    # Twin: with l known, g and c are determined; m and c only as a ratio.
-    assert lj.identifiability(pendulum, record, PENDULUM, free=["g", "c"]).rank == 2
-    assert lj.identifiability(pendulum, record, PENDULUM, free=["m", "c"]).combined() == ["c/m"]
-    # The scale of L is not determined: all but one common factor.
-    scaled = lambda t, q, v, p: 0.5 * p["inertia"] * v**2 + p["weight"] * jnp.cos(q)
-    rubbed = lj.System(scaled, dissipation=lambda t, q, v, p: 0.5 * p["drag"] * v**2)
-    told = lj.identifiability(rubbed, record, {"inertia": 1.0, "weight": 8.0, "drag": 0.1})
-    assert "one common factor of all" in repr(told)
-    # A parameter that L does not contain.
-    more = PENDULUM | {"colour": 3.0}
-    assert lj.identifiability(pendulum, record, more, free=["g", "colour"]).unseen() == ["colour"]
-
-
-@pytest.mark.exhaustive
-def test_a_measured_force_shows_the_mass():
-    """A motion does not determine the scale of L, but a multiplier does."""
-    case = CASES["pendulum on a rod"]
-    traj = case.truth()
-    record = lambda **measured: lj.Record(
-        case.ts, **measured, q0=case.q0, v0=case.v0, sigma={"q": 0.01, "multipliers": 0.1}
-    )
-    free = ["g", "l", "m"]
-    assert lj.identifiability(hung, record(q=traj.q), HUNG, free=free).unseen() == ["m"]
-    assert lj.identifiability(hung, record(q=traj.q, multipliers=traj.multipliers), HUNG, free=free).rank == 3
-
-
-@pytest.mark.exhaustive
 def test_a_start_on_constraints_is_as_uncertain_as_they_are():
     """A bob released at the rod's side is as uncertain as the rod's length; the angle gives exactly the same."""
     case = CASES["pendulum on a rod"]
@@ -166,63 +102,6 @@ def test_a_start_on_constraints_is_as_uncertain_as_they_are():
     # Twin: if the length were known, so would be the distance.
     slope[:, 1] = 0
     assert np.sqrt(slope[0] @ joint @ slope[0]) < 0.2 * expected[0]
-
-
-@pytest.mark.slow
-def test_a_start_that_the_data_do_not_see():
-    """The start of an unmeasured, uncoupled coordinate is not determined; without a guess of it the fit is refused."""
-    both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2
-    ts = np.linspace(0.0, 4.0, 60)
-    record = lj.Record(ts, q={"a": np.cos(2 * ts)}, q0={"a": 1.0, "b": 0.5})
-    found = lj.fit(lj.System(both), record, {"k": 3.0})
-    np.testing.assert_allclose(found.values, [4.0], rtol=1e-8)
-    assert np.isnan(found.start_sd[0][0]["b"]) and np.isfinite(found.start_sd[0][0]["a"])
-    assert "b(0)    0.5 (not determined)" in repr(found)
-    with pytest.raises(ValueError, match="(?s)asks for 'b'.*start of record 0 was read off what it measures, 'a'"):
-        lj.fit(lj.System(both), lj.Record(ts, q={"a": np.cos(2 * ts)}), {"k": 3.0})
-
-
-class Springs(NamedTuple):
-    """Parameters that are not a dictionary."""
-
-    m: Any
-    walls: dict
-
-
-springs = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p.m * v**2) - 0.5 * jnp.sum(p.walls["k"] * q**2))
-SPRINGS = Springs(jnp.array([1.0, 2.0]), {"k": jnp.array([3.0, 5.0])})
-
-
-@pytest.mark.exhaustive
-def test_elements_of_any_pytree():
-    """One entry of an array is fitted, the others stay; bounds by element; a run with its own parameters."""
-    ts = np.linspace(0.0, 4.0, 60)
-    heavy = SPRINGS._replace(m=jnp.array([1.5, 2.0]))
-    runs = [lj.integrate(springs, jnp.ones(2), jnp.zeros(2), p, ts=ts).q for p in (SPRINGS, heavy)]
-    records = [lj.Record(ts, q=runs[0]), lj.Record(ts, q=runs[1], params={"m": heavy.m})]
-    guess = SPRINGS._replace(walls={"k": jnp.array([3.0, 4.0])})
-    found = lj.fit(springs, records, guess, free="walls.k[1]", bounds={"walls.k[1]": (0.0, None)})
-    assert found.names == ("walls.k[1]",)
-    np.testing.assert_allclose(found.params.walls["k"], [3.0, 5.0], rtol=1e-8)
-    np.testing.assert_array_equal(found.params.m, SPRINGS.m)
-
-
-@pytest.mark.exhaustive
-def test_what_the_residuals_tell():
-    """As many unknowns as measurements leave no uncertainty; residuals on a curve are not measurement errors."""
-    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
-    with pytest.warns(lj.FitWarning, match="as many unknowns as measurements.*\n.*sigma="):
-        found = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6]), {"k": 1.0})
-    assert np.isnan(found.sd).all() and np.isnan(found.start_sd[0][0])
-    # Twin: the same with the size of the errors given.
-    told = lj.fit(spring, lj.Record([0.0, 0.5, 1.0], q=[1.0, 0.9, 0.6], sigma=0.01), {"k": 1.0})
-    assert np.isfinite(told.sd).all()
-    clean = lj.integrate(spring, 1.0, 0.0, {"k": 4.0}, ts=TS).q
-    data = noisy(np.asarray(clean) + 0.3 * np.cos(9 * TS), 0.02)
-    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
-        lj.fit(spring, lj.Record(TS, q=data), {"k": 3.0})
-    # Twin: residuals as large, but uncorrelated.
-    lj.fit(spring, lj.Record(TS, q=noisy(np.asarray(clean), 0.25)), {"k": 3.0})
 
 
 @pytest.mark.exhaustive
@@ -331,57 +210,6 @@ def test_outliers_from_far(swinging, monkeypatch):
     assert not np.allclose(astray.values, found.values, atol=0.1)
 
 
-@pytest.mark.parametrize("wild", [0, 3, 6])
-def test_a_start_is_read_off_without_wild_values(wild):
-    """An outlier among the first seven samples hardly changes the position and velocity that are read off."""
-    t = 0.05 * np.arange(40.0)
-    x = 1.0 + 0.5 * t - 2.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=40)
-    x[wild] += 3.0
-    q, v = _parabola(t, x, np.arange(40))
-    assert abs(q - 1.0) < 0.01 and abs(v - 0.5) < 0.1
-    # Twin: least squares follow the outlier; a parabola through samples far apart keeps them all.
-    near = np.polynomial.Polynomial.fit(t[:7], x[:7], 2)
-    assert abs(near(0.0) - 1.0) > 0.1 or abs(near.deriv()(0.0) - 0.5) > 1.0
-    t, far = np.arange(7.0), np.cos(0.8 * np.arange(7.0))
-    near = np.polynomial.Polynomial.fit(t, far, 2)
-    np.testing.assert_allclose(_parabola(t, far, np.arange(7))[0], near(0.0))
-
-
-def problem(case, measured, **options):
-    """The arrays of a fit."""
-    record = lj.Record(case.ts, **measured, q0=case.q0, v0=case.v0, sigma=case.sigma)
-    return problem_of(case.system, record, case.guess(), sorted(case.free), None, None, None, "squares", None, options)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", exhaustive_but(("pendulum",), ("pendulum", "pendulum on a rod", "rolling hoop")))
-def test_slopes_three_ways(name):
-    """Slopes of all residuals, including measured multipliers: forward, reverse, and by differences.
-
-    The steps do not depend on the varied unknowns, so the differenced function is smooth. For times of events, see the
-    rolling hoop.
-    """
-    case = CASES[name]
-    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(0.01)}
-    p = problem(case, case.measured(case.truth()), **fixed)
-    u = p.start
-    flat, back = ravel_pytree(u)
-    slopes = linearised(p, u, WHOLE, "squares").slopes
-    forward = np.concatenate([slopes.rows_by_shared[0], slopes.rows_by_local[0]], axis=1)
-    rows = lambda x: equations(p, back(x), WHOLE).rows[0]
-    direction = np.random.default_rng(0).normal(size=forward.shape[0])
-    pulled = jax.jit(jax.grad(lambda x: direction @ rows(x)))(flat)
-    np.testing.assert_allclose(pulled, direction @ forward, rtol=1e-9, atol=1e-9 * np.max(np.abs(direction @ forward)))
-    at = jax.jit(rows)
-    for i in range(len(flat)):
-        step = np.zeros(len(flat))
-        step[i] = 1e-3 * max(abs(float(flat[i])), 0.1)
-        two = lambda h: (np.asarray(at(flat + h * step)) - np.asarray(at(flat - h * step))) / (2 * h * step[i])
-        difference = (4 * two(0.5) - two(1.0)) / 3
-        scale = max(np.max(np.abs(forward[:, i])), 1e-3 * np.max(np.abs(forward)))
-        np.testing.assert_allclose(difference, forward[:, i], atol=1e-7 * scale, rtol=0)
-
-
 @pytest.mark.slow
 def test_inside_a_program(swinging):
     """Fits of many measurements in one program give the same as one by one."""
@@ -468,14 +296,6 @@ def test_called_again_it_compiles_nothing(swinging):
     assert len(programs) == 1
 
 
-def test_all_samples_of_a_whole_record_count():
-    """The last sample counts even if first time plus length is rounded to less than its time. Twin: the sum."""
-    random = np.random.default_rng(0)
-    times = [np.sort(random.uniform(0.1, 10.0, 5)) for _ in range(100)]
-    assert all(np.all(_counts(t, 3, 1.0) == (t <= t[3])) for t in times)
-    assert not all(np.all((t <= t[0] + 1.0 * (t[3] - t[0])) == (t <= t[3])) for t in times)
-
-
 @pytest.mark.slow
 def test_a_fit_sees_what_has_changed():
     """A fit uses the current value of a number that L reads from outside: w² = k times that number."""
@@ -485,20 +305,6 @@ def test_a_fit_sees_what_has_changed():
     np.testing.assert_allclose(of(), 4.0, rtol=1e-7)
     strength[0] = 2.0
     np.testing.assert_allclose(of(), 2.0, rtol=1e-7)
-
-
-@pytest.mark.slow
-def test_unknowns_of_a_start_keep_to_the_constraints():
-    """A start satisfies the constraints for any unknowns and parameters."""
-    case = CASES["pendulum on a rod"]
-    p = problem(case, {"q": case.truth().q})
-    assert p.start.local.shape == (1, 2)
-    state = jax.jit(lambda u: p.setting(u.shared, u.local[0], 0, WHOLE)[2])
-    for own in ([0.3, -0.5], [-0.5, 1.0]):
-        u = Unknowns(jnp.array([2.4, 1.0]), jnp.array([own]))
-        q, v = state(u)
-        assert abs(q["x"] ** 2 + q["y"] ** 2 - 2.4**2) < 1e-12
-        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
 
 
 @pytest.mark.exhaustive

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lagjax.mechanisms import andrews
+from tests.behaviour.test_end_states import WITHIN, relative_errors, run
 from tests.mechanisms import published
-from tests.mechanisms.test_end_states import WITHIN, relative_errors, run
 from tests.mechanisms.test_mechanism import assert_close, assert_reference, equations, residual, stacked
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lagjax.mechanisms import fekete
-from tests.mechanisms.test_end_states import run
+from tests.behaviour.test_end_states import run
 
 
 def test_fekete():

@@ -6,8 +6,8 @@ from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.mechanisms import n_four_bar
+from tests.behaviour.test_end_states import TOLERANCES, WITHIN, relative_errors, run
 from tests.mechanisms import published
-from tests.mechanisms.test_end_states import TOLERANCES, WITHIN, relative_errors, run
 from tests.mechanisms.test_mechanism import assert_reference
 from tests.tiers import exhaustive_but
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.behaviour.test_regular_first import BOTH, exact
 from tests.sweep import worker
-from tests.sweep.test_regular_first import BOTH, exact
 
 PROGRAM = """
 import jax, numpy as np, sys
@@ -18,7 +18,7 @@ jax.config.update("jax_num_cpu_devices", 2)
 import lagjax as lj
 from tests.sweep import worker
 swept = lj.sweep(worker.run, worker.axes(170), progress=False)
-from tests.sweep.test_regular_first import BOTH, first_coordinate
+from tests.behaviour.test_regular_first import BOTH, first_coordinate
 irregular = lj.sweep(first_coordinate, BOTH, progress=False).values
 np.savez(sys.argv[1], values=swept.values, steps=swept.status.steps, how=swept.how, irregular=irregular)
 """

@@ -4,30 +4,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.fit.cases import HUNG, PENDULUM, hung, pendulum
+from tests.fit.cases import PENDULUM, pendulum
 
 T = np.linspace(0.0, 1.0, 20)
 Q = np.cos(T)
-
-
-@pytest.mark.parametrize(
-    "make, words",
-    [
-        (lambda: lj.Record(T[::-1], q=Q), "must increase, but t"),
-        (lambda: lj.Record(np.where(T > 0.5, np.nan, T), q=Q), "NaN"),
-        (lambda: lj.Record(T, q=Q[:-1]), r"shape \(19,\), but the record has 20 times"),
-        (lambda: lj.Record(T, q={"theta": Q[None]}), "'theta' has the shape"),
-        (lambda: lj.Record(T, q=np.where(T > 0.5, np.inf, Q)), "infinity"),
-        (lambda: lj.Record(T), "no measurement"),
-        (lambda: lj.Record([0.0], q=[1.0]), "two or more"),
-        (lambda: lj.Record(T, q=Q, hold_v=True), "v0 is known, but it is not given"),
-        (lambda: lj.Record(T, q={"theta": Q}, hold_q="theta"), "q0 is known"),
-    ],
-)
-def test_records(make, words):
-    """A record that makes no sense raises an error that says why."""
-    with pytest.raises(ValueError, match=words):
-        make()
 
 
 RECORD = lj.Record(T, q=Q)
@@ -67,21 +47,6 @@ def test_arguments(arguments, error, words):
     records, params, options = arguments
     with pytest.raises(error, match="(?s)" + words):
         lj.fit(pendulum, records, params, **options)
-
-
-def test_wrong_names_of_coordinates_and_constraints():
-    """Measurements of names that the motion does not have are refused."""
-    start = dict(q0={"x": 2.0, "y": 0.0}, v0={"x": 0.0, "y": 0.0})
-    for measured in ({"q": {"z": Q}}, {"multipliers": {"rope": Q}}):
-        with pytest.raises(ValueError, match="but the motion has no such name"):
-            lj.fit(hung, lj.Record(T, **measured, **start), HUNG)
-
-
-@pytest.mark.slow
-def test_a_guess_that_cannot_move():
-    """A guess from which the motion fails at once gives an error with the message of `integrate`."""
-    with pytest.raises(ValueError, match="(?s)from the guess the motion of record 0 fails.*mass matrix"):
-        lj.fit(pendulum, RECORD, PENDULUM | {"l": 0.0}, free="g")
 
 
 @pytest.mark.slow

@@ -1,0 +1,57 @@
+"""Starts of a fit: read off the data, on the constraints for any unknowns, and those that the data do not see."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.fit.problem.initial_states import _parabola
+from lagjax.fit.problem.residuals import WHOLE
+from lagjax.numerics.windowed_least_squares import Unknowns
+from tests.fit.cases import CASES
+from tests.fit.problem.test_residuals import problem
+
+
+@pytest.mark.slow
+def test_a_start_that_the_data_do_not_see():
+    """The start of an unmeasured, uncoupled coordinate is not determined; without a guess of it the fit is refused."""
+    both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2
+    ts = np.linspace(0.0, 4.0, 60)
+    record = lj.Record(ts, q={"a": np.cos(2 * ts)}, q0={"a": 1.0, "b": 0.5})
+    found = lj.fit(lj.System(both), record, {"k": 3.0})
+    np.testing.assert_allclose(found.values, [4.0], rtol=1e-8)
+    assert np.isnan(found.start_sd[0][0]["b"]) and np.isfinite(found.start_sd[0][0]["a"])
+    assert "b(0)    0.5 (not determined)" in repr(found)
+    with pytest.raises(ValueError, match="(?s)asks for 'b'.*start of record 0 was read off what it measures, 'a'"):
+        lj.fit(lj.System(both), lj.Record(ts, q={"a": np.cos(2 * ts)}), {"k": 3.0})
+
+
+@pytest.mark.parametrize("wild", [0, 3, 6])
+def test_a_start_is_read_off_without_wild_values(wild):
+    """An outlier among the first seven samples hardly changes the position and velocity that are read off."""
+    t = 0.05 * np.arange(40.0)
+    x = 1.0 + 0.5 * t - 2.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=40)
+    x[wild] += 3.0
+    q, v = _parabola(t, x, np.arange(40))
+    assert abs(q - 1.0) < 0.01 and abs(v - 0.5) < 0.1
+    # Twin: least squares follow the outlier; a parabola through samples far apart keeps them all.
+    near = np.polynomial.Polynomial.fit(t[:7], x[:7], 2)
+    assert abs(near(0.0) - 1.0) > 0.1 or abs(near.deriv()(0.0) - 0.5) > 1.0
+    t, far = np.arange(7.0), np.cos(0.8 * np.arange(7.0))
+    near = np.polynomial.Polynomial.fit(t, far, 2)
+    np.testing.assert_allclose(_parabola(t, far, np.arange(7))[0], near(0.0))
+
+
+@pytest.mark.slow
+def test_unknowns_of_a_start_keep_to_the_constraints():
+    """A start satisfies the constraints for any unknowns and parameters."""
+    case = CASES["pendulum on a rod"]
+    p = problem(case, {"q": case.truth().q})
+    assert p.start.local.shape == (1, 2)
+    state = jax.jit(lambda u: p.setting(u.shared, u.local[0], 0, WHOLE)[2])
+    for own in ([0.3, -0.5], [-0.5, 1.0]):
+        u = Unknowns(jnp.array([2.4, 1.0]), jnp.array([own]))
+        q, v = state(u)
+        assert abs(q["x"] ** 2 + q["y"] ** 2 - 2.4**2) < 1e-12
+        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 1e-12
