@@ -67,6 +67,11 @@ def problem_of(
         replace(found.params, {name: values[r] for name, values in overrides.items()}) for r in range(len(records))
     ]
     guessed, unflatten, guess = starts(first, records, windows, params_of_records, options)
+    if not found.names and not guessed.q.along.shape[-1] + guessed.v.along.shape[-1]:
+        raise ValueError(
+            "nothing is left to find: no number of params is free, and every start is known.\n"
+            "Fix: free=... with the names of the numbers to find, or lj.Record(...) without hold_q and hold_v."
+        )
     system = traced_phases(system, guess)
     first, observe, options = system.first_phase, _traced(observe, guess), _with_traced_events(options, first, guess)
     measured = {kind: _gathered(windows, [record.measured[kind] for record in records], kind)

@@ -11,6 +11,7 @@ Q = np.cos(T)
 
 
 RECORD = lj.Record(T, q=Q)
+KNOWN = lj.Record(T, q=Q, q0=1.0, v0=0.0, hold_q=True, hold_v=True)
 
 
 @pytest.mark.parametrize(
@@ -30,6 +31,7 @@ RECORD = lj.Record(T, q=Q)
         ((RECORD, PENDULUM, {"optimiser": "adam"}), TypeError, "lj.fit_loss"),
         ((RECORD, PENDULUM, {"window": 0.01}), ValueError, "shorter than two intervals"),
         ((Q, PENDULUM, {}), TypeError, "lj.Record"),
+        ((KNOWN, PENDULUM, {"free": []}), ValueError, "nothing is left to find"),
         ((lj.Record(T, q={"theta": Q}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "was measured as"),
         ((lj.Record(T, v=Q), PENDULUM, {}), ValueError, "no guess of its start"),
         ((lj.Record(T, q=Q, v=Q), PENDULUM, {}), ValueError, "several kinds.*sigma"),
