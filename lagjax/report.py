@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from lagjax.integrate import Crossing, Trajectory
 from lagjax.system import System
 from lagjax.work_precision import WorkPrecision, in_ms, table, usual_others
-from lagjax.work_precision import work_precision as comparison
+from lagjax.work_precision import work_precision as compared
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
 JUDGED_AT = 1e-10
@@ -116,7 +116,7 @@ def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecis
     instead, by_hand = None, run.by_hand
     if others and by_hand is not None:
         instead = usual_others(lambda *state: by_hand(*state)[0], run.q0, run.v0, run.params, run.ts)
-    return comparison.work_precision(
+    return compared(
         run.system, run.q0, run.v0, run.params,
         ts=run.ts, events=run.events, error=run.error, others=instead, patience_with_others=PATIENCE, **settings,
     )  # fmt: skip

@@ -47,7 +47,8 @@ Traceback (most recent call last):
 def sections() -> dict[str, list[str]]:
     """The public names under the comments above their imports, in the order of `__all__`."""
     found, title = {}, ""
-    for line in INIT.read_text().splitlines():
+    on_one_line = re.sub(r"import \(([^)]*)\)", lambda names: "import " + " ".join(names[1].split()), INIT.read_text())
+    for line in on_one_line.splitlines():
         if re.match(r"\s*# (?!isort)", line) and not found.get("closed"):
             title = line.strip("# .")
         elif named := re.match(r"\s*from lagjax\S* import (.*)", line):

@@ -42,6 +42,8 @@ DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "lyapunov_exponents": (lambda system: lj.lyapunov_exponents(system, 1.0, 0.0, PARAMS, ts=TS), False),
     "work_precision": (lambda system: lj.work_precision(system, 1.0, 0.0, PARAMS, ts=TS), False),
     "fit": (lambda system: lj.fit(system, RECORD, PARAMS), True),
+    "fit_residuals": (lambda system: lj.fit_residuals(system, RECORD, PARAMS), True),
+    "fit_loss": (lambda system: lj.fit_loss(system, RECORD, PARAMS), True),
     "identifiability": (lambda system: lj.identifiability(system, RECORD, PARAMS), True),
 }  # fmt: skip
 NO_SYSTEMS = {
