@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 from lagjax.jaxtools.jaxpr_identity import Itself, content_of, meaning_of, rules_of, with_own_constants
 
@@ -57,7 +58,7 @@ def test_constants_of_inner_functions_become_its_own():
     inner = jax.jit(lambda x: x + TABLE)
     own = with_own_constants(jax.make_jaxpr(lambda x: 2 * inner(x))(1.0))
     assert any(np.array_equal(x, TABLE) for x in own.consts)
-    np.testing.assert_array_equal(jax.core.eval_jaxpr(own.jaxpr, own.consts, 1.0)[0], 2 * (1.0 + TABLE))
+    np.testing.assert_array_equal(jaxpr_as_fun(own)(1.0)[0], 2 * (1.0 + TABLE))
 
 
 def with_rule(slope):

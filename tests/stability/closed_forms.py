@@ -1,5 +1,7 @@
 """Whether a closed form is a motion: its rates are its velocities, and its accelerations those of the system."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,12 @@ import numpy as np
 import lagjax as lj
 
 STEP = 1e-3
+
+
+@partial(jax.jit, static_argnums=0)
+def accelerations(system, t, q, v, params):
+    """Those at several times."""
+    return jax.vmap(lambda *state: lj.accelerations(system, *state, params)[0])(t, q, v)
 
 
 def defect(system, exact, q0, v0, params, times):
@@ -20,5 +28,5 @@ def defect(system, exact, q0, v0, params, times):
     weights = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / (12 * STEP)
     rates = jax.tree.map(lambda x: np.einsum("k,tk...->t...", weights, x), states)
     q, v = jax.tree.map(lambda x: x[:, 2], states)
-    a = jax.jit(jax.vmap(lambda *state: lj.accelerations(system, *state, params)[0]))(np.asarray(times), q, v)
+    a = accelerations(system, np.asarray(times), q, v, params)
     return max(float(np.max(np.abs(x - y))) for x, y in zip(jax.tree.leaves(rates), jax.tree.leaves((v, a))))

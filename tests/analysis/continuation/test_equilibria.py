@@ -111,18 +111,6 @@ def test_closed_curve_and_folds_of_a_side_branch():
 # Printed results and messages.
 
 
-def test_what_is_drawn():
-    """Stable parts are solid, unstable dashed, the pitchfork is marked, axes are named; unknown names are refused."""
-    found = bead(1.0, 0.0, 8.0)
-    (axis,) = found.plot().axes
-    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
-    assert dashes == {"-", "--"} and axis.get_xlabel() == "omega" and axis.get_ylabel() == "q"
-    labels = axis.get_legend_handles_labels()[1]
-    assert {"stable", "unstable", "pitchfork"} <= set(labels)
-    with pytest.raises(ValueError, match="names no coordinate"):
-        found.plot("theta")
-
-
 def test_no_start_and_no_program():
     """Without an equilibrium there is no branch; and inside a compiled program its points cannot be counted."""
     with pytest.raises(ValueError, match="no equilibrium was found from the start"):

@@ -10,7 +10,7 @@ from lagjax.analysis.equilibria.result import NO_BALANCE, NOT_FINITE, NOT_LASTIN
 from lagjax.mechanisms import governor
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import TOP, UPRIGHT, about_z, conical, slowest_sleeping_spin, top
-from tests.systems import PARAMS, double_pendulum, pendulum, rod_pendulum
+from tests.systems import PARAMS, double_pendulum, pendulum
 
 BEAD = bead_on_hoop.PARAMS
 CHAIN = {"m1": 1.0, "m2": 2.0, "l1": 1.0, "l2": 0.5, "g": 9.8125}
@@ -230,22 +230,6 @@ def test_bad_input(settings, words):
     """Errors name what is wrong before anything is computed."""
     with pytest.raises(ValueError, match=words):
         lj.equilibria(pendulum, PARAMS, **settings)
-
-
-def test_what_is_printed():
-    """The table has one line for each equilibrium: state, multipliers, stability."""
-    found = lj.equilibria(rod_pendulum, PARAMS, starts=[{"x": 0.3, "y": -1.0}, {"x": 0.3, "y": 1.0}])
-    lines = repr(found).splitlines()
-    assert lines[0] == "Equilibria: 2 from 2 starts"
-    assert lines[1].split() == ["x", "y", "λ", "rod"]
-    assert lines[2].split() == ["0", "-1.25", "-3.925", "stable"] and lines[3].endswith("unstable")
-
-
-@pytest.mark.slow
-def test_a_batch():
-    """Under `vmap` nothing is merged, and the printed form shows the batch."""
-    found = jax.vmap(lambda g: lj.equilibria(pendulum, {"g": g, "l": 1.0}, starts=[0.1, 3.0, -3.0]))(jnp.ones(2))
-    assert found.found.shape == (2, 3) and found.found.all() and "a batch of 2 with 3 starts each" in repr(found)
 
 
 # Where a stiffness is zero, the first term that does not vanish decides.
