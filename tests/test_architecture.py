@@ -100,7 +100,8 @@ def handed_out(package):
     """The names that the `__init__` of a package imports or assigns."""
     tree = ast.parse((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())
     imported = [alias.asname or alias.name for x in tree.body if isinstance(x, ast.ImportFrom) for alias in x.names]
-    assigned = [target.id for x in tree.body if isinstance(x, ast.Assign) for target in x.targets]
+    targets = [target for x in tree.body if isinstance(x, ast.Assign) for target in x.targets]
+    assigned = [target.id for target in targets if isinstance(target, ast.Name)]
     return {*imported, *assigned}
 
 
