@@ -116,6 +116,11 @@ class HashablePart(NamedTuple):
         arrays = iter(arrays)
         return jtu.tree_unflatten(self.structure, [next(arrays) if x is ARRAY else x for x in self.leaves])
 
+    def in_place(self, arrays: Iterable) -> Any:
+        """The tree of the arrays alone, with None in place of the rest."""
+        arrays = iter(arrays)
+        return jtu.tree_unflatten(self.structure, [next(arrays) if x is ARRAY else None for x in self.leaves])
+
     def __reduce__(self):
         # Equinox puts a marker into the structure of its modules and recognises it by identity. A copied structure
         # would contain a copy of the marker, so the tree itself is copied instead.

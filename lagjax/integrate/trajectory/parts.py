@@ -66,4 +66,4 @@ class StaticPart(NamedTuple):
 def pack(problem: tuple, how: SolveInfo, integrate: Callable) -> tuple[PyTree, StaticPart]:
     """Split `problem` = (system, params, what was asked for) into arrays and a hashable rest."""
     arrays, rest = hashable_partition(problem)
-    return arrays, StaticPart(rest, how, integrate)
+    return rest.in_place(arrays), StaticPart(rest, how, integrate)

@@ -90,7 +90,7 @@ class Trajectory(eqx.Module):
         return self._problem()[2]
 
     def _problem(self):
-        return self.static.rest.combine(self.arrays)
+        return self.static.rest.combine(jax.tree.leaves(self.arrays))
 
     def rows(self) -> dict:
         """The fields with one row per output, by name."""

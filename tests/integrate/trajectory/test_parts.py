@@ -18,7 +18,7 @@ def test_arrays_and_a_hashable_rest():
     """Packed and combined it is the same; another number changes the arrays alone, another name the rest."""
     arrays, static = pack(problem(), HOW, max)
     assert jax.tree.leaves(arrays) == [9.81] and hash(static) == hash(pack(problem(1.62), HOW, max)[1])
-    system, params, asked = static.rest.combine(arrays)
+    system, params, asked = static.rest.combine(jax.tree.leaves(arrays))
     assert (system, params["name"], asked) == ("system", "steel", ASKED) and params["g"] == 9.81
     assert static == pack(problem(1.62), HOW, max)[1] != pack(problem(name="brass"), HOW, max)[1]
     assert static.method == "Dopri8" and static.integrate is max
