@@ -109,6 +109,9 @@ def past_the_door(name, source):
     """The imports of a module from other rooms that these do not hand out."""
     found = []
     for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names if alias.name.startswith("lagjax.")]
+            found += [module for module in modules if room(module) != room(name) and module != door(module)]
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("lagjax."):
             if room(node.module) != room(name) and (ROOT / room(node.module)).is_dir():
                 names = handed_out(node.module) if node.module == door(node.module) else set()
@@ -127,6 +130,7 @@ def test_the_check_of_doors_can_fail():
     inside = "from lagjax.system.model import Model"
     assert past_the_door("lagjax.fit.fit", inside) and not past_the_door("lagjax.system.system", inside)
     assert past_the_door("lagjax.fit.fit", "from lagjax.system import unknown_name")
+    assert past_the_door("lagjax.fit.fit", "import lagjax.system.model as model")
     assert not past_the_door("lagjax.fit.fit", "from lagjax.system import Model")
 
 

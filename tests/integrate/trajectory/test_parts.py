@@ -18,6 +18,8 @@ def test_arrays_and_a_hashable_rest():
     """Packed and combined it is the same; another number changes the arrays alone, another name the rest."""
     arrays, static = pack(problem(), HOW, max)
     assert jax.tree.leaves(arrays) == [9.81] and hash(static) == hash(pack(problem(1.62), HOW, max)[1])
+    # A sweep labels the parameters by their place.
+    assert arrays[1] == {"g": 9.81, "name": None}
     system, params, asked = static.rest.combine(jax.tree.leaves(arrays))
     assert (system, params["name"], asked) == ("system", "steel", ASKED) and params["g"] == 9.81
     assert static == pack(problem(1.62), HOW, max)[1] != pack(problem(name="brass"), HOW, max)[1]
