@@ -141,7 +141,7 @@ def fit_loss(system: System | Hybrid, records: Record | Sequence[Record], params
 
     **Returns:** a function of unknowns like that of `lj.fit_residuals`, to a number. `loss(unknowns, batch)` takes W/B
     times the windows with the indices `batch` (B,), which estimates the loss of all. Networks are trained with it, by
-    an optimiser of optax: [a recipe](learned.md#training).
+    an optimiser of optax: [a recipe](/learned.md#training).
 
     **Raises:** as `lj.fit_residuals`.
     """
