@@ -139,10 +139,8 @@ def positive_definite(
             "Fix: lj.learned.Network(..., out=n * (n + 1) // 2)."
         )
     sizes = jnp.broadcast_to(jnp.asarray(sizes, numbers.dtype), (n,))
-    x = numbers[:n]
-    root = jnp.sqrt(x**2 + 4)
-    # For a large negative x the sum would be only round-off. (`minimum` would have half a slope at 0.)
-    diagonal = jnp.where(x > 0, (x + root) / 2, 2 / (root - jnp.where(x > 0, 0.0, x)))
+    # (x + √(x² + 4))/2, without its cancellation at large negative x, and without a comparison: steps would end there.
+    diagonal = jnp.exp(jnp.arcsinh(numbers[:n] / 2))
     triangle = jnp.diag(diagonal).at[np.tril_indices(n, -1)].set(numbers[n:])
     scale = jnp.sqrt(sizes)
     return scale[:, None] * (floor * jnp.eye(n, dtype=numbers.dtype) + triangle @ triangle.T) * scale[None, :]

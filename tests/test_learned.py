@@ -33,6 +33,31 @@ def test_the_diagonal_is_the_formula():
     np.testing.assert_allclose(found, 2 / (x**2 + 4) ** 1.5, rtol=1e-6)
 
 
+def _explained(matrix):
+    """What `lj.explain` says of ½ v·M(q)·v - V(q) with a network in each, by the label of its line."""
+    one, other = jax.random.split(jax.random.key(0))
+    narrow = {"width": 6, "depth": 1}
+    params = {"mass": Network(jnp.ones(2), key=one, out=3, **narrow), "potential": Network(jnp.ones(2), key=other)}
+    system = lj.System(lambda t, q, v, p: 0.5 * v @ matrix(p["mass"](q), v) @ v - p["potential"](q))
+    return dict(lj.explain(system, 0.0, jnp.array([0.3, 0.2]), jnp.array([1.0, 0.0]), params).rows)
+
+
+def test_what_is_said_of_a_learned_mass_matrix():
+    """M(q) by `positive_definite` depends on q alone and has no jump, at which steps would end and derivatives wait."""
+    said = _explained(lambda numbers, v: positive_definite(numbers))
+    assert said["mass matrix"] == "positive definite, dense, depends on q[0], q[1]"
+    assert "jumps and kinks" not in said
+
+
+def test_what_is_said_of_one_that_sees_velocities():
+    """Twin: a matrix that depends on v is said to, and a diagonal made by a comparison is one."""
+    said = _explained(lambda numbers, v: positive_definite(numbers + 0.1 * v[0] ** 2))
+    assert said["mass matrix"].endswith("depends on q[0], q[1], velocities")
+    by_comparison = lambda numbers, v: jnp.diag(jnp.where(numbers[:2] > 0, 1 + numbers[:2], 1 / (1 - numbers[:2])))
+    said = _explained(by_comparison)
+    assert said["mass matrix"].endswith("depends on q[0], q[1]") and "comparison" in said["jumps and kinks"]
+
+
 def test_a_plain_square_becomes_singular():
     """Twin: with a free diagonal the mass matrix Λ Λᵀ of a training that passes zero has no inverse."""
     plain = lambda x: jnp.array([[x[0], 0.0], [x[2], x[1]]]) @ jnp.array([[x[0], x[2]], [0.0, x[1]]])
