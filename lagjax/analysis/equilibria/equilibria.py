@@ -322,6 +322,8 @@ def _from_valleys(steady: Steady, rows: EquilibriumRow, lost, unseen, search, si
         if x is not None:
             _put(q, i, coordinates.like(at, x.astype(steady.t.dtype)))
     again = search(q, jax.tree.map(np.zeros_like, q))
+    # A search that starts at a multiple root does not see how small the stiffness is there.
+    again = again._replace(soft=np.maximum(again.soft, rows.soft))
     reached = lost[again.found[lost]]
     return jax.tree.map(lambda old, new: _with(old, reached, new), rows, again)
 

@@ -192,7 +192,11 @@ def between(bordered, side: Side) -> np.ndarray:
     if not roots.size:
         return bordered.y
     _, y = reduced(bordered, np.full((1, 1), roots[np.argmin(np.abs(roots))]))
-    return y[0] if np.all(np.isfinite(y)) else bordered.y
+    y, n = y[0], bordered.steady.n
+    # A root at zero has no size that could say what is round-off there; the search has one.
+    if np.max(np.abs(y / bordered.columns)[:n]) < np.sqrt(np.finfo(bordered.steady.t.dtype).eps):
+        y = np.where(np.arange(y.size) < n, 0.0, y)
+    return y if np.all(np.isfinite(y)) else bordered.y
 
 
 def _nodes():
@@ -212,27 +216,33 @@ def nearest(steady: Steady, x, size: float, unseen: np.ndarray) -> np.ndarray | 
     bordered = bordered_at(steady, y, size, np.flatnonzero(unseen), CREEPS_BELOW)
     if bordered.right.shape[1] != 1 or bordered.left.shape[1] != 1:
         return None
-    s = 0.1 * _nodes()
-    b, _ = reduced(bordered, s[:, None])
-    if not np.all(np.isfinite(b)):
+    y = _multiple_root(bordered)
+    if y is None:
         return None
-    fitted = np.polynomial.Chebyshev.fit(s, b[:, 0], 16, domain=(-0.1, 0.1))
-    slope, curvature = fitted.deriv(), fitted.deriv(2)
-    root = 0.0
-    with np.errstate(all="ignore"):
-        # Schröder's iteration, which a multiple root does not slow down.
-        for _ in range(30):
-            value, first, second = fitted(root), slope(root), curvature(root)
-            step = value * first / (first**2 - value * second)
-            root = root - step if np.isfinite(step) else root
-    if abs(root) > 0.1:
-        return None
-    _, near = reduced(bordered, np.full((1, 1), root))
-    if not np.all(np.isfinite(near)):
-        return None
-    bordered = bordered_at(steady, near[0], size, np.flatnonzero(unseen))
+    bordered = bordered_at(steady, y, size, np.flatnonzero(unseen))
     if bordered.right.shape[1] != 1 or bordered.left.shape[1] != 1:
         return None
     amplitudes, b = reduced_force(bordered, size)
     term = first_term(amplitudes, b[SAMPLES // 2 :])
     return None if term is None else between(bordered, term)[: steady.n]
+
+
+def _multiple_root(bordered: Bordered) -> np.ndarray | None:
+    """The unknowns at the root of the reduced force nearest to amplitude zero; None beyond a tenth of the size.
+
+    At a k-fold root, b/b' = (s - s₀)/k + ... has a simple one, which is read off where b is larger than round-off.
+    """
+    s = 0.1 * _nodes()
+    b = reduced(bordered, s[:, None])[0][:, 0]
+    if not np.all(np.isfinite(b)):
+        return None
+    slope = np.polynomial.Chebyshev.fit(s, b, 16, domain=(-0.1, 0.1)).deriv()(s)
+    seen = (np.abs(b) > 1e-8 * np.max(np.abs(b))) & (slope != 0)
+    if np.sum(seen) < SAMPLES // 4:
+        return None
+    roots = np.polynomial.Chebyshev.fit(s[seen], b[seen] / slope[seen], 7, domain=(-0.1, 0.1)).roots()
+    roots = roots[(np.abs(roots.imag) <= 1e-3) & (np.abs(roots.real) <= 0.1)].real
+    if not roots.size:
+        return None
+    _, near = reduced(bordered, np.full((1, 1), roots[np.argmin(np.abs(roots))]))
+    return near[0] if np.all(np.isfinite(near)) else None

@@ -49,6 +49,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
 # diffrax has no message for a success, and equinox has no public way to set one.
 RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"
+# Its own advice, a larger max_steps, helps only if the motion is long; from inside a program nothing else can be said.
+RESULTS._index_to_message[int(RESULTS.max_steps_reached._value)] = (
+    "The maximum number of solver steps was reached: a long motion, a stiff one, or one that cannot go on. "
+    "lj.integrate outside of jit, vmap and grad tells which."
+)
 ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
 
 

@@ -30,7 +30,7 @@ def one_by_one(function: Callable) -> Callable:
 
     @wraps(function)
     def without_derivatives(*args):
-        return looped(*map(lax.stop_gradient, args))
+        return looped(*(lax.stop_gradient(jnp.asarray(x)) for x in args))
 
     return without_derivatives
 

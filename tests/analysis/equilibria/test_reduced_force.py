@@ -51,6 +51,29 @@ VALLEY = lj.System(
 FLAT = {"turn": 0.0, "k": 0.0, "bend": 0.0, "x4": 0.0, "y4": 0.0, "apart": 0.0}
 
 
+ON_A_LINE = lj.System(
+    lambda t, q, v, p: (
+        0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["x4"] * (q["x"] - p["at"]) ** 4 - p["x6"] * (q["x"] - p["at"]) ** 6
+        - p["weight"] * q["y"]
+    ),
+    {"line": lj.Holonomic(lambda t, q, p: q["y"] - p["at"])},
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_a_multiple_root_on_a_constraint(at):
+    """V = c (x - a)^k on a line, with and without weight across it: one rest, at a, stable exactly for c > 0."""
+    starts = [{"x": at + 0.3, "y": at}, {"x": at - 0.5, "y": at + 0.1}]
+    for x4, x6, stable in ((1.0, 0.0, True), (-1.0, 0.0, False), (0.0, 1.0, True), (0.0, -1.0, False)):
+        for weight in (0.0, 9.81):
+            params = {"x4": x4, "x6": x6, "weight": weight, "at": at}
+            found = lj.equilibria(ON_A_LINE, params, starts=starts)
+            assert words(found) == ["stable" if stable else "unstable"] and found.zero_modes.tolist() == [1]
+            np.testing.assert_allclose((found.q["x"][0], found.q["y"][0]), at, atol=1e-8)
+            np.testing.assert_allclose(found.multipliers["line"][0], weight, atol=1e-8)
+
+
 BESIDE = [{"x": 0.3, "y": 0.2}, {"x": -0.4, "y": 0.5}]
 
 

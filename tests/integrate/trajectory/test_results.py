@@ -36,3 +36,9 @@ def test_what_ended_well():
     lanes = jax.vmap(lambda code: ended_well(item(RESULTS.successful, code)))(codes)
     assert [name for name, well in zip(NAMES, lanes) if well] == good
     assert is_among(RESULTS.raised, [RESULTS.misfit, RESULTS.raised]) and not is_among(RESULTS.raised, [])
+
+
+def test_used_up_steps_have_a_next_thing_to_do():
+    """A program that used up its steps cannot say why; its message says where one learns it, without a guess."""
+    words = message(RESULTS.max_steps_reached)
+    assert "outside of jit, vmap and grad" in words and "Try increasing" not in words

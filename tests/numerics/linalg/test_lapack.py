@@ -57,3 +57,9 @@ def test_no_derivatives():
     """What is decomposed is held; twin: NumPy's function in JAX has the derivative."""
     size = lambda svd: jax.grad(lambda x: jnp.sum(svd(x)))(MATRICES[0])
     assert not size(lapack.singular_values).any() and size(lambda x: jnp.linalg.svd(x, compute_uv=False)).any()
+
+
+def test_outside_of_jit():
+    """Arrays of NumPy in lanes, outside of jit."""
+    found = jax.vmap(lapack.singular_values)(MATRICES)
+    np.testing.assert_allclose(found, np.linalg.svd(MATRICES, compute_uv=False), atol=1e-12)
