@@ -22,7 +22,7 @@ def one_by_one(function: Callable) -> Callable:
     @looped.def_vmap
     def _(size: int, batched: Sequence[bool], *args):
         def at(i: Array):
-            one_matrix = jax.tree.map(lambda x, is_batched: x[i] if is_batched else x, args, tuple(batched))
+            one_matrix = [jnp.asarray(x)[i] if is_batched else x for x, is_batched in zip(args, batched)]
             return looped(*one_matrix)
 
         found = lax.map(at, jnp.arange(size))
@@ -30,7 +30,7 @@ def one_by_one(function: Callable) -> Callable:
 
     @wraps(function)
     def without_derivatives(*args):
-        return looped(*(lax.stop_gradient(jnp.asarray(x)) for x in args))
+        return looped(*map(lax.stop_gradient, args))
 
     return without_derivatives
 
