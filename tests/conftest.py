@@ -33,6 +33,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing creates so many objects that garbage collection runs constantly: 1.3 of 17 s of a test, now 0.3.
 gc.set_threshold(50_000, 5, 5)
 
+# Tests of many files share programs, more than a user needs at a time; `room_for_programs` sets the bound here.
+PROGRAMS.most = 1_000
+
 # Each compiled program takes some fifty memory maps. Linux gives a process 65,530, and XLA crashes without one.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 # Two workers share the memory of a small machine.
@@ -90,6 +93,7 @@ def room_for_programs():
         return
     pages = lambda: int(SIZE.read_text().split()[1])
     if MAPS.read_bytes().count(b"\n") > MOST_MAPS or pages() > allowed[0]:
+        PROGRAMS.clear()
         jax.clear_caches()
         gc.collect()
         allowed[0] = pages() + MOST_PAGES // 2
