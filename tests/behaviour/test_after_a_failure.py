@@ -48,7 +48,7 @@ def test_bounces_that_accumulate():
     np.testing.assert_allclose(traj.q, [5.0, 0.0, 5.0 * (1 - 0.25)], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bounces_that_accumulate_in_lanes():
     """The same for lanes, under jit, and in a sweep."""
     run = lambda h: lj.integrate(zeno, h, 0.0, PARAMS, ts=TS, throw=False)

@@ -11,6 +11,7 @@ import pytest
 
 import lagjax as lj
 from tests.library_calls import batches_in, calls_in, text_of
+from tests.tiers import exhaustive_but
 
 COUNT, LANES = 18, 3
 # Seconds for a process, below those after which pytest ends a test (`faulthandler_timeout`).
@@ -133,7 +134,7 @@ def programs_of(script, folder, **environment):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plain", ["", "1"])
+@pytest.mark.parametrize("plain", exhaustive_but(("",), ("", "1")))
 def test_no_batches_from_python(plain, tmp_path):
     """Ledgers, sweeps, analysis called from Python: no program of the process has a batch, with `LAGJAX_PLAIN` too."""
     texts = programs_of(EAGER, tmp_path, LAGJAX_PLAIN=plain)

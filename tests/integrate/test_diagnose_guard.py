@@ -57,7 +57,7 @@ def two_phases(guard):
     return lj.Hybrid({"out": FREE, "back": FREE}, [switch])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_switch_is_named():
     """A root that becomes NaN in place of crossing, and a fall to -inf; twin: the line without the root, q(10) = -4."""
     with pytest.warns(

@@ -40,7 +40,7 @@ def test_exchange_of_stability():
     np.testing.assert_array_equal(other.stable[off], other.parameter[off] > EXCHANGE["c"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sleeping_top():
     """Two frequencies meet at ω_c = 2 √(M g l I1)/I3, where the sleeping top wakes, along the held spin."""
     start = UPRIGHT | {"spin": 12.0}

@@ -92,7 +92,7 @@ def test_cross_rails():
     assert above[0].stable.all() and above[0].q["R"].max() < 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_closed_curve_and_folds_of_a_side_branch():
     """A circle that crosses the first branch at both ends; a subcritical pitchfork whose branch folds at mu = -1/4."""
     one = lambda potential: lj.System(lambda t, q, v, p: 0.5 * v**2 - potential(q, p["mu"]))

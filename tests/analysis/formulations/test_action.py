@@ -50,7 +50,7 @@ def test_the_action_of_a_trajectory():
         lj.action(system, 1.0, params, 0.0, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_action_does_not_depend_on_the_outputs():
     """The brachistochrone's time from eleven outputs, steep at first; twin: in too few parts it is off, and says so."""
     g, y0 = 9.81, 1e-3

@@ -168,7 +168,7 @@ def test_what_cannot_be_estimated():
         orbit(ts, estimate_error="yes")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_chose_the_steps():
     """Outputs, tolerance, longest step or stability are named; and the number of evaluations."""
     said = lambda traj: next(line for line in repr(traj).splitlines() if "steps chosen by" in line)

@@ -26,7 +26,7 @@ def test_a_brake():
     np.testing.assert_allclose(braked(2.0, by=1.0), 1.5, rtol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_a_brake():
     """By the velocity, the edge and the strength, in both modes.
 
@@ -53,7 +53,7 @@ def test_more_derivatives_of_a_brake():
     np.testing.assert_allclose(jax.grad(jax.grad(braked))(2.0), 0.75, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wall_that_does_not_pull():
     """A spring with a damper that pushes only: the velocity afterwards is linear in that before.
 
@@ -124,7 +124,7 @@ def test_stick_and_slip():
     assert abs(traj.q[-1] - right(12.0, 1.0, 1.0)) > 1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_table():
     """A force from a table: as from the straight lines between its knots; derivative against a difference quotient."""
     knots, heights = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
@@ -139,7 +139,7 @@ def test_a_table():
     np.testing.assert_allclose(jax.grad(lambda p: end(p).q[-1])(1.0), quotient, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_many_numbers():
     """A gradient by thirty numbers, which replays the steps of each leg; twin: one more number than counted."""
     rubbed = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, force=lambda t, q, v, p: -jnp.sum(p) * jnp.sign(v))

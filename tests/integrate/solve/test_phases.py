@@ -33,7 +33,7 @@ def test_lanes_start_in_their_own_phases():
     np.testing.assert_array_equal(np.asarray(together.result._value)[2:], codes)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_by_number_and_by_name():
     """A number known before tracing is the name's; in a sweep it is an axis."""
     by = [run(0.0, start).multipliers["floor"][-1] for start in ("lying", 1, np.int64(1), jnp.asarray(1))]
