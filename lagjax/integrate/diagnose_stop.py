@@ -4,6 +4,7 @@ If steps collapse or `max_steps` is used up, some more steps are taken from wher
 is said only where one of these numbers shows it, and with the number; otherwise the facts stand alone:
 
 - The rate of progress at the end, not the average rate, tells how many steps are missing.
+- An eigenvalue of the mass matrix is below zero at the end or just beyond it (`lagjax/mechanics/indefinite_mass.py`).
 - Velocities or accelerations that have grown a millionfold, or that grow while steps shrink, approach a singularity.
 - Steps are rejected at jumps and kinks of forces, where these are read off their programs and `jumps="ignored"`.
 - Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the
@@ -34,7 +35,14 @@ from lagjax.integrate.trajectory.error_report import of_a_step
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import jitted
-from lagjax.mechanics import describe, equations_of, explain_failure, unreachable_ahead
+from lagjax.mechanics import (
+    IndefiniteMass,
+    describe,
+    equations_of,
+    explain_failure,
+    indefinite_mass,
+    unreachable_ahead,
+)
 from lagjax.system import Model, State, coordinates
 
 # The number of steps that are examined, and the first of these, which only find their length.
@@ -86,17 +94,24 @@ def stopped_early(trajectory: Trajectory, settings: Settings, guards: str = "") 
         f"the integration stopped at t = {float(end.t):.9g}, {share:.3g} % of the way to {t1:.6g}, after "
         f"{accepted} accepted and {rejected} rejected steps"
     )
-    reason = explain_failure(trajectory.model, State(end.t, end.q, end.v, trajectory.params))
-    if reason := reason or unreachable_ahead(trajectory):
+    first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+    last = State(end.t, end.q, end.v, trajectory.params)
+    mass = indefinite_mass(trajectory.model, State(*first, trajectory.params), last)
+    reason = None if mass and mass.crossed else explain_failure(trajectory.model, last) or unreachable_ahead(trajectory)
+    if reason:
         return f"{what}: {reason}"
-    last = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
+    shown = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
     if bool(trajectory.result == RESULTS.max_steps_reached):
-        return f"{what}: max_steps = {settings.max_steps} is used up. {last} " + _used_up(trajectory, settings, guards)
-    said = f"{what}: {RESULTS[trajectory.result]} {last}"
+        return f"{what}: max_steps = {settings.max_steps} is used up. {shown} " + _used_up(
+            trajectory, settings, guards, mass
+        )
+    said = f"{what}: {RESULTS[trajectory.result]} {shown}"
+    if mass and mass.crossed:
+        return _with_cause(said, mass[:2])
     if settings.controller is not None:
         return f"{said}\nFix: {_of_controller(trajectory, settings)}."
     steps, path = last_steps(trajectory, settings), _Path(trajectory)
-    found = _singularity(path, steps) or _jump(trajectory, settings, steps) or _undefined(path, steps)
+    found = _singularity(path, steps, mass) or _jump(trajectory, settings, steps) or _undefined(path, steps)
     if found:
         return _with_cause(said, found)
     return (
@@ -110,7 +125,7 @@ def _with_cause(said: str, found):
     return f"{said}\nCause: {cause}." + (f"\nFix: {fix}." if fix else "")
 
 
-def _used_up(trajectory: Trajectory, settings: Settings, guards: str):
+def _used_up(trajectory: Trajectory, settings: Settings, guards: str, mass: IndefiniteMass | None):
     """The rate of progress, what keeps the steps short, and what to do."""
     end, taken = trajectory.end, int(trajectory.stats["num_steps"])
     if settings.controller is not None or not taken:
@@ -124,7 +139,9 @@ def _used_up(trajectory: Trajectory, settings: Settings, guards: str):
             return said
         method = method_of(settings, trajectory.model)
         implicit = isinstance(method, diffrax.AbstractImplicitSolver)
-        found = _singularity(path, steps) or _jump(trajectory, settings, steps) or _fast(path, steps, implicit)
+        crossed = mass[:2] if mass and mass.crossed else None
+        found = crossed or _singularity(path, steps, mass) or _jump(trajectory, settings, steps)
+        found = found or _fast(path, steps, implicit)
         facts = "" if found else f" {rejected} of the next {len(steps.h)} were rejected. {path.largest(steps)}"
         otherwise = "a looser rtol and atol"
     if not missing < TOO_MANY:
@@ -269,7 +286,7 @@ def _jacobian(model: Model, t, y: PyTree):
     return jax.jacfwd(rates)(jnp.concatenate(model.vectors(*y)))
 
 
-def _singularity(path: _Path, steps: Steps):
+def _singularity(path: _Path, steps: Steps, mass: IndefiniteMass | None):
     """Velocities or accelerations that have grown without bound, or that grow while steps shrink."""
     kept = steps.kept if steps.kept.size else np.array([0])
 
@@ -285,6 +302,8 @@ def _singularity(path: _Path, steps: Steps):
     blown_up = [np.max(x) > many * usual > 0 for x, many, usual in zip(last, BLOWN_UP, path.usual)]
     if not (any(blown_up) or shrinks and any(grows)):
         return None
+    if mass is not None:
+        return mass[:2]
     if shrinks:
         # Steps in a geometric series converge to its limit.
         ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
