@@ -22,6 +22,7 @@ from lagjax.mechanics import (
     equations_of,
     examined,
     explain_failure,
+    has_networks,
     is_free_of_velocities,
     listed,
     structure,
@@ -220,9 +221,13 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         rows += [("jumps and kinks", "; ".join(words))] if (words := jumps.in_words()) else []
         rows += [("not followed", "; ".join(jumps.missed))] if jumps.missed else []
     rows.append(("solved", _how_solved(equations_of(model, fast=True), found_structure)))
+    networks = has_networks(model)
+    loose = ", by Tsit5 at rtol of 1e-6 and above" if networks else ""
     if is_free_of_velocities(model):
         by = type(nystrom_for(model)).__name__
-        rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}"))
+        rows.append(("velocities", f"accelerations do not depend on them: stepped by {by}{loose}"))
+    elif networks:
+        rows.append(("network", f"stepped by Dopri8{loose}"))
     if problem:
         rows.append(("problem", problem.replace("\n", "\n    ")))
     return Explanation(

@@ -17,6 +17,8 @@ from lagjax.mechanics import departures
 from lagjax.system import Model, State, coordinates, warn
 
 # Tolerances that each dtype reaches with a margin.
+# From here on, with a network in L, Tsit5 takes less time than methods of higher order (`benchmarks/learned/loose.py`).
+LOOSE = 1e-6
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 # The prefix with which a user writes a method, by the package that defines it.
 PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
@@ -60,6 +62,17 @@ def check_jumps(jumps: Any) -> str:
             'Fix: leave jumps out (they are found), or jumps="ignored".'
         )
     return jumps
+
+
+def check_outputs(outputs: Any) -> str:
+    """Return `outputs`; raise unless it is one of its two values."""
+    if not isinstance(outputs, str) or outputs not in ("exact", "interpolated"):
+        raise ValueError(
+            f"outputs must be 'exact' or 'interpolated', not {outputs!r:.60}.\n"
+            "Usual cause: the times of outputs, which are ts=.\n"
+            'Fix: leave outputs out (they are ends of steps), or outputs="interpolated".'
+        )
+    return outputs
 
 
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
@@ -241,6 +254,13 @@ def tolerance(value: Any, name: str, dtype: np.dtype):
     if is_traced(value):
         return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
     return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
+
+
+def is_loose(rtol: Any, dtype: np.dtype) -> bool:
+    """Whether tolerances, as `tolerance` returns them, suit a method of low order; traced ones count as the default."""
+    if is_traced(rtol):
+        return DEFAULT_TOLERANCE.get(np.dtype(dtype), 1e-2) >= LOOSE
+    return bool(np.min(rtol) >= (1 - 1e-6) * LOOSE)
 
 
 @once

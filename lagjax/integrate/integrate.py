@@ -59,6 +59,7 @@ def integrate(
     drift: str | None = None,
     estimate_error: bool | None = None,
     start: str | ArrayLike | None = None,
+    outputs: str = "exact",
 ) -> Trajectory:
     """Integrate Lagrange's equations from (q0, v0) at `ts[0]`, with outputs at `ts`.
 
@@ -77,7 +78,7 @@ def integrate(
       constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
-      method, not an interpolation. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
+      method, unless `outputs` says otherwise. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
       by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
       (`lagjax/integrate/stepping/tolerances.py`): at a zero crossing by its size at the end of the step, at rest by
@@ -88,8 +89,10 @@ def integrate(
     **Other arguments:**
 
     - `method`: any diffrax solver. By default `lj.Nystrom12()` if there are no constraints and accelerations do not
-      depend on velocities (`lj.explain` says so), `lj.Nystrom8()` if L has a network in it, else `lj.Dopri8()`: the
-      fastest way to an error between 1e-4 and 1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`).
+      depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
+      1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With a network (an array of 64 numbers or
+      more, and of two axes or more, among the parameters) it is `lj.Tsit5()` for rtol of 1e-6 and above, constraints
+      or not, and below that `lj.Nystrom8()` in place of `lj.Nystrom12()`; a traced `rtol` counts as the default one.
       With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, as they
       also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours; diffrax's other methods take 2
       to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast, and
@@ -125,6 +128,11 @@ def integrate(
     - `start`: the phase of a `Hybrid` in which the motion starts, its name or its number in the order of the phases; by
       default the first one. A number may be traced, so that each lane of a `vmap`, or each point of a sweep over
       numbers, starts in its own phase.
+    - `outputs`: "exact" makes each output the end of a step, which costs little up to about as many outputs as there
+      would be steps. Beyond that, "interpolated" steps over them by `lj.Tsit5()`, and takes them from the polynomial of
+      order 5 through q, v and a at both ends of a step, returned to the constraints. No tolerance controls its error,
+      but that is about as large as the errors of steps for rtol of 1e-3 to 1e-6
+      (`tests/behaviour/test_interpolated_outputs.py`). In reverse mode with `events` outputs are exact.
     - `drift`: `"project"` (return to the constraints after every step; the default if there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 
@@ -165,13 +173,14 @@ def integrate(
         guards = guards_of(crossings, system, state) if crossings else None
     drift = arguments.check_drift(drift, any(phase.constraints for phase in system.phases))
     arguments.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
+    relative = arguments.tolerance(rtol, "rtol", dtype)
     settings = Settings(
         method=method,
         controller=stepsize_controller,
         event=left,
         adjoint=None if isinstance(adjoint, Replay) else adjoint,
         memory=adjoint.memory if isinstance(adjoint, Replay) else None,
-        rtol=arguments.tolerance(rtol, "rtol", dtype),
+        rtol=relative,
         atol=arguments.tolerance(rtol if atol is None else atol, "rtol" if atol is None else "atol", dtype),
         by_size=atol is None,
         dt0=arguments.step_length(dt0, "dt0", dtype),
@@ -182,6 +191,8 @@ def integrate(
         drift=drift,
         progress=progress,
         jumps=arguments.check_jumps(jumps),
+        outputs=arguments.check_outputs(outputs),
+        loose=arguments.is_loose(relative, dtype),
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )

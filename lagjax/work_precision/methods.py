@@ -6,9 +6,9 @@ from typing import Any
 import diffrax
 import numpy as np
 
-from lagjax.integrate import ROUND_OFFS, arguments
+from lagjax.integrate import ROUND_OFFS, arguments, nystrom_for
 from lagjax.mechanics import is_free_of_velocities
-from lagjax.numerics import Dopri8, Nystrom, Nystrom12, Tsit5
+from lagjax.numerics import Dopri8, Nystrom, Tsit5
 from lagjax.system import State, System, model_of
 
 # From too loose for high orders to show, to where round-off dominates.
@@ -24,7 +24,11 @@ FIX = 'methods={"Dopri8": lj.Dopri8(), "Tsit5": lj.Tsit5()}, or leave it out'
 def usual(system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
     """The explicit methods that suit a system, starting with the default of `integrate`."""
     by_stages: dict[str, diffrax.AbstractSolver] = {"Dopri8": Dopri8(), "Tsit5": Tsit5()}
-    return ({"Nystrom12": Nystrom12()} if is_free_of_velocities(model_of(system, *start)) else {}) | by_stages
+    model = model_of(system, *start)
+    if not is_free_of_velocities(model):
+        return by_stages
+    default = nystrom_for(model)
+    return {type(default).__name__: default} | by_stages
 
 
 def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.AbstractSolver]:

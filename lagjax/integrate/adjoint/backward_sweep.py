@@ -19,7 +19,14 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Int, PyTree
 
-from lagjax.integrate.adjoint.step_record import Recorded, RecordRows, StepProblem, StepRecord, recorded_again
+from lagjax.integrate.adjoint.step_record import (
+    Recorded,
+    RecordRows,
+    StepProblem,
+    StepRecord,
+    outputs_within,
+    recorded_again,
+)
 from lagjax.integrate.stepping.projected_solver import ProjectedSolver
 from lagjax.jaxtools import PRODUCT, length, like
 from lagjax.numerics import ExplicitRungeKutta, Nystrom, evaluations_a_step
@@ -216,22 +223,38 @@ class _Way:
         of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
         return of(self.leaves[ends], t, ct)
 
-    def pulled(self, t0: Array, t1: Array, y: PyTree, ct):
-        """The cotangents of the arrays, of both times (None if not wanted) and of the state at a step's start."""
+    def pulled(self, t0: Array, t1: Array, y: PyTree, ct, of_outputs):
+        """The cotangents of the arrays, of both times (None if not wanted) and of the state at a step's start.
+
+        `of_outputs`: the cotangents of outputs inside the step and elsewhere; None if outputs are ends of steps.
+        """
         leaves = [self.safe(x) if self.is_lane(i) else x for i, x in enumerate(self.leaves)]
         chosen = [leaves[i] for i in self.moved]
         start = (chosen, t0, t1, y) if self.of_times else (chosen, y)
 
         def end(by, chosen, *start):
             start = start if self.of_times else (t0, t1, *start)
-            step = self.each(lambda problem, *start: by(self.copied(problem.solver, *start), *start), 3)
-            return step(*filled(leaves, self.moved, chosen), *start)
+            step = self.each(partial(ended, by), 4)
+            return step(*filled(leaves, self.moved, chosen), *start, of_outputs)
 
-        _, pull, valid = jax.vjp(partial(end, ProjectedSolver.again), *start, has_aux=True)
+        def ended(by, problem: StepProblem, t0: Array, t1: Array, y: PyTree, of_outputs):
+            (y1, rates), valid = by(self.copied(problem.solver, t0, t1, y), t0, t1, y)
+            if rates is None:
+                return (y1, None), valid
+            inside, states = outputs_within(problem, t0, t1, y, y1, *rates)
+            of_inside = jax.tree.map(
+                lambda x, ct: jnp.sum(x * jnp.where(like(inside, ct), ct, 0.0)), states, of_outputs
+            )
+            return (y1, sum(jtu.tree_leaves(of_inside))), valid
+
+        (_, weighed), pull, valid = jax.vjp(partial(end, ProjectedSolver.again), *start, has_aux=True)
+        ct = ct, None if weighed is None else jnp.ones_like(weighed)
         if self.motion.robust:
             # Choose between pulls, not between ends: the derivative of an invalid end is NaN, and zero times it too.
             robustly = partial(end, ProjectedSolver.again_robustly)
-            pull = partial(lax.cond, eqxi.unvmap_all(valid), pull, lambda ct: jax.vjp(robustly, *start)[1](ct))
+            pull = partial(
+                lax.cond, eqxi.unvmap_all(valid), pull, lambda ct: jax.vjp(robustly, *start, has_aux=True)[1](ct)
+            )
         of_arrays, *of_start = pull(ct)
         return (of_arrays, *of_start) if self.of_times else (of_arrays, None, None, *of_start)
 
@@ -256,15 +279,20 @@ class _Way:
         on = self.is_on(s)
         t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
         here = on & (t1 > t0)
-        output = jnp.maximum(s.output, 0)
-        time = self.at(self.ts, output)
-        hit = here & (s.output >= 0) & (time > t0) & (time <= t1)
 
         def only(condition: Callable, tree: PyTree):
             return jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
 
-        ct = jax.tree.map(jnp.add, s.y, only(hit, self.at(self.of_outputs, output)))
-        of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct))
+        ct, output, inside = s.y, s.output, None
+        if self.motion.static.solver.between:
+            inside = only(here, self.of_outputs)
+        else:
+            at = jnp.maximum(output, 0)
+            time = self.at(self.ts, at)
+            hit = here & (output >= 0) & (time > t0) & (time <= t1)
+            ct = jax.tree.map(jnp.add, ct, only(hit, self.at(self.of_outputs, at)))
+            output = jnp.where(hit, self.at(self.first, at - 1), output)
+        of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct), inside)
         total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
         if self.of_times:
             first, ends = here & (s.k == 0), self.where.controller.ts
@@ -272,9 +300,7 @@ class _Way:
             total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
             total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
         y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
-        return BackwardSweep(
-            s.k - on, s.number, s.rows, y, total, jnp.where(hit, self.at(self.first, output - 1), s.output)
-        )
+        return BackwardSweep(s.k - on, s.number, s.rows, y, total, output)
 
     def piece(self, s: BackwardSweep) -> BackwardSweep:
         """Pull back one piece."""

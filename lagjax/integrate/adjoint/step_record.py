@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.stepping.projected_solver import ProjectedSolver
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs
 from lagjax.jaxtools import like, where
+from lagjax.numerics import Quintic
 
 # A row of a pendulum takes 40 bytes: in a thousand lanes the rows take 20 MB.
 ROWS = 512
@@ -240,11 +241,16 @@ def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
 
     def turn(run: _RecordRun) -> _RecordRun:
         here, place, row = continues(run), run.place, run.accepted % p.room.rows
-        further, keep, result = _step(p, place)
+        further, keep, result, dense = _step(p, place)
         # A rejected step is overwritten by the next one.
         rows = jax.tree.map(lambda all, x: _put(all, row, x, here), run.rows, RecordRows(place.t, place.t1, place.y))
         outputs, saved = run.outputs, run.saved
-        if outputs is not None:
+        if outputs is not None and p.solver.between:
+            inside, states = outputs_within(p, place.t, place.t1, **dense)
+            hit = here & keep & inside
+            outputs = jax.tree.map(lambda all, x: jnp.where(like(hit, x), x, all), outputs, states)
+            saved = jnp.where(here & keep, jnp.sum(p.ts <= place.t1, dtype=saved.dtype), saved)
+        elif outputs is not None:
             i = jnp.minimum(saved, p.ts.size - 1)
             hit = here & keep & (saved < p.ts.size) & (place.t1 >= p.ts[i])
             outputs = jax.tree.map(lambda all, x: _put(all, i, x, hit), outputs, further.y)
@@ -256,9 +262,9 @@ def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
 
 
 def _step(p: StepProblem, place: RecordPlace):
-    """One more attempt of a step: the next place, whether the step was accepted, and its result."""
+    """One more attempt of a step: the next place, whether the step was accepted, its result, its dense output."""
     order, results = p.solver.error_order(p.terms), diffrax.RESULTS
-    y, error, _, solver_state, solved = p.solver.step(
+    y, error, dense, solver_state, solved = p.solver.step(
         p.terms, place.t, place.t1, place.y, p.args, place.solver_state, False
     )
     error = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
@@ -271,7 +277,14 @@ def _step(p: StepProblem, place: RecordPlace):
     y, solver_state = where(keep, (y, solver_state), (place.y, place.solver_state))
     solved = results.where(keep, solved, results.successful)
     result = results.where(diffrax.is_okay(solved), judged, solved)
-    return RecordPlace(t, t1, y, solver_state, controller_state), keep, result
+    return RecordPlace(t, t1, y, solver_state, controller_state), keep, result, dense
+
+
+def outputs_within(p: StepProblem, t0: Array, t1: Array, y0: PyTree, y1: PyTree, a0: PyTree, a1: PyTree):
+    """Which outputs lie in a step, and the states there, between its ends; elsewhere the state at its end."""
+    inside = (p.ts > t0) & (p.ts <= t1)
+    between = Quintic(t0=t0, t1=t1, y0=y0, y1=y1, a0=a0, a1=a1)
+    return inside, jax.vmap(between.at)(jnp.where(inside, p.ts, t1))
 
 
 def _put(all, i, x, here):

@@ -253,6 +253,8 @@ def _loop_twice(
     """The same in reverse mode, where diffrax differentiates only outputs: crossings, once their times are known,
     become outputs."""
     first = _loop(*stop_gradient((equations, start, ts, guards, settings)), diffrax.ForwardMode())
+    # Crossings must be ends of steps, and so are then the outputs among them.
+    settings = replace(settings, outputs="exact")
     end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
     times = jnp.concatenate([ts, first.located.t])
     times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
@@ -286,6 +288,10 @@ def _outputs(equations: Equations, start: Start, solution: Solution, ts: Array, 
     # Outputs not reached get the start state and are masked afterwards: NaN times zero would poison gradients.
     reached = jnp.isfinite(solution.reached) & ~start.refused
     states = jax.tree.map(lambda x, x0: jnp.where(like(reached, x), x, x0[None]), solution.outputs, (start.q, start.v))
+    if settings.outputs == "interpolated" and settings.drift == "project":
+        # Between states that satisfy the constraints a polynomial is off them by about its error.
+        tolerances = settings.rtol, settings.atol
+        states = jax.vmap(lambda t, q, v: returned(equations, t, q, v, *tolerances)[:2])(ts, *states)
     if settings.jump_ts is not None:
         states = apart_from_jumps(equations, ts, settings.jump_ts, *states)
     # One compiled evaluation for the outputs and the end together.
@@ -416,6 +422,7 @@ def _solver(equations: Equations, fast, feedback, refused, settings: Settings, a
         controlled=settings.controller is None,
         project=settings.drift == "project",
         arriving=_arriving(settings),
+        between=settings.outputs == "interpolated",
         jump_ts=settings.jump_ts,
     )
 
@@ -451,10 +458,12 @@ def _controller(equations: Equations, ts: Array, settings: Settings, scales, bar
     if not bare and (scales is not None or settings.apart or any(angle)):
         controller = PerCoordinateTolerance(controller, Tolerances(settings.rtol, settings.atol), scales, angle)
     arriving = _arriving(settings) and not bare
+    # Where no output is the end of a step.
+    ends = ts if arriving and settings.outputs == "exact" else ts[np.array([0, -1])]
     if settings.jump_ts is None and not repeated:
-        return StepToOutputs(controller, ts, settings.shares) if arriving else controller
+        return StepToOutputs(controller, ends, settings.shares) if arriving else controller
     jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
-    return StepToOutputs(controller, together(ts if arriving else ts[np.array([0, -1])], jumps), settings.shares)
+    return StepToOutputs(controller, together(ends, jumps), settings.shares)
 
 
 def resolution(ts: Array):

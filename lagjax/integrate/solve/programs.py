@@ -46,7 +46,7 @@ from lagjax.jaxtools import (
     takes_for_regular,
 )
 from lagjax.mechanics import has_networks, is_free_of_velocities
-from lagjax.numerics import Dopri8, Nystrom, Nystrom8, Nystrom12, evaluations_a_step, in_our_form
+from lagjax.numerics import Dopri8, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
 from lagjax.system import Model, State, System, model_of
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
@@ -145,7 +145,9 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     start = State(ts[0], q0, v0, params)
     model = model_of(system, *start)
     s, method = settings, method_of(settings, model)
-    asked = SolveOptions(s.method, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
+    # What the tolerance chose is no longer known where the motion is continued.
+    chosen = method if s.method is None and isinstance(method, Tsit5) else s.method
+    asked = SolveOptions(chosen, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
@@ -204,6 +206,7 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
 
 def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    name += ", outputs interpolated" if settings.outputs == "interpolated" else ""
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
     # With many short legs the number of steps does not tell what chose them.
@@ -214,6 +217,17 @@ def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):
 def method_of(settings: Settings, model: Model):
     """Return the method asked for, raising if it cannot do it; by default the fastest that can."""
     chosen = settings.method
+    if settings.outputs == "interpolated":
+        chosen = Tsit5() if chosen is None else chosen
+        if not isinstance(chosen, Tsit5 | diffrax.Tsit5):
+            raise ValueError(
+                'outputs="interpolated" takes outputs from polynomials of order 5, which '
+                f"{type(chosen).__name__} does not go with: its steps are too long, or it has no acceleration at their "
+                "ends.\n"
+                "Fix: method=lj.Tsit5(), or leave method out: it is then chosen."
+            )
+    if chosen is None and settings.loose and has_networks(model):
+        return Tsit5()
     if chosen is None:
         # BacksolveAdjoint integrates a state that is not a pair (q, v).
         pairs = not isinstance(settings.adjoint, diffrax.BacksolveAdjoint)

@@ -22,7 +22,7 @@ from lagjax.integrate.stepping.step_to_outputs import between_jumps
 from lagjax.integrate.stepping.tolerances import Tolerances
 from lagjax.jaxtools import kept_as_call
 from lagjax.mechanics import Equations, all_finite, to_manifold
-from lagjax.numerics import Interpolation, Radau5
+from lagjax.numerics import Interpolation, Quintic, Radau5
 
 # Without projection a state drifts off its constraints, and dependent ones then disagree by that much.
 DEPENDENT_BELOW_WHILE_DRIFTING = 1e-3
@@ -63,8 +63,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     """Wrap `solver`: project after each step (if `project`), and compute dense output by steps.
 
     A step that cannot be returned to the constraints is rejected; with fixed steps the solve ends there. `controlled`:
-    the tolerances choose the steps. `arriving`: outputs are wanted only at the ends of steps. The controller makes
-    steps end at `jump_ts`; here each step is kept on its side of them.
+    the tolerances choose the steps. `arriving`: outputs are wanted only at the ends of steps; `between`: inside them,
+    from a polynomial. The controller makes steps end at `jump_ts`; here each step is kept on its side of them.
 
     The solver holds the equations, since diffrax gives an interpolation only times and states; `fast`: the same method,
     for steps with the written-out equations. `feedback`: the rate of Baumgarte's feedback. If `refused`, and if a step
@@ -81,6 +81,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     controlled: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     arriving: bool = eqx.field(static=True)
+    between: bool = eqx.field(static=True)
     jump_ts: Float[Array, " J"] | None = None
 
     @property
@@ -118,7 +119,9 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         """The vector field by the written-out equations."""
         return diffrax.ODETerm(FastField(self.equations))
 
-    def _between(self, *, t0: Array, t1: Array, y0: PyTree, y1: PyTree = None, state=None):
+    def _between(self, *, t0: Array, t1: Array, y0: PyTree, y1: PyTree = None, state=None, a0=None, a1=None):
+        if self.between:
+            return Quintic(t0=t0, t1=t1, y0=y0, y1=y1, a0=a0, a1=a1)
         if self.arriving:
             return Arrived(t0=t0, t1=t1, y0=y0, y1=y1)
         return SteppedTo(t0=t0, t1=t1, y0=y0, state=state, solver=self)
@@ -152,14 +155,16 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         if self.jump_ts is not None:
             t0, t1, made_jump = between_jumps(t0, t1, self.jump_ts, made_jump)
         if self.fast is None:
-            y1, error, solver_state, result = self._robust_step(t0, t1, y0, solver_state, made_jump)
+            y1, error, rates, solver_state, result = self._robust_step(t0, t1, y0, solver_state, made_jump)
         else:
-            y1, error, solver_state, result = self._fast_step(t0, t1, y0, solver_state, made_jump)
+            y1, error, rates, solver_state, result = self._fast_step(t0, t1, y0, solver_state, made_jump)
         # An infinite state would make its error relative to it zero.
         failed = self.refused | ~all_finite((y1, error))
         y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
         error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
+        if self.between:
+            return y1, error, {"y0": y0, "y1": y1, "a0": rates[0], "a1": rates[1]}, solver_state, result
         if self.arriving:
             return y1, error, {"y0": y0, "y1": y1}, solver_state, result
         # Newton's iteration for an output starts from the polynomial of the step around it.
@@ -172,19 +177,20 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         fast, terms = self.fast, self.fast_terms
         assert fast is not None
         jumped = True if self.project else made_jump
-        y1, error, _, solver_state, result = fast.step(terms, t0, t1, y0, None, solver_state, jumped)
+        y1, error, dense, solver_state, result = fast.step(terms, t0, t1, y0, None, solver_state, jumped)
+        rates = self._rates(dense, t1 - t0)
         if self.project:
             y1 = self.equations.projected(t1, *y1)
         if not self.equations.fallback:
-            return y1, error, solver_state, result
+            return y1, error, rates, solver_state, result
         valid = all_finite((y1, error))
 
         def again():
-            y1, error, _, result = self._robust_step(t0, t1, y0, None, True)
-            return y1, error, fast.init(terms, t1, t1, y1, None), result
+            y1, error, rates, _, result = self._robust_step(t0, t1, y0, None, True)
+            return y1, error, rates, fast.init(terms, t1, t1, y1, None), result
 
         # A branch also in a batch, where all lanes take it or none.
-        return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, solver_state, result), again)
+        return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, rates, solver_state, result), again)
 
     def _robust_step(self, t0: Array, t1: Array, y0: PyTree, solver_state: PyTree, made_jump: Any):
         # The projection moves the state, so a derivative kept from the last step's end is stale.
@@ -192,29 +198,41 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         terms, stages = self.terms, self._stages(t0, y0)
         if solver_state is None:
             solver_state = self.solver.init(terms, t0, t1, y0, stages)
-        y1, error, _, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
+        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
+        rates = self._rates(dense, t1 - t0)
         if self.project:
             projected = to_manifold(self.equations, t1, *y1, *self.tolerances)
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
-        return y1, error, solver_state, result
+        return y1, error, rates, solver_state, result
+
+    def _rates(self, dense: dict, h: Array):
+        """The accelerations at both ends of a step, which are its first and last stages; None if not needed."""
+        if not self.between:
+            return None
+        step = jnp.where(h == 0, 1.0, h)
+        return tuple(jtu.tree_map(lambda k, i=i: k[i] / step, dense["k"][1]) for i in (0, -1))
 
     def again(self, t0: Array, t1: Array, y0: PyTree):
-        """Repeat an accepted step from its start, fast if possible; return its end, and whether that is finite."""
+        """Repeat an accepted step from its start, fast if possible.
+
+        Return its end and the accelerations at both ends (None if not `between`), and whether that is finite.
+        """
         if self.fast is None:
-            return self.again_robustly(t0, t1, y0), jnp.asarray(True)
+            return self.again_robustly(t0, t1, y0)
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
-        y1, error, *_ = self.fast.step(self.fast_terms, t0, t1, y0, None, None, True)
+        y1, error, dense, *_ = self.fast.step(self.fast_terms, t0, t1, y0, None, None, True)
         y1 = self.equations.projected(t1, *y1) if self.project else y1
-        return y1, all_finite((y1, error))
+        return (y1, self._rates(dense, t1 - t0)), all_finite((y1, error))
 
     def again_robustly(self, t0: Array, t1: Array, y0: PyTree):
-        """Repeat an accepted step with the robust solve; return its end."""
+        """The same with the robust solve."""
         if self.jump_ts is not None:
             t0, t1, _ = between_jumps(t0, t1, self.jump_ts, True)
-        return self._robust_step(t0, t1, y0, None, True)[0]
+        y1, _, rates, *_ = self._robust_step(t0, t1, y0, None, True)
+        return (y1, rates), jnp.asarray(True)
 
     def rates(self, t: Array, y: PyTree):
         """The accelerations, and the multipliers by name."""
@@ -272,7 +290,7 @@ class SteppedTo(Interpolation):
         t0, made_jump = self.t0, False
         if s.jump_ts is not None:
             t0, t, made_jump = between_jumps(t0, t, s.jump_ts, made_jump)
-        y, error, _, result = s._robust_step(t0, t, self.y0, self.state, made_jump)
+        y, error, *_, result = s._robust_step(t0, t, self.y0, self.state, made_jump)
         valid = (result == diffrax.RESULTS.successful) & s.acceptable(self.y0, y, error)
         return jtu.tree_map(lambda x: jnp.where(valid, x, jnp.nan), y)
 

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -126,6 +127,63 @@ def test_default(system, q0, expected):
     params = {"g": 1.0} | ({"weights": np.ones((8, 8))} if system is NETWORK else {})
     run = lambda q0, v0: lj.integrate(system, q0, v0, params, ts=jnp.array([0.0, 0.1]), throw=False)
     assert jax.eval_shape(run, q0, v0).static.method == expected
+
+
+def layered(p, q):
+    """A network of two coordinates."""
+    return jnp.sum(jnp.tanh(jnp.tanh(q @ p[0]) @ p[1]))
+
+
+def structured(t, q, v, p):
+    """A mass matrix that depends on q."""
+    return 0.5 * (1 + layered(p, q) ** 2) * (v @ v)
+
+
+LAYERS = [np.ones((2, 8)), np.ones((8, 8))]
+MLP = eqx.nn.MLP(2, "scalar", 8, 2, jnp.tanh, key=jax.random.key(0))
+SEQUENCE = eqx.nn.Sequential([MLP.layers[0], eqx.nn.Lambda(jnp.tanh), MLP.layers[1], eqx.nn.Lambda(jnp.sum)])
+ON_ROD = {"rod": lj.Holonomic(lambda t, q, p: q @ q - 1.0)}
+NETWORKS = {
+    "matrices": (lj.System(lambda t, q, v, p: 0.5 * (v @ v) - layered(p, q)), LAYERS, "Nystrom8"),
+    "MLP": (lj.System(lambda t, q, v, p: 0.5 * (v @ v) - p(q)), MLP, "Nystrom8"),
+    "Sequential": (lj.System(lambda t, q, v, p: 0.5 * (v @ v) - p(q)), SEQUENCE, "Nystrom8"),
+    "among others": (
+        lj.System(lambda t, q, v, p: 0.5 * p["m"] * (v @ v) - p["V"](q)),
+        {"m": 1.0, "V": MLP},
+        "Nystrom8",
+    ),
+    "structured": (lj.System(structured), LAYERS, "Dopri8"),
+    "on a rod": (lj.System(lambda t, q, v, p: 0.5 * (v @ v) - layered(p, q), ON_ROD), LAYERS, "Dopri8"),
+    "too small": (lj.System(lambda t, q, v, p: 0.5 * (v @ v) - layered(p, q)), [np.ones((2, 8)), np.ones(8)], None),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_of_networks(name):
+    """Tsit5 at loose tolerances, constraints or not; a traced tolerance counts as the default of the dtype."""
+    system, params, tight = NETWORKS[name]
+    loose = "Tsit5" if tight else "Nystrom12"
+    tight = tight or "Nystrom12"
+
+    def chosen(dtype, rtol=None, traced=None):
+        q0, v0 = np.array([1.0, 0.0], dtype), np.array([0.0, 1.0], dtype)
+        x = jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array_like(x) else x, params)
+        ts = np.array([0.0, 0.1], dtype)
+        run = lambda q0, v0, traced: lj.integrate(
+            system, q0, v0, x, ts=ts, rtol=rtol if traced is None else traced, throw=False
+        )
+        return jax.eval_shape(run, q0, v0, traced)
+
+    for rtol, expected in ((None, tight), (9e-7, tight), (1e-6, loose), ((1e-3, 1e-7), tight), ((1e-3, 1e-5), loose)):
+        assert chosen(np.float64, rtol).static.method == expected
+    assert chosen(np.float32).static.method == loose
+    for dtype, expected in ((np.float64, tight), (np.float32, loose)):
+        assert chosen(dtype, traced=np.asarray(1e-5, dtype)).static.method == expected
+    # Where the motion is continued, by the same method.
+    asked = chosen(np.float64, 1e-6).asked.method
+    assert type(asked).__name__ == ("Tsit5" if loose == "Tsit5" else "NoneType")
+    said = repr(lj.explain(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]), params))
+    assert ("by Tsit5 at rtol of 1e-6 and above" in said) == (loose == "Tsit5") and f"stepped by {tight}" in said
 
 
 def test_refused_where_velocities_count():

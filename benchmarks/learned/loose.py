@@ -1,0 +1,128 @@
+"""Gradients through motions of networks at loose tolerances, in batches, beside diffrax's Tsit5 by hand.
+
+A double pendulum whose mass matrix and potential are networks of two hidden layers, in float32 at rtol 1e-5. "Known":
+the networks are small corrections to the pendulum; "untrained": they are all there is, and the motion is slow. diffrax
+takes the same L by `jax.grad`, `jax.jvp` and `jnp.linalg.solve`, as one writes it, and its own adjoint. Both run in one
+process, in turn; errors are relative to a float64 gradient at 1e-8. Compiling is timed apart, once, by processor time.
+
+    python -m benchmarks.learned.loose [known|untrained] [width] [lanes] [outputs]
+"""
+
+import sys
+import time
+from functools import partial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax as lj
+from benchmarks.learned.models import layers, network
+
+WAYS = {"default": {}, "interpolated": {"outputs": "interpolated"}, "Dopri8": {"method": lj.Dopri8()}}
+RTOL, EXACT, END, REPEATS = 1e-5, 1e-8, 2.0, 7
+
+
+def kinetic(q):
+    """The mass matrix of a double pendulum of unit masses and lengths."""
+    across = jnp.cos(q[0] - q[1])
+    return jnp.stack([jnp.stack([2.0 + 0 * across, across]), jnp.stack([across, 1.0 + 0 * across])])
+
+
+def lagrangian(known: bool, t, q, v, p):
+    """½ v·M v - V with M and V of one network of four numbers."""
+    found = network(p, jnp.concatenate([jnp.sin(q), jnp.cos(q)]))
+    mass, potential = lj.learned.positive_definite(found[:3]), found[3]
+    if known:
+        mass, potential = kinetic(q) + 0.1 * mass, 0.1 * potential - 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+    return 0.5 * v @ mass @ v - potential
+
+
+def by_diffrax(known: bool, p, q0, v0, ts, rtol):
+    """The motion as written by hand."""
+
+    def field(t, y, p):
+        q, v = y
+        of = partial(lagrangian, known, t)
+
+        def momentum(q, v):
+            return jax.grad(of, 1)(q, v, p)
+
+        mass = jax.jacfwd(momentum, 1)(q, v)
+        force = jax.grad(of, 0)(q, v, p) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
+        return v, jnp.linalg.solve(mass, force)
+
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field), diffrax.Tsit5(), ts[0], ts[-1], None, (q0, v0), args=p, saveat=diffrax.SaveAt(ts=ts),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol), max_steps=512,
+    ).ys  # fmt: skip
+
+
+def by_lagjax(options: dict, known: bool, p, q0, v0, ts, rtol):
+    """The motion by lagjax."""
+    system = lj.System(partial(lagrangian, known))
+    traj = lj.integrate(system, q0, v0, p, ts=ts, rtol=rtol, atol=rtol, throw=False, **options)
+    return traj.q, traj.v
+
+
+def programs(motion: Any, dtype: Any, kind: str, width: int, lanes: int, outputs: int, rtol: float):
+    """A gradient and a loss, compiled, of no arguments."""
+    random = np.random.default_rng(0)
+
+    def cast(tree: Any):
+        return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+
+    p = cast(layers(random, 4, width, width, 4))
+    q0, v0 = cast(0.5 * random.normal(size=(2, lanes, 2)))
+    ts = np.linspace(0.0, END, outputs).astype(dtype)
+
+    def loss(p, q0, v0):
+        found = jax.vmap(lambda q0, v0: motion(kind == "known", p, q0, v0, ts, rtol))(q0, v0)
+        return sum(jnp.mean((x - 0.1) ** 2) for x in found)
+
+    gradient, forward = jax.jit(jax.value_and_grad(loss)), jax.jit(loss)
+    return lambda: gradient(p, q0, v0), lambda: forward(p, q0, v0)
+
+
+def flat(found: Any):
+    """A gradient as one vector."""
+    return np.concatenate([np.ravel(np.asarray(x, float)) for x in jax.tree.leaves(found[1])])
+
+
+def measured(kind: str, width: int, lanes: int, outputs: int, ways: dict):
+    """Print a row for each way: its error, and times over those of diffrax."""
+    of = {"diffrax": by_diffrax} | {name: partial(by_lagjax, options) for name, options in ways.items()}
+    exact = flat(programs(by_diffrax, jnp.float64, kind, width, lanes, outputs, EXACT)[0]())
+    calls, firsts = {}, {}
+    for name, motion in of.items():
+        calls[name] = programs(motion, jnp.float32, kind, width, lanes, outputs, RTOL)
+        started = time.process_time()
+        jax.block_until_ready(calls[name][0]())
+        firsts[name] = time.process_time() - started
+        jax.block_until_ready(calls[name][1]())
+        print(f"compiled {name}: {firsts[name]:.1f} s", flush=True)
+    times = {name: ([], []) for name in of}
+    for _ in range(REPEATS):
+        for name, pair in calls.items():
+            for call, found in zip(pair, times[name]):
+                started = time.process_time()
+                jax.block_until_ready(call())
+                found.append(time.process_time() - started)
+    medians = {name: [float(np.median(x)) for x in pair] for name, pair in times.items()}
+    for name, (gradient, forward) in medians.items():
+        error = np.linalg.norm(flat(calls[name][0]()) - exact) / np.linalg.norm(exact)
+        ratios = [x / y for x, y in zip((gradient, forward, firsts[name]), (*medians["diffrax"], firsts["diffrax"]))]
+        print(
+            f"{kind} 2 x {width}, {lanes} lanes, {outputs} outputs, {name:12} error {error:.1e}  "
+            f"gradient {1e3 * gradient:8.1f} ms {ratios[0]:5.2f}  forward {1e3 * forward:8.1f} ms {ratios[1]:5.2f}  "
+            f"first gradient {firsts[name]:5.1f} s {ratios[2]:5.2f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    of_command = sys.argv[1:] or ["known", "64", "64", "21"]
+    measured(of_command[0], *map(int, of_command[1:4]), WAYS)

@@ -1,0 +1,134 @@
+"""Outputs between the ends of steps: as accurate as the steps, on the constraints, differentiable in both modes.
+
+The pendulum's exact motion, in Jacobi's elliptic functions, is the oracle.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import lagjax as lj
+from lagjax.numerics import Quintic
+from tests.behaviour.test_bad_input import refusal
+
+HALF, MANY, FEW = np.sin(0.6), np.linspace(0.0, 6.0, 121), np.array([0.0, 6.0])
+swing = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.cos(q))
+# As many numbers as reverse mode replays for; their sum is one.
+shared = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
+SHARES = jnp.full(40, 1 / 40)
+rod = lj.System(
+    lambda t, q, v, p: 0.5 * (v @ v) - jnp.sum(p) * q[1], {"rod": lj.Holonomic(lambda t, q, p: q @ q - 1.0)}
+)
+between = {"outputs": "interpolated", "estimate_error": False}
+
+
+def exact(t):
+    """The angle and its rate, from rest at 1.2."""
+    sn, cn, dn, _ = special.ellipj(special.ellipk(HALF**2) - t, HALF**2)
+    return 2 * np.arcsin(HALF * sn), -2 * HALF * cn
+
+
+def worst(traj):
+    """The largest errors of q and v at the outputs."""
+    return [np.max(np.abs(x - y)) for x, y in zip((traj.q, traj.v), exact(MANY))]
+
+
+@pytest.mark.parametrize(("end_rate", "orders"), [(1.0, (6, 5)), (1.01, (1, 0))])
+def test_order_of_the_polynomial(end_rate, orders):
+    """Sixth in q and fifth in v between exact ends; first with a wrong velocity at an end."""
+
+    def error(h):
+        worst = np.zeros(2)
+        for t0 in (0.0, 0.5, 1.0, 1.5):
+            (q0, q1), (v0, v1) = (x.tolist() for x in exact(np.array([t0, t0 + h])))
+            ends = dict(t0=t0, t1=t0 + h, y0=(q0, v0), y1=(q1, end_rate * v1), a0=-np.sin(q0), a1=-np.sin(q1))
+            t = t0 + h * np.linspace(0.1, 0.9, 9)
+            found = [Quintic(**ends).at(x) for x in t]
+            worst = np.maximum(worst, [np.max(np.abs(np.array(x) - y)) for x, y in zip(zip(*found), exact(t))])
+        return worst
+
+    coarse, fine = error(0.4), error(0.2)
+    for order, a, b in zip(orders, coarse, fine):
+        assert np.log2(a / b) == pytest.approx(order, abs=0.35)
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+def test_as_accurate_as_the_steps(rtol):
+    """Of 121 outputs none is much further off than the outputs of Tsit5's own steps, and no step is added for them."""
+    of = lambda ts, **how: lj.integrate(swing, 1.2, 0.0, ts=ts, rtol=rtol, **how)
+    found, steps = of(MANY, **between), of(FEW, method=lj.Tsit5(), estimate_error=False).stats["num_steps"]
+    assert found.stats["num_steps"] == steps and found.static.method == "Tsit5, outputs interpolated"
+    # The phase error of 1e-3 is larger than that of the polynomial; q and v are of order one.
+    reached = np.max(np.abs(np.array(exact(6.0)) - [found.end.q, found.end.v]))
+    assert max(worst(found)) < 3 * reached + 15 * rtol
+    assert "outputs interpolated" in repr(found)
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """The replay gives the forward derivative of the same steps, by parameters, start and times; and that is right."""
+
+    def loss(p, q0, ts, **how):
+        traj = lj.integrate(shared, q0, 0.0, p, ts=ts, throw=False, **how)
+        return jnp.sum(traj.q**2) + jnp.sum(jnp.sin(traj.v))
+
+    point, along = (
+        (SHARES, jnp.asarray(1.2), jnp.asarray(MANY)),
+        (jnp.arange(40.0) / 40, jnp.asarray(0.3), jnp.sin(MANY)),
+    )
+    loose = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-5, **between), (0, 1, 2)))(*point)
+    pushed = jax.jvp(lambda *x: loss(*x, rtol=1e-5, **between), point, along)[1]
+    assert sum(jnp.sum(a * b) for a, b in zip(loose, along)) == pytest.approx(float(pushed), rel=1e-10)
+    right = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-10), (0, 1, 2)))(*point)
+    for a, b in zip(loose, right):
+        assert jnp.max(jnp.abs(a - b)) < 2e-3 * jnp.max(jnp.abs(b))
+    # Lanes with different numbers of steps and a shared output time.
+    starts = jnp.array([0.2, 1.2, 3.0])
+    each = jax.jit(jax.vmap(jax.grad(lambda p, q0: loss(p, q0, MANY, rtol=1e-5, **between)), (None, 0)))(SHARES, starts)
+    together = jax.grad(lambda p: jnp.sum(jax.vmap(lambda q0: loss(p, q0, MANY, rtol=1e-5, **between))(starts)))(SHARES)
+    assert jnp.max(jnp.abs(together - jnp.sum(each, 0))) < 1e-9 * jnp.max(jnp.abs(together))
+    assert jnp.max(jnp.abs(each[1] - loose[0])) < 1e-9 * jnp.max(jnp.abs(loose[0]))
+
+
+@pytest.mark.slow
+def test_on_the_constraints():
+    """Outputs satisfy them to round-off, with the multiplier there; derivatives in both modes agree."""
+    start = jnp.array([np.sin(1.2), -np.cos(1.2)])
+    of = lambda p, **how: lj.integrate(rod, start, jnp.zeros(2), p, ts=MANY, rtol=1e-4, throw=False, **how)
+    traj = of(SHARES, **between)
+    assert np.max(np.abs(np.sum(traj.q**2, 1) - 1)) < 1e-13 and np.max(np.abs(np.sum(traj.q * traj.v, 1))) < 1e-13
+    angle, rate = exact(MANY)
+    assert np.max(np.abs(traj.q[:, 0] - np.sin(angle))) < 2e-3
+    # 2 λ = -(cos(angle) + rate²) pulls the mass inwards; g = 1.
+    assert np.max(np.abs(2 * traj.multipliers["rod"] + np.cos(angle) + rate**2)) < 1e-2
+    loss = lambda p: jnp.sum(of(p, **between).q[:, 0]) + jnp.sum(of(p, **between).multipliers["rod"])
+    along = jnp.arange(40.0) / 40
+    pushed = jax.jvp(loss, (SHARES,), (along,))[1]
+    assert float(jax.grad(loss)(SHARES) @ along) == pytest.approx(float(pushed), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_beside_events_and_in_float32():
+    """An event is found where it is, and ends the outputs; float32 stays float32; a gradient with an event is right."""
+    down = {"down": lj.Crossing(lambda t, q, v, m, p: q, terminal=True)}
+    quarter = special.ellipk(HALF**2)
+    of = lambda p, **how: lj.integrate(shared, 1.2, 0.0, p, ts=MANY, rtol=1e-6, events=down, throw=False, **how)
+    traj = of(SHARES, **between)
+    assert traj.events["down"].t[0] == pytest.approx(quarter, abs=1e-5)
+    assert np.array_equal(np.isnan(traj.q), MANY > quarter)
+    assert np.nanmax(np.abs(traj.q - exact(MANY)[0])) < 2e-5
+    # The period is proportional to 1/√(sum of p).
+    slope = jax.grad(lambda p: of(p, **between).events["down"].t[0])(SHARES)
+    assert slope == pytest.approx(np.full(40, -quarter / 2), rel=1e-4)
+    single = lj.integrate(swing, np.float32(1.2), np.float32(0.0), ts=MANY.astype(np.float32), **between)
+    assert single.q.dtype == np.float32 and max(worst(single)) < 3e-4
+
+
+def test_refused():
+    """Unknown words, and methods whose steps are too long for the polynomial."""
+    with refusal(ValueError, "outputs must be 'exact' or 'interpolated'", "leave outputs out"):
+        lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="linear")
+    with refusal(ValueError, "which Dopri8 does not go with", r"method=lj.Tsit5\(\)"):
+        lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="interpolated", method=lj.Dopri8())
