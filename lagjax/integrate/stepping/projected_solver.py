@@ -163,7 +163,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         y1 = jtu.tree_map(lambda y1, y0: jnp.where(failed, y0, y1), y1, y0)
         error = jtu.tree_map(lambda x: jnp.where(failed, jnp.inf, x), error)
         result = diffrax.RESULTS.where(failed & (result == diffrax.RESULTS.successful), NOT_FINITE, result)
-        if self.between:
+        if rates is not None:
             return y1, error, {"y0": y0, "y1": y1, "a0": rates[0], "a1": rates[1]}, solver_state, result
         if self.arriving:
             return y1, error, {"y0": y0, "y1": y1}, solver_state, result
