@@ -21,7 +21,7 @@ import numpy as np
 import lagjax as lj
 from benchmarks.learned.models import layers, network
 
-WAYS = {"default": {}, "interpolated": {"outputs": "interpolated"}, "Dopri8": {"method": lj.Dopri8()}}
+WAYS = {"default": {}, "exact outputs": {"outputs": "exact"}, "Dopri8": {"method": lj.Dopri8()}}
 RTOL, EXACT, END, REPEATS = 1e-5, 1e-8, 2.0, 7
 
 

@@ -64,13 +64,13 @@ def check_jumps(jumps: Any) -> str:
     return jumps
 
 
-def check_outputs(outputs: Any) -> str:
-    """Return `outputs`; raise unless it is one of its two values."""
-    if not isinstance(outputs, str) or outputs not in ("exact", "interpolated"):
+def check_outputs(outputs: Any) -> str | None:
+    """Return `outputs`; raise unless it is None or one of two words."""
+    if not (outputs is None or isinstance(outputs, str) and outputs in ("exact", "interpolated")):
         raise ValueError(
             f"outputs must be 'exact' or 'interpolated', not {outputs!r:.60}.\n"
             "Usual cause: the times of outputs, which are ts=.\n"
-            'Fix: leave outputs out (they are ends of steps), or outputs="interpolated".'
+            'Fix: outputs="exact" (they are ends of steps), outputs="interpolated", or leave it out.'
         )
     return outputs
 

@@ -59,7 +59,7 @@ def integrate(
     drift: str | None = None,
     estimate_error: bool | None = None,
     start: str | ArrayLike | None = None,
-    outputs: str = "exact",
+    outputs: str | None = None,
 ) -> Trajectory:
     """Integrate Lagrange's equations from (q0, v0) at `ts[0]`, with outputs at `ts`.
 
@@ -78,7 +78,7 @@ def integrate(
       constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
-      method, unless `outputs` says otherwise. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
+      method, except as `outputs` says. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
       by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
       (`lagjax/integrate/stepping/tolerances.py`): at a zero crossing by its size at the end of the step, at rest by
@@ -92,7 +92,8 @@ def integrate(
       depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
       1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With a network (an array of 64 numbers or
       more, and of two axes or more, among the parameters) it is `lj.Tsit5()` for rtol of 1e-6 and above, constraints
-      or not, and below that `lj.Nystrom8()` in place of `lj.Nystrom12()`; a traced `rtol` counts as the default one.
+      or not, and below that, or with a `stepsize_controller`, `lj.Nystrom8()` in place of `lj.Nystrom12()`. A traced
+      `rtol` counts as the default one.
       With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, as they
       also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours; diffrax's other methods take 2
       to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast, and
@@ -100,7 +101,7 @@ def integrate(
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
-      or a thin barrier, without a warning. No step is longer than this, nor than the time between two outputs.
+      or a thin barrier, without a warning. No step is longer than this, nor, if outputs are exact, than the time between two.
     - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0,
       ...)`, `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the
       motion across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored"
@@ -132,7 +133,8 @@ def integrate(
       would be steps. Beyond that, "interpolated" steps over them by `lj.Tsit5()`, and takes them from the polynomial of
       order 5 through q, v and a at both ends of a step, returned to the constraints. No tolerance controls its error,
       but that is about as large as the errors of steps for rtol of 1e-3 to 1e-6
-      (`tests/behaviour/test_interpolated_outputs.py`). In reverse mode with `events` outputs are exact.
+      (`tests/behaviour/test_interpolated_outputs.py`). In reverse mode with `events` outputs are exact. By default they
+      are interpolated where `method` is left out and `lj.Tsit5()` chosen for a network, and exact otherwise.
     - `drift`: `"project"` (return to the constraints after every step; the default if there are any),
       `"baumgarte"` (feedback at 50 decays a time span), or `"none"`.
 
@@ -192,7 +194,7 @@ def integrate(
         progress=progress,
         jumps=arguments.check_jumps(jumps),
         outputs=arguments.check_outputs(outputs),
-        loose=arguments.is_loose(relative, dtype),
+        loose=stepsize_controller is None and arguments.is_loose(relative, dtype),
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )

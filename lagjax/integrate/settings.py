@@ -49,8 +49,8 @@ class Settings:
     robust: bool = eqx.field(static=True, default=True)
     # Whether jumps of forces are found and followed.
     jumps: str = eqx.field(static=True, default="found")
-    # Whether outputs are ends of steps or lie inside them, on a polynomial.
-    outputs: str = eqx.field(static=True, default="exact")
+    # Whether outputs are ends of steps or lie inside them, on a polynomial; None if it follows from the method.
+    outputs: str | None = eqx.field(static=True, default="exact")
     # Whether the tolerance is loose, as far as it is known while JAX traces.
     loose: bool = eqx.field(static=True, default=False)
     # A right-hand side of up to this many operations is copied to each of a method's stages.

@@ -146,7 +146,10 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     model = model_of(system, *start)
     s, method = settings, method_of(settings, model)
     # What the tolerance chose is no longer known where the motion is continued.
-    chosen = method if s.method is None and isinstance(method, Tsit5) else s.method
+    by_tolerance = s.method is None and isinstance(method, Tsit5)
+    chosen = method if by_tolerance else s.method
+    if settings.outputs is None:
+        settings = replace(settings, outputs="interpolated" if by_tolerance else "exact")
     asked = SolveOptions(chosen, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)

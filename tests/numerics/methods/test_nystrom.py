@@ -162,28 +162,31 @@ NETWORKS = {
 def test_of_networks(name):
     """Tsit5 at loose tolerances, constraints or not; a traced tolerance counts as the default of the dtype."""
     system, params, tight = NETWORKS[name]
-    loose = "Tsit5" if tight else "Nystrom12"
+    loose = "Tsit5, outputs interpolated" if tight else "Nystrom12"
     tight = tight or "Nystrom12"
 
-    def chosen(dtype, rtol=None, traced=None):
+    def chosen(dtype, rtol=None, traced=None, **how):
         q0, v0 = np.array([1.0, 0.0], dtype), np.array([0.0, 1.0], dtype)
         x = jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array_like(x) else x, params)
         ts = np.array([0.0, 0.1], dtype)
         run = lambda q0, v0, traced: lj.integrate(
-            system, q0, v0, x, ts=ts, rtol=rtol if traced is None else traced, throw=False
+            system, q0, v0, x, ts=ts, rtol=rtol if traced is None else traced, throw=False, **how
         )
         return jax.eval_shape(run, q0, v0, traced)
 
     for rtol, expected in ((None, tight), (9e-7, tight), (1e-6, loose), ((1e-3, 1e-7), tight), ((1e-3, 1e-5), loose)):
         assert chosen(np.float64, rtol).static.method == expected
     assert chosen(np.float32).static.method == loose
+    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.1)
+    assert chosen(np.float64, **fixed).static.method == tight
+    assert chosen(np.float32, outputs="exact").static.method == loose.partition(",")[0]
     for dtype, expected in ((np.float64, tight), (np.float32, loose)):
         assert chosen(dtype, traced=np.asarray(1e-5, dtype)).static.method == expected
     # Where the motion is continued, by the same method.
     asked = chosen(np.float64, 1e-6).asked.method
-    assert type(asked).__name__ == ("Tsit5" if loose == "Tsit5" else "NoneType")
+    assert type(asked).__name__ == ("NoneType" if loose == tight else "Tsit5")
     said = repr(lj.explain(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]), params))
-    assert ("by Tsit5 at rtol of 1e-6 and above" in said) == (loose == "Tsit5") and f"stepped by {tight}" in said
+    assert ("by Tsit5 at rtol of 1e-6 and above" in said) == (loose != tight) and f"stepped by {tight}" in said
 
 
 def test_refused_where_velocities_count():
