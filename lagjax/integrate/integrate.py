@@ -91,17 +91,17 @@ def integrate(
     - `method`: any diffrax solver. By default `lj.Nystrom12()` if there are no constraints and accelerations do not
       depend on velocities (`lj.explain` says so), else `lj.Dopri8()`: the fastest way to an error between 1e-4 and
       1e-10 on nearly all scenes (`benchmarks/results/work_precision.json`). With a network (an array of 64 numbers or
-      more, and of two axes or more, among the parameters) it is `lj.Tsit5()` for rtol of 1e-6 and above, constraints
-      or not, and below that, or with a `stepsize_controller`, `lj.Nystrom8()` in place of `lj.Nystrom12()`. A traced
-      `rtol` counts as the default one.
-      With these and with `lj.Tsit5()` small systems run on equations that are written out number by number, as they
-      also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours; diffrax's other methods take 2
-      to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast, and
-      `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter.
+      more, and of two axes or more, among the parameters) it is `lj.Tsit5()` for rtol of 1e-6 and above, constraints or
+      not, and below that, or with a `stepsize_controller`, `lj.Nystrom8()` in place of `lj.Nystrom12()`. A traced
+      `rtol` counts as the default one. With these and with `lj.Tsit5()` small systems run on equations that are written
+      out number by number, as they also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours;
+      diffrax's other methods take 2 to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast,
+      and `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
     - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
-      or a thin barrier, without a warning. No step is longer than this, nor, if outputs are exact, than the time between two.
+      or a thin barrier, without a warning. No step is longer than this, nor than the time between two
+      exact outputs.
     - `jumps`: "found" reads jumps and kinks off the programs of L, the force and the dissipation (`jnp.where(q > 0,
       ...)`, `jnp.sign(v)`, `jnp.maximum`, `jnp.interp`): each becomes an end of a step, derivatives are those of the
       motion across it, and a motion that is pushed back from both sides stays on it, as under dry friction. "ignored"
