@@ -5,7 +5,7 @@ the networks are small corrections to the pendulum; "untrained": they are all th
 takes the same L by `jax.grad`, `jax.jvp` and `jnp.linalg.solve`, as one writes it, and its own adjoint. Both run in one
 process, in turn; errors are relative to a float64 gradient at 1e-8. Compiling is timed apart, once, by processor time.
 
-    python -m benchmarks.learned.loose [known|untrained] [width] [lanes] [outputs]
+    python -m benchmarks.learned.loose [known|untrained] [width] [lanes] [outputs] [way ...]
 """
 
 import sys
@@ -91,38 +91,37 @@ def flat(found: Any):
     return np.concatenate([np.ravel(np.asarray(x, float)) for x in jax.tree.leaves(found[1])])
 
 
-def measured(kind: str, width: int, lanes: int, outputs: int, ways: dict):
-    """Print a row for each way: its error, and times over those of diffrax."""
-    of = {"diffrax": by_diffrax} | {name: partial(by_lagjax, options) for name, options in ways.items()}
-    exact = flat(programs(by_diffrax, jnp.float64, kind, width, lanes, outputs, EXACT)[0]())
-    calls, firsts = {}, {}
-    for name, motion in of.items():
-        calls[name] = programs(motion, jnp.float32, kind, width, lanes, outputs, RTOL)
-        started = time.process_time()
-        jax.block_until_ready(calls[name][0]())
-        firsts[name] = time.process_time() - started
-        jax.block_until_ready(calls[name][1]())
-        print(f"compiled {name}: {firsts[name]:.1f} s", flush=True)
-    times = {name: ([], []) for name in of}
-    for _ in range(REPEATS):
+def measured(kind: str, width: int, lanes: int, outputs: int, ways: list[str]):
+    """Print a row for each way: times over those of diffrax, and the error of its gradient."""
+    motions = {"diffrax": by_diffrax} | {name: partial(by_lagjax, WAYS[name]) for name in ways}
+    calls = {name: programs(of, jnp.float32, kind, width, lanes, outputs, RTOL) for name, of in motions.items()}
+    found = {}
+    for i, what in enumerate(("gradient", "forward")):
+        firsts, times = {}, {name: [] for name in calls}
         for name, pair in calls.items():
-            for call, found in zip(pair, times[name]):
+            started = time.process_time()
+            found[what, name] = jax.block_until_ready(pair[i]())
+            firsts[name] = time.process_time() - started
+        for _ in range(REPEATS):
+            for name, pair in calls.items():
                 started = time.process_time()
-                jax.block_until_ready(call())
-                found.append(time.process_time() - started)
-    medians = {name: [float(np.median(x)) for x in pair] for name, pair in times.items()}
-    for name, (gradient, forward) in medians.items():
-        error = np.linalg.norm(flat(calls[name][0]()) - exact) / np.linalg.norm(exact)
-        ratios = [x / y for x, y in zip((gradient, forward, firsts[name]), (*medians["diffrax"], firsts["diffrax"]))]
-        print(
-            f"{kind} 2 x {width}, {lanes} lanes, {outputs} outputs, {name:12} error {error:.1e}  "
-            f"gradient {1e3 * gradient:8.1f} ms {ratios[0]:5.2f}  forward {1e3 * forward:8.1f} ms {ratios[1]:5.2f}  "
-            f"first gradient {firsts[name]:5.1f} s {ratios[2]:5.2f}",
-            flush=True,
-        )
+                jax.block_until_ready(pair[i]())
+                times[name].append(time.process_time() - started)
+        for name, of_name in times.items():
+            next_one, first = float(np.median(of_name)), firsts[name]
+            ratio, of_first = next_one / float(np.median(times["diffrax"])), first / firsts["diffrax"]
+            print(
+                f"{kind} 2 x {width}, {lanes} lanes, {outputs} outputs: {what:8} {name:13} {1e3 * next_one:8.1f} ms, "
+                f"{ratio:5.2f} x diffrax; first {first:6.1f} s, {of_first:5.2f} x",
+                flush=True,
+            )
+    exact = flat(programs(by_diffrax, jnp.float64, kind, width, lanes, outputs, EXACT)[0]())
+    for name in calls:
+        error = np.linalg.norm(flat(found["gradient", name]) - exact) / np.linalg.norm(exact)
+        print(f"error of the gradient: {name:13} {error:.1e}", flush=True)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     of_command = sys.argv[1:] or ["known", "64", "64", "21"]
-    measured(of_command[0], *map(int, of_command[1:4]), WAYS)
+    measured(of_command[0], *map(int, of_command[1:4]), of_command[4:] or list(WAYS))
