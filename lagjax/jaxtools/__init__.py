@@ -56,6 +56,15 @@ from lagjax.jaxtools.plain import is_plain
 from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.sparsity import pattern
-from lagjax.jaxtools.tracing import REGULAR_FIRST, SILENT, WATCHED, is_eager, is_traced, numpy_of, takes_for_regular
+from lagjax.jaxtools.tracing import (
+    REGULAR_FIRST,
+    SILENT,
+    WATCHED,
+    as_usual,
+    is_eager,
+    is_traced,
+    numpy_of,
+    takes_for_regular,
+)
 from lagjax.jaxtools.trees import like, stop_gradient, where, without_init
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one

@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax.jaxtools.cache import hashable_partition, once, program_of
 from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.tracing import is_eager, is_traced
+from lagjax.jaxtools.tracing import as_usual, is_eager, is_traced
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one
 
 WITHOUT_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
@@ -47,6 +47,7 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
     finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
 
     @wraps(function)
+    @as_usual
     def program(*args):
         if not is_eager() or is_traced(args):
             return as_part(*args)

@@ -52,6 +52,7 @@ from lagjax.jaxtools.jaxpr import (
     without_chains,
 )
 from lagjax.jaxtools.plain import is_plain
+from lagjax.jaxtools.tracing import as_usual
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 
 STAYS_A_CALL = {"inlineable": "false"}
@@ -132,6 +133,7 @@ def apart(function: Callable, *args):
     return kept_as_call(_jitted(function, args))
 
 
+@as_usual
 @eqx.filter_jit
 def _jitted(function: Callable, args: tuple):
     return function(*args)
@@ -397,7 +399,7 @@ def _lane_shapes(*operands, jaxpr: ClosedJaxpr, lanes, **params):
 def _define(name: str, evaluate: Callable, on_cpu: Callable, shapes, batch: Callable):
     primitive = Primitive(name)
     primitive.multiple_results = True
-    primitive.def_impl(lambda *x, **params: jax.jit(lambda *x: primitive.bind(*x, **params))(*x))
+    primitive.def_impl(as_usual(lambda *x, **params: jax.jit(lambda *x: primitive.bind(*x, **params))(*x)))
     primitive.def_abstract_eval(shapes)
     ad.primitive_jvps[primitive] = partial(_jvp, primitive)
     batching.primitive_batchers[primitive] = batch

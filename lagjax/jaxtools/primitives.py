@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from lagjax.jaxtools.tracing import as_usual
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 
 __all__ = ["Primitive", "ad", "front", "jaxpr_as_fun", "linear_map_primitive", "primitive", "split"]
@@ -30,7 +31,7 @@ def primitive(
     """
     new = Primitive(name)
     new.multiple_results = several
-    new.def_impl(evaluate)
+    new.def_impl(as_usual(evaluate))
     new.def_abstract_eval(shapes)
     # What such a primitive evaluates in Python becomes part of a program only here.
     lowered = one_by_one(compiled or evaluate)
@@ -41,7 +42,7 @@ def primitive(
         (batching.primitive_batchers, batched),
     ):
         if rule is not None:
-            rules[new] = rule
+            rules[new] = as_usual(rule)
     return new
 
 

@@ -1,6 +1,9 @@
 """Whether JAX is tracing here and now, and in which context."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import wraps
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +34,31 @@ def takes_for_regular() -> bool:
 def is_eager() -> bool:
     """Whether JAX is tracing nothing here and now, not even a function without traced arguments."""
     return get_opaque_trace_state() == _EAGER
+
+
+def as_usual(function: Callable) -> Callable:
+    """The same function, with JAX's settings for finding errors off, whatever the user has set for his own code.
+
+    It compiles: one by one, the operations of a motion take minutes. It does not look for NaN: trial steps, outputs
+    that a motion did not reach and slots for events that did not happen are NaN. It may make constants for a program.
+    """
+
+    @wraps(function)
+    def without_debugging(*args, **kwargs):
+        config = jax.config
+        looks = config.jax_debug_nans or config.jax_debug_infs
+        if not (looks or config.jax_disable_jit or config.jax_transfer_guard_host_to_device not in (None, "allow")):
+            return function(*args, **kwargs)
+        with ExitStack() as usual:
+            usual.enter_context(jax.disable_jit(False))
+            usual.enter_context(jax.transfer_guard("allow"))
+            if looks:
+                # Not otherwise: on leaving, JAX 0.10 stops looking in compiled programs if the user asked by an update.
+                usual.enter_context(jax.debug_nans(False))
+                usual.enter_context(jax.debug_infs(False))
+            return function(*args, **kwargs)
+
+    return without_debugging
 
 
 def numpy_of(tree: PyTree):

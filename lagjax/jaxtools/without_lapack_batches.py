@@ -26,6 +26,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fu
 from jax.interpreters import ad, batching, mlir
 
 from lagjax.jaxtools.jaxpr import HOLDS_A_SOLVER, LAPACK, anywhere, applied, bodies, rewritten
+from lagjax.jaxtools.tracing import as_usual
 
 # The name of a function whose backward pass is rewritten already.
 WITH_WAY_BACK = "with_rewritten_way_back"
@@ -62,7 +63,7 @@ def one_by_one(function: Callable) -> Callable:
 
 def jitted(function: Callable) -> Callable:
     """Return equinox's `filter_jit` of the same function, with LAPACK called for one matrix at a time on a CPU."""
-    return eqx.filter_jit(one_by_one(function))
+    return as_usual(eqx.filter_jit(one_by_one(function)))
 
 
 def without_batches(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -232,7 +233,7 @@ def _with_rewritten_way_back(equation):
 
 _library_p = Primitive("one_by_one")
 _library_p.multiple_results = True
-_library_p.def_impl(lambda *x, of: jax.jit(partial(_library_p.bind, of=of))(*x))
+_library_p.def_impl(as_usual(lambda *x, of: jax.jit(partial(_library_p.bind, of=of))(*x)))
 _library_p.def_abstract_eval(_shapes)
 ad.primitive_jvps[_library_p] = _jvp
 ad.primitive_transposes[_library_p] = _transposed

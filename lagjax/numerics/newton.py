@@ -242,7 +242,8 @@ def least_squares_root(residual: Callable, y0: Float[Array, " n"], linear: np.nd
         jacobian = jnp.where(better, new_jacobian, jacobian)
         columns = jnp.maximum(columns, jnp.max(jnp.abs(jacobian / rows[:, None]), axis=0))
         # The last steps are Newton's, as long as they reduce the residual.
-        tries_left = search.memory.tries_left - ((damping < NEWTON_BELOW) & ~better & ~always_accepted)
+        in_vain = (damping < NEWTON_BELOW) & ~better & ~always_accepted
+        tries_left = search.memory.tries_left - in_vain.astype(search.memory.tries_left.dtype)
         left = jnp.where(better, new, old)
         going = jnp.where(always_accepted, better, moved) & (left > 0) & (damping < 1e12)
         return better, Damping(rows, columns, damping, grow, jnp.where(going, tries_left, 0))

@@ -31,8 +31,10 @@ from lagjax.jaxtools import (
     ClosedJaxpr,
     Jaxpr,
     Meaning,
+    as_usual,
     bodies,
     content_of,
+    is_traced,
     meaning_of,
     one_by_one,
     program_of,
@@ -124,6 +126,7 @@ def _explained(run: Callable, axes: Axes, patience: int | None, robust: bool):
         yield
 
 
+@as_usual
 def traced_point(
     run: Callable, axes: Axes, patience: int | None = None, robust: bool = True
 ) -> tuple[ClosedJaxpr, PyTree]:
@@ -133,6 +136,7 @@ def traced_point(
         return watched(run, dict(zip(axes.names, shaped)))
 
 
+@as_usual
 def compiled(
     run: Callable,
     axes: Axes,
@@ -168,6 +172,7 @@ def compiled(
     memory = program.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
 
+    @as_usual
     def call(point: dict[str, np.ndarray], count: int):
         return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
@@ -197,6 +202,13 @@ def program_for(
         return program
 
     program, structure = traced_point(run, axes, patience, robust)
+    if is_traced(program.consts):
+        raise TypeError(
+            "run uses a value from outside that is being traced: a sweep compiles and runs on its own, outside of jit, "
+            "grad and vmap, and has no derivative by such a value.\n"
+            "Fix: inside a program use jax.vmap in place of lj.sweep; or a derivative for each point of the sweep, "
+            "lj.sweep(jax.grad(...), axes)."
+        )
     meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
     key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings

@@ -10,10 +10,12 @@ are solved in vector form, and every message speaks of the coordinate by the use
 Warn once what single precision costs: JAX computes in float32 unless told otherwise.
 
 The warning comes where a state is first made of numbers that the user gave, in whichever function that is. A user who
-means float32, on a GPU or for networks, starts from NumPy float32 arrays, or filters the warning by its class. JAX's
-own arrays do not show what was meant: they are float32 in either case.
+means float32, on a GPU or for networks, says so in one of the ways of `_is_meant`, or filters the warning by its class.
+JAX's own arrays do not show what was meant, nor does an update of its setting to False: both are alike in either case.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -36,24 +38,35 @@ _settled = []
 class PrecisionWarning(UserWarning):
     """JAX computes in single precision, as it does unless told otherwise; issued once per process.
 
-    Where that is intended: `warnings.filterwarnings("ignore", category=lj.PrecisionWarning)`, or initial states of
-    `np.float32` arrays.
+    Where that is intended: initial states or parameters of `np.float32`, `JAX_ENABLE_X64=0` in the environment,
+    or `warnings.filterwarnings("ignore", category=lj.PrecisionWarning)`.
     """
 
 
 def warn_of_float32(dtype: DTypeLike, given) -> None:
-    """Warn once per process if JAX is left in single precision and no array in `given` is NumPy float32."""
+    """Warn once per process if JAX is left in single precision, and nothing shows that this is meant."""
     if _settled or dtype != SINGLE or jax.dtypes.canonicalize_dtype(np.float64) != SINGLE:
         return
-    if not any(isinstance(x, np.ndarray | np.generic) and x.dtype == SINGLE for x in given):
+    if not _is_meant(given):
         warn(
             "JAX computes in float32, as it does unless told otherwise: seven digits at most (1e-7), tolerances of "
             "1e-5 in place of 1e-9 (none below 1e-6), and still fewer digits in derivatives and fits.\n"
             'Fix: jax.config.update("jax_enable_x64", True) before the first array. Where float32 is meant, on a GPU '
-            "for example, start from np.float32 arrays, or ignore lj.PrecisionWarning. This warning comes once.",
+            "for example, start from np.float32 arrays, or set JAX_ENABLE_X64=0 in the environment, or ignore "
+            "lj.PrecisionWarning. This warning comes once.",
             PrecisionWarning,
         )
     _settled.append(True)
+
+
+def _is_meant(given):
+    """Whether single precision was asked for: by NumPy's float32, in the environment, or in a context."""
+    if any(isinstance(x, np.ndarray | np.generic) and x.dtype == SINGLE for x in given):
+        return True
+    # A new thread has the setting of the process, without the contexts that this one has entered.
+    with ThreadPoolExecutor(1) as thread:
+        of_process = thread.submit(jax.dtypes.canonicalize_dtype, np.float64).result()
+    return of_process != SINGLE or "JAX_ENABLE_X64" in os.environ
 
 
 FLOAT64 = np.dtype("float64")
@@ -129,8 +142,8 @@ def state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     Whole numbers among the coordinates become floats. Python floats become arrays of the state's dtype, in `params`
     too: a float that stayed a Python number would be compiled in, and each new value would compile again.
 
-    **Raises:** `TypeError` for a coordinate that is not a real number, or a time that is not one number; `ValueError`
-    where `v` does not have the structure and shapes of `q`, or `q` is empty.
+    **Raises:** `TypeError` for a coordinate that is not a real number, for half precision, or for a time that is not
+    one number; `ValueError` where `v` does not have the structure and shapes of `q`, or `q` is empty.
     """
     return _as_jax_arrays(given_state(t, q, v, params))
 
@@ -149,7 +162,13 @@ def given_state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     # A Python float takes the dtype of the other coordinates.
     dtype = _dtype_of(given)
     if dtype != FLOAT64:
-        warn_of_float32(dtype, given)
+        if dtype.itemsize < SINGLE.itemsize:
+            raise TypeError(
+                f"q and v are {dtype}, and the steps of a motion are lost in its {jnp.finfo(dtype).nmant + 1} bits.\n"
+                "Usual cause: the dtype of a network, given to the state, too.\n"
+                "Fix: q0 and v0 of np.float32; the network in params may stay as it is."
+            )
+        warn_of_float32(dtype, [*given, *jtu.tree_leaves(params)])
     q, v = (jtu.tree_map(lambda x: _cast(x, dtype), tree) for tree in (q_arrays, v_arrays))
     return State(_cast(t, dtype), q, v, given_params(params, dtype))
 

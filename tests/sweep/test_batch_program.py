@@ -210,3 +210,16 @@ def test_a_second_sweep_compares_little(monkeypatch):
         np.testing.assert_allclose(quiet(run, xs(5)).values, -xs(5)["x"] / 2, rtol=1e-12)
         counts.append(len(calls))
     assert counts[0] > 50 and counts[1] < 20
+
+
+def test_values_that_are_traced():
+    """A sweep in a derivative, a program or lanes of a value that its run reads is refused; twin: as an axis."""
+
+    def total(k):
+        return jnp.sum(quiet(lambda point: k * point["x"], xs(3)).values)
+
+    for transformed in (jax.grad(total), jax.jit(total), lambda k: jax.vmap(total)(jnp.array([k]))):
+        with pytest.raises(TypeError, match="(?s)uses a value from outside that is being traced.*jax.vmap in place"):
+            transformed(2.0)
+    slopes = quiet(lambda point: jax.grad(lambda k: k * point["x"])(point["k"]), xs(3) | {"k": np.array([2.0])})
+    assert np.array_equal(slopes.values[:, 0], xs(3)["x"])

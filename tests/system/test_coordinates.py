@@ -56,6 +56,14 @@ def test_a_float_is_one_in_whatever_it_comes():
     assert of(jnp.asarray(9.81, jnp.float32)).dtype == jnp.float32
 
 
+@pytest.mark.parametrize("half", (jnp.float16, jnp.bfloat16))
+def test_half_precision(half):
+    """A state in half precision is refused; twin: the parameters may be, and stay so."""
+    with pytest.raises(TypeError, match=r"(?s)q and v are b?float16.*Fix: q0 and v0 of np.float32"):
+        coordinates.state(0.0, half(1.0), half(0.0), None)
+    assert coordinates.state(0.0, np.float32(1.0), np.float32(0.0), {"w": half(1.0)}).params["w"].dtype == half
+
+
 def test_what_is_no_number():
     """Text and a quantity with its unit raise, with the coordinate and the usual cause."""
 

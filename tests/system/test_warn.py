@@ -22,8 +22,10 @@ TS = np.linspace(0.0, 1.0, 2)
 def untold(monkeypatch):
     """A process without x64 in which nothing has warned yet."""
     monkeypatch.setattr(coordinates, "_settled", [])
-    with jax.enable_x64(False):
-        yield
+    monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
+    jax.config.update("jax_enable_x64", False)
+    yield
+    jax.config.update("jax_enable_x64", True)
 
 
 def told(act):
@@ -45,12 +47,32 @@ def test_told_once(untold, number):
         coordinates.state(0.0, number, number, None)
 
 
-@pytest.mark.parametrize("number", (np.float32(1.0), np.ones(2, np.float32), jnp.ones(2, jnp.float16)))
-def test_not_told_where_it_is_meant(untold, number):
-    """A NumPy float32 state shows that it is meant, from then on; half precision does not warn, but later states do."""
-    assert told(lambda: coordinates.state(0.0, number, number, None)) == []
-    again = told(lambda: coordinates.state(0.0, 1.0, 1.0, None))
-    assert len(again) == (number.dtype == np.float16)
+@pytest.mark.parametrize(
+    "meant",
+    (
+        (0.0, np.float32(1.0), np.float32(1.0), None),
+        (0.0, np.ones(2, np.float32), np.ones(2, np.float32), None),
+        (0.0, 1.0, 1.0, {"w": np.ones(2, np.float32)}),
+    ),
+)
+def test_not_told_where_it_is_meant(untold, meant):
+    """NumPy float32 in a state or the parameters shows that it is meant, from then on."""
+    assert told(lambda: coordinates.state(*meant)) == []
+    assert told(lambda: coordinates.state(0.0, 1.0, 1.0, None)) == []
+
+
+def test_not_told_where_it_is_said(untold, monkeypatch):
+    """Said in the environment, or for a part of the code alone; twin: where it is not, a state warns."""
+    monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    assert told(lambda: coordinates.state(0.0, 1.0, 1.0, None)) == []
+    monkeypatch.delenv("JAX_ENABLE_X64")
+    coordinates._settled.clear()
+    jax.config.update("jax_enable_x64", True)
+    with jax.enable_x64(False):
+        assert told(lambda: coordinates.state(0.0, 1.0, 1.0, None)) == []
+    coordinates._settled.clear()
+    jax.config.update("jax_enable_x64", False)
+    assert len(told(lambda: coordinates.state(0.0, 1.0, 1.0, None))) == 1
 
 
 def test_not_told_with_x64(monkeypatch):

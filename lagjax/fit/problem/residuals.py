@@ -312,4 +312,4 @@ def _squeezed(t: Array, last: Int[Array, ""], part: Array):
     kept = jnp.sum(_counts(t, last, part))
     closest = jnp.maximum(PADDING * (t[1] - t[0]), 8 * jnp.finfo(t.dtype).eps * jnp.max(jnp.abs(t)))
     beyond = jnp.arange(t.shape[0]) - (kept - 1)
-    return jnp.where(beyond <= 0, t, t[kept - 1] + beyond * closest)
+    return jnp.where(beyond <= 0, t, t[kept - 1] + beyond.astype(t.dtype) * closest)

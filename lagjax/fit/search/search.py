@@ -142,7 +142,7 @@ def _channel(problem: FitProblem, left: Array, ordered: bool, r: Array, known: A
             return jnp.concatenate([x, jnp.zeros_like(x[:, :most])], axis=1)[:, following]
 
         each = (0, *range(2, r.ndim + 1))
-        pairs = jnp.sum(known[:, None] & later(known), axis=each)
+        pairs = jnp.sum(known[:, None] & later(known), axis=each).astype(r.dtype)
         lags = jnp.sum(pairs > 0).astype(r.dtype)
         one = jnp.maximum(jnp.sum(r**2) / count, jnp.finfo(r.dtype).tiny)
         correlations = jnp.sum(r[:, None] * later(r), axis=each) / jnp.where(pairs > 0, pairs, 1) / one

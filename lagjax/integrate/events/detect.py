@@ -201,7 +201,7 @@ class EventController(diffrax.AbstractStepSizeController):
             return jtu.tree_map(lambda x, all: jnp.where(like(new, all), x[None], all), here, (watched.t, watched.y))
 
         t, y = lax.cond(eqxi.unvmap_any(jnp.any(new)), with_new, lambda: (watched.t, watched.y))
-        followed = tuple(f._replace(count=f.count + c) for f, c in zip(move.followed, crossed))
+        followed = tuple(f._replace(count=f.count + c.astype(f.count.dtype)) for f, c in zip(move.followed, crossed))
         begins = keep & ~watched.begun
 
         def with_turns(values, turns):

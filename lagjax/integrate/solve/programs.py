@@ -35,6 +35,7 @@ from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import (
     HashablePart,
+    as_usual,
     compiler_options,
     filled_up,
     hashable_partition,
@@ -105,6 +106,7 @@ class _Programs:
         self.robust: Callable = jit(partial(_of_arrays, static, True, count))
         self._count, self._compiled = count, set()
 
+    @as_usual
     def run(self, arrays: list, count: int, shown: bool | None, settled: bool = False) -> Trajectory:
         """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given.
 

@@ -89,7 +89,7 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def _eliminated(matrix: Array):
     n = matrix.shape[0]
-    scale = 1 / jnp.max(jnp.abs(matrix), axis=1)
+    scale = (1 / jnp.max(jnp.abs(matrix), axis=1)).astype(matrix.dtype)
     work = jnp.concatenate([matrix * scale[:, None], jnp.diag(scale)], axis=1)
     row = np.arange(n)
 

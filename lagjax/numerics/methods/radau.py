@@ -371,7 +371,7 @@ class Radau5(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     def _powers_of_step(self, y: PyTree):
         leaves = jtu.tree_map(
-            lambda power, y: jtu.tree_map(lambda x: np.full(np.shape(x), power), y), self.step_powers, y
+            lambda power, y: jtu.tree_map(lambda x: np.full(np.shape(x), power, x.dtype), y), self.step_powers, y
         )
         return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(leaves)])
 
@@ -428,7 +428,9 @@ class Stages(eqx.Module):
 def _inverses(jacobian: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Inverse]:
     """(gamma I - hJ)^-1, and (A^-1 x I - I x hJ)^-1 from that and one complex inverse."""
     unit = jnp.eye(jacobian.shape[0], dtype=jacobian.dtype)
-    real, pair = dense.inverse(float(GAMMA) * unit - jacobian), dense.inverse(complex(LAMBDA) * unit - jacobian)
+    of_pair = {4: np.complex64, 8: np.complex128}[jacobian.dtype.itemsize]
+    real = dense.inverse(float(GAMMA) * unit - jacobian)
+    pair = dense.inverse(complex(LAMBDA) * unit.astype(of_pair) - jacobian.astype(of_pair))
 
     def outer(right: Any, left: Any, like: Array) -> Array:
         return jnp.asarray(np.outer(right, left), like.dtype)

@@ -1,0 +1,134 @@
+"""Motions, constraints, events and gradients while JAX's own settings for finding errors are on."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+# A number that stands in each mode's Lagrangian, so that no program of another mode serves it.
+MODES = {
+    "disable_jit": (jax.disable_jit, 2.0),
+    "debug_nans": (partial(jax.debug_nans, True), 3.0),
+    "debug_infs": (partial(jax.debug_infs, True), 4.0),
+    "strict dtypes": (partial(jax.numpy_dtype_promotion, "strict"), 5.0),
+    "enable_checks": (partial(jax.enable_checks, True), 6.0),
+}
+TS = np.array([0.0, 0.4, 0.9])
+TOLERANCE = {"rtol": 1e-8, "atol": 1e-8}
+
+
+@pytest.fixture(params=MODES)
+def mode(request):
+    """Whether JAX is in this mode, in a context of its own, and its number."""
+    context, number = MODES[request.param]
+    return context, number
+
+
+def spring(m):
+    """A mass m on a spring of stiffness k."""
+    return lj.System(lambda t, q, v, params: 0.5 * m * v**2 - 0.5 * params["k"] * q**2)
+
+
+def raises_in(context, error, act):
+    """Twin: the mode is on where the user's own code runs."""
+    with context(), pytest.raises(error):
+        act()
+
+
+def test_the_modes_are_on():
+    """In each mode that changes what JAX does, something of the user's fails or runs that else does not."""
+    zero, one = jnp.zeros(()), jax.device_put(1.0)
+    raises_in(MODES["debug_nans"][0], FloatingPointError, lambda: jnp.log(zero - 1.0))
+    raises_in(MODES["debug_infs"][0], FloatingPointError, lambda: 1.0 / zero)
+    raises_in(MODES["strict dtypes"][0], jax.dtypes.TypePromotionError, lambda: one * jnp.arange(2))
+    with jax.disable_jit():
+        assert jax.jit(lambda x: 2.0 if x > 0 else 3.0)(one) == 2.0
+
+
+@pytest.mark.slow
+def test_events_in_a_mode(mode):
+    """A motion with an event at its known time, and room for others that do not happen; a second call; by steps."""
+    context, m = mode
+    k, w = 2.0 * m, np.sqrt(2.0)
+    zero = lj.Crossing(lambda t, q, v, params: q)
+    with context():
+        first, again = (lj.integrate(spring(m), 1.0, 0.0, {"k": k}, ts=TS, events={"zero": zero}) for _ in range(2))
+        late = lj.integrate(spring(m), 1.0, 0.0, {"k": k}, ts=2 * TS, events={"zero": zero})
+        at = first.at(0.6)
+    assert np.allclose(first.q, np.cos(w * TS), atol=1e-8) and np.array_equal(first.q, again.q)
+    assert first.events["zero"].count == 0 and np.allclose(late.events["zero"].t[:1], np.pi / 2 / w, atol=1e-8)
+    assert np.isclose(at.q, np.cos(w * 0.6), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_constraints_and_gradients_in_a_mode(mode):
+    """A mass turns on a rod as it must; slopes by stiffness, in a program of the user's and out of it."""
+    context, m = mode
+    rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)
+    turning = lj.System(lambda t, q, v, params: 0.5 * m * (v["x"] ** 2 + v["y"] ** 2), constraints={"rod": rod})
+
+    def end(k):
+        return lj.integrate(spring(m), 1.0, 0.0, {"k": k}, ts=TS, **TOLERANCE).q[-1]
+
+    one = jax.device_put(jnp.asarray(m))
+    with context():
+        traj = lj.integrate(turning, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 2.0}, ts=TS, **TOLERANCE)
+        outside, inside = jax.grad(end)(one), jax.jit(jax.grad(end))(one)
+    assert np.allclose(traj.q["x"], np.cos(2.0 * TS), atol=1e-7)
+    exact = -TS[-1] * np.sin(TS[-1]) / (2.0 * m)
+    assert np.allclose([outside, inside], exact, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_nothing_is_transferred_by_a_program():
+    """A program of the user's is traced and run where transfers are refused; twin: one that he makes is."""
+    run = jax.jit(lambda q, k: lj.integrate(spring(7.0), q, 0.0, {"k": k}, ts=TS).q)
+    q, k = jax.device_put((1.0, 7.0))
+    with jax.transfer_guard("disallow"):
+        first, again = run(q, k), run(q, k)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="Disallowed"):
+            run(q + np.float64(1.0), k)
+    assert np.allclose(first, np.cos(TS), atol=1e-8) and np.array_equal(first, again)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["debug_nans", "disable_jit", "strict dtypes"], indirect=True)
+def test_failures_sweeps_and_fits_in_a_mode(mode):
+    """A motion that fails says why, a sweep has NaN for it alone, a stiff method and a fit do their work."""
+    context, m = mode
+    pole = lj.System(lambda t, q, v, params: 0.5 * m * v**2 + m * params["c"] / q)
+    t = np.linspace(0.0, 2.0, 9)
+    measured = lj.Record(t, q=np.cos(1.5 * t), sigma=1e-3)
+    with context():
+        with pytest.raises((RuntimeError, ValueError), match="Fix"):
+            lj.integrate(pole, 1.0, 0.0, {"c": 1.0}, ts=np.array([0.0, 5.0]), max_steps=500)
+        run = lambda at: lj.integrate(spring(m), at["q"], 0.0, {"k": m}, ts=TS).q[-1]
+        swept = lj.sweep(run, {"q": np.array([1.0, np.nan])}, progress=False)
+        stiff = lj.integrate(spring(m), 1.0, 0.0, {"k": m}, ts=TS, method=lj.Radau5())
+        found = lj.fit(spring(m), measured, {"k": m}, progress=False)
+    assert np.isclose(swept.values[0], np.cos(TS[-1]), atol=1e-8) and np.isnan(swept.values[1])
+    assert np.allclose(stiff.q, np.cos(TS), atol=1e-6)
+    assert np.isclose(found.params["k"], 1.5**2 * m, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half", (jnp.float16, jnp.bfloat16))
+def test_networks_in_half_precision(half):
+    """Parameters in half precision give the motion of their values, and slopes in their dtype; twin: other values."""
+    stiffness = lambda t, q, v, params: 0.5 * v**2 - 0.5 * jnp.sum(params["w"] @ params["w"]) * q**2
+
+    def end(params, q0=np.float32(1.0)):
+        return lj.integrate(lj.System(stiffness), q0, np.float32(0.0), params, ts=TS).q[-1]
+
+    # 0.5 and 1.5 are exact in half precision.
+    w = {"w": jnp.array([0.5, 1.5], half)}
+    rate = np.sqrt(2.5)
+    slope = -TS[-1] * np.sin(rate * TS[-1]) / rate * np.array([0.5, 1.5])
+    found, slopes = jax.value_and_grad(end)(w)
+    assert found.dtype == jnp.float32 and np.isclose(found, np.cos(rate * TS[-1]), atol=1e-4)
+    assert slopes["w"].dtype == half and np.allclose(slopes["w"].astype(np.float32), slope, rtol=0.02)
+    assert not np.isclose(end({"w": jnp.array([0.5, 1.25], half)}), found, atol=1e-2)
