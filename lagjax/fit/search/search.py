@@ -478,7 +478,7 @@ def _search(problem: FitProblem, course: Course, optimiser: Any, limit: int, tel
         costs = costs.at[turn].set(jnp.where(done, end.cost, costs[turn]))
         next_y, first = begin(turn + 1)
         y = jax.tree.map(lambda new, old: jnp.where(done, new, old), next_y, end.y)
-        return turn + done, jnp.where(done, first, number + 1), y, taken + steps, costs, best
+        return turn + done.astype(turn.dtype), jnp.where(done, first, number + 1), y, taken + steps, costs, best
 
     y, number = begin(0)
     no_end = _no_end(problem, y, _keeps_slopes(problem, optimiser))
