@@ -32,7 +32,7 @@ from lagjax.integrate.solve.programs import method_of
 from lagjax.integrate.stepping.projected_solver import Field
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import of_a_step
-from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory.results import RESULTS, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import jitted
 from lagjax.mechanics import (
@@ -101,11 +101,12 @@ def stopped_early(trajectory: Trajectory, settings: Settings, guards: str = "") 
     if reason:
         return f"{what}: {reason}"
     shown = f"The last state is {describe(end.q)}, v = {describe(end.v)}."
-    if bool(trajectory.result == RESULTS.max_steps_reached):
-        return f"{what}: max_steps = {settings.max_steps} is used up. {shown} " + _used_up(
-            trajectory, settings, guards, mass
-        )
+    if is_among(trajectory.result, [RESULTS.max_steps_reached]):
+        used_up = f"max_steps = {settings.max_steps} is used up. {shown}"
+        return f"{what}: {used_up} {_used_up(trajectory, settings, guards, mass)}"
     said = f"{what}: {RESULTS[trajectory.result]} {shown}"
+    if is_among(trajectory.result, [RESULTS.no_progress]):
+        return f"{said} {_used_up(trajectory, settings, guards, mass)}"
     if mass and mass.crossed:
         return _with_cause(said, mass[:2])
     if settings.controller is not None:

@@ -117,7 +117,9 @@ def integrate(
       like `events`, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,
       which says how much memory reverse mode may use.
-    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events.
+    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events. A motion
+      ends before (`lj.RESULTS.no_progress`) after 4096 attempts in a row, each so short that a hundred times
+      `max_steps` of them would not be enough.
     - `throw`: raise if the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
     - `progress`: True shows a progress meter. By default only the wait for the compiler is shown, if someone may look.
@@ -145,7 +147,7 @@ def integrate(
     - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; `ts` that is not monotonic; a
       tolerance below the dtype's resolution.
     - `ValueError` for a start off the constraints, or one where L or its equations are singular or not finite.
-    - `RuntimeError` if the integration stops early: `max_steps` reached, or a step size that collapsed.
+    - `RuntimeError` if the integration stops early: `max_steps` reached, or steps that collapsed.
     - Warns (`lj.AccuracyWarning`) if `scaled_error` is above 1: if the estimated error is more than 10,000 tolerances
       or leaves fewer than three digits; without an estimate, if the Jacobi integral must be constant and changed by
       1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. For batches look at

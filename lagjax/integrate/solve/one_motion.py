@@ -69,12 +69,17 @@ PHASE_STEPS = 0.2
 # With fixed steps no tolerance says what change to expect.
 FIXED_STEPS_ALLOW = 1e-5
 # Results that the robust solve would give as well.
-UNAFFECTED = RESULTS.max_steps_reached, RESULTS.start_off_constraints, RESULTS.tolerance_too_small, RESULTS.unordered
+UNAFFECTED = (
+    RESULTS.max_steps_reached, RESULTS.no_progress, RESULTS.start_off_constraints, RESULTS.tolerance_too_small,
+    RESULTS.unordered,
+)  # fmt: skip
 # diffrax's results and the names of ours that replace them.
 TRANSLATED = {
     "nonfinite_input": "not_finite",
     "nonlinear_divergence": "unsolved_step",
     "nonlinear_max_steps_reached": "unsolved_step",
+    # Controllers end a motion by one of diffrax's own results; none of diffrax's gives this one.
+    "max_steps_rejected": "no_progress",
 }
 
 
@@ -461,9 +466,9 @@ def _controller(equations: Equations, ts: Array, settings: Settings, scales, bar
     # Where no output is the end of a step.
     ends = ts if arriving and settings.outputs == "exact" else ts[np.array([0, -1])]
     if settings.jump_ts is None and not repeated:
-        return StepToOutputs(controller, ends, settings.shares) if arriving else controller
+        return StepToOutputs(controller, ends, settings.shares, settings.max_steps) if arriving else controller
     jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
-    return StepToOutputs(controller, together(ends, jumps), settings.shares)
+    return StepToOutputs(controller, together(ends, jumps), settings.shares, settings.max_steps)
 
 
 def resolution(ts: Array):

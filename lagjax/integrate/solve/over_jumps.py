@@ -300,7 +300,9 @@ def _ending(
     # Where a force jumps in time, the side of which a guard is belongs to the next leg.
     whole = end.t >= last
     below = ended_well(result) & ~onward & whole & _is_below(end, given, guards, count, settings.rtol)
-    wrong = ~way.free & (below | ~ended_well(result) & (result != RESULTS.max_steps_reached))
+    wrong = ~way.free & (
+        below | ~ended_well(result) & (result != RESULTS.max_steps_reached) & (result != RESULTS.no_progress)
+    )
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
     return ModeEnding(onward, wrong, first, end, result)

@@ -6,12 +6,17 @@ it. Outputs then cost nothing apart from the steps that they shorten.
 
 Times at which a force jumps are ends of steps, too, and each step stays on its own side of them: it begins and ends a
 few units of round-off away from a jump, so that the force is never evaluated at the jump itself.
+
+A motion whose steps have collapsed is not stepped until `max_steps`: it ends after `TRIES` attempts in a row, accepted
+or rejected, after each of which the proposed step was so short that a hundred times `max_steps` of such steps would not
+reach the last time. Attempts that end at an output do not count, so that outputs which crowd together end nothing.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,22 +30,25 @@ from lagjax.mechanics import Equations
 WHOLE_STEPS = 1.0, 1e30
 # The distance kept from a jump, in round-offs of the time: a user may compute the same time in two ways.
 MARGIN = 4
+# So many attempts take a few seconds in large systems; a collision that passes takes a few hundred.
+TRIES, TIMES = 4096, 100
 
 
 class StepToOutputs(diffrax.AbstractStepSizeController):
     """Wrap `controller`: each of the increasing times `ts` is the end of a step.
 
     `shares`: the part of the proposed first step that is taken; and the longest step, as a part of the interval between
-    two of `ts`.
+    two of `ts`. `max_steps`: None if a motion may take as many as it wants.
     """
 
     controller: diffrax.PIDController | PerCoordinateTolerance
     ts: Float[Array, " T"]
     shares: Float[Array, " 2"]
+    max_steps: int | None = eqx.field(static=True, default=None)
 
     def wrap(self, direction):
         """Wrap the inner controller likewise; `ts` stay, since time always runs forward here."""
-        return StepToOutputs(self.controller.wrap(direction), self.ts, self.shares)
+        return StepToOutputs(self.controller.wrap(direction), self.ts, self.shares, self.max_steps)
 
     def init(
         self, terms: diffrax.AbstractTerm, t0: Array, t1: Array, y0: PyTree, dt0: Any, args: PyTree, func: Callable,
@@ -49,14 +57,14 @@ class StepToOutputs(diffrax.AbstractStepSizeController):
         """Choose the first step."""
         proposed, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         index, step = jnp.minimum(1, self.ts.size - 1), self.shares[0] * (proposed - t0)
-        return self._toward(index, t0, step), (state, index, step)
+        return self._toward(index, t0, step), (state, index, step, jnp.asarray(0))
 
     def adapt_step_size(
         self, t0: Array, t1: Array, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order: Any,
         controller_state: PyTree,
     ):  # fmt: skip
         """Decide whether to keep a step, and choose the next one."""
-        state, index, before = controller_state
+        state, index, before, short = controller_state
         # Output times may be closer together than the least step; that must not end the solve.
         least = self.controller.dtmin
         judged = t1 if least is None else jnp.maximum(t1, t0 + 2 * least)
@@ -64,11 +72,19 @@ class StepToOutputs(diffrax.AbstractStepSizeController):
             t0, judged, y0, y1_candidate, args, y_error, error_order, state
         )
         proposed = next_t1 - next_t0
+        if least is not None:
+            # The step itself was rejected, not the longer one that was judged, or it would be tried again for ever.
+            proposed = jnp.where(keep, proposed, proposed * ((t1 - t0) / (judged - t0)))
+            result = diffrax.RESULTS.where(~keep & (proposed < least), diffrax.RESULTS.dt_min_reached, result)
         next_t0 = next_t0 if least is None else jnp.where(keep, t1, t0)
         # That a step was shortened is no reason to reduce the size proposed before it.
         proposed = jnp.where(keep, jnp.maximum(proposed, jnp.where(t1 - t0 < before, before, 0.0)), proposed)
+        if self.max_steps is not None:
+            longer = TIMES * self.max_steps * proposed > self.ts[-1] - next_t0
+            short = jnp.where(longer, 0, jnp.where(t1 < self.ts[index], short + 1, short))
+            result = diffrax.RESULTS.where(short >= TRIES, diffrax.RESULTS.max_steps_rejected, result)
         index = jnp.where(keep & (t1 >= self.ts[index]), jnp.minimum(index + 1, self.ts.size - 1), index)
-        return keep, next_t0, self._toward(index, next_t0, proposed), jumped, (state, index, proposed), result
+        return keep, next_t0, self._toward(index, next_t0, proposed), jumped, (state, index, proposed, short), result
 
     def _toward(self, index, t: Array, step):
         left = self.ts[index] - t

@@ -45,6 +45,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     reset_not_finite = "The state after a switch is NaN or infinite."
     no_such_phase = "start= is not the number of a phase."
     raised = "A function that is called in Python, by a callback, raised an exception."
+    no_progress = (
+        "The steps became so short, for thousands of them in a row, that a hundred times max_steps would not be enough."
+    )
 
 
 # diffrax has no message for a success, and equinox has no public way to set one.
