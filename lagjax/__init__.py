@@ -62,7 +62,8 @@ from lagjax.integrate import (
     sticks,
     touches,
 )
-from lagjax.numerics import Dopri8, Nystrom8, Nystrom12, Radau5, Tsit5
+from lagjax.numerics import RK4, Dopri8, Nystrom8, Nystrom12, Radau5, Tsit5
+from lagjax.steps import rollout, step
 from lagjax.system import PrecisionWarning
 
 # isort: split
@@ -194,8 +195,11 @@ __all__ = [
     "PoincareSection",
     "periods",
     "turning_points",
+    "step",
+    "rollout",
     "Dopri8",
     "Tsit5",
+    "RK4",
     "Nystrom8",
     "Nystrom12",
     "Radau5",

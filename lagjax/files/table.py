@@ -25,7 +25,7 @@ from lagjax.numerics import tolerance_of_the_controller
 # A module, and the classes that are found there: their fields.
 CLASSES = """
 lagjax.numerics.methods.runge_kutta
-  Dopri8 Tsit5: in_a_loop
+  Dopri8 Tsit5 RK4: in_a_loop
 lagjax.numerics.methods.nystrom
   Nystrom8 Nystrom12: in_a_loop
 lagjax.numerics.methods.radau

@@ -15,6 +15,7 @@ from lagjax.jaxtools.cache import (
     varies,
 )
 from lagjax.jaxtools.compiled import compiled, compiler_options
+from lagjax.jaxtools.fuse_both_modes import one_function_in_both_modes
 from lagjax.jaxtools.fuse_cpu import PRODUCT, TOGETHER, apart, calls_host, kept_as_call, one_function, poisoned
 from lagjax.jaxtools.jaxpr import (
     ADDITIVE,

@@ -132,6 +132,50 @@ def weighted_sum(start: PyTree, weights: Array, increments):
     return total if start is None else jtu.tree_map(lax.add, start, total)
 
 
+class _KuttaInArrays(diffrax.AbstractERK):
+    """Kutta's method with a stage at the end of the step, which is the first one of the next step."""
+
+    tableau: ClassVar = diffrax.ButcherTableau(
+        c=np.array([1 / 2, 1 / 2, 1, 1]),
+        b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6, 0]),
+        b_error=np.array([0, 0, 0, 1 / 6, -1 / 6]),
+        a_lower=(
+            np.array([1 / 2]),
+            np.array([0, 1 / 2]),
+            np.array([0, 0, 1.0]),
+            np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+        ),
+    )
+    interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms: diffrax.AbstractTerm):
+        return 4
+
+
+class RK4(ExplicitRungeKutta):
+    """Kutta's method of order 4, "the" Runge-Kutta method: four evaluations per step.
+
+    The default of `lj.step` and `lj.rollout`. With the rate of change k₅ at the end of a step, which the next step
+    begins with, `k₁/6 + k₂/3 + k₃/3 + k₅/6` is of order 3, so that `h (k₄ - k₅)/6` estimates the error.
+
+    >>> import diffrax
+    >>> growth = diffrax.ODETerm(lambda t, y, args: y)
+    >>> print(RK4().step(growth, 0.0, 1.0, 24.0, None, None, True)[0])  # 24 (1 + 1 + 1/2 + 1/6 + 1/24)
+    65.0
+
+    Source: Kutta, Z. Math. Phys. 46 (1901) 435; Hairer, Nørsett & Wanner, *Solving ODEs I*, Table II.1.2, and the
+    conditions of order 3, Eq. (II.1.11).
+    """
+
+    shipped: ClassVar = _KuttaInArrays()
+    tableau: ClassVar = _KuttaInArrays.tableau
+    interpolation_cls: ClassVar[Callable] = _KuttaInArrays.interpolation_cls
+
+    def order(self, terms: diffrax.AbstractTerm):
+        """4."""
+        return 4
+
+
 class Tsit5(ExplicitRungeKutta):
     """Tsitouras' method of order 5, with an embedded one of order 4: six evaluations per step.
 
