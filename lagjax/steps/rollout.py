@@ -112,7 +112,7 @@ def _rolled(
     system: System, s: State, held: PyTree, merge: Traced | None, dt: Array, method: ExplicitRungeKutta, count: int,
     by_name: bool,
 ):  # fmt: skip
-    if by_name:
+    if by_name and count:
         assert merge is not None
         _check_read(system, s, held, merge)
     if not count:
@@ -177,7 +177,7 @@ def _rows(controls: Any, dtype: DTypeLike):
         shapes = jtu.tree_map(np.shape, controls)
         raise ValueError(
             f"controls must be arrays with one row for each step, as many in all, and have the shapes {shapes!s:.200}.\n"
-            "Usual cause: one value for all steps, which belongs into params; or controls of two lengths.\n"
+            "Usual cause: one value for all steps, which belongs into params; controls of two lengths; or 1e3 steps, a float.\n"
             'Fix: controls={"torque": jnp.zeros(100)} for 100 steps; or controls=100 if there is nothing to control.'
         )
     return found, lengths.pop()

@@ -24,6 +24,7 @@ from lagjax.system import State, System, check_system, coordinates, model_of, tr
 
 # A state counts as returned to the constraints within so many units of round-off; else it is NaN.
 ROUND_OFFS = 1e4
+DEFAULT = RK4()
 
 
 def step(
@@ -142,7 +143,7 @@ def _explicit(method: ExplicitRungeKutta, accelerations: Any, t: Array, y: tuple
 
 def explicit_method(method: Any) -> ExplicitRungeKutta:
     """The method for steps of a fixed length, `RK4` by default; raise unless it is one of lagjax's explicit ones."""
-    ours = RK4() if method is None else method if isinstance(method, ExplicitRungeKutta) else None
+    ours = DEFAULT if method is None else method if isinstance(method, ExplicitRungeKutta) else None
     if ours is None and isinstance(method, diffrax.AbstractSolver):
         ours = in_our_form(method)
     if ours is None:
