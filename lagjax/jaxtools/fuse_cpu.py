@@ -65,8 +65,8 @@ TOGETHER = 256
 # A matrix product of more multiplications is left to the library: that gains more than one function.
 PRODUCT = 4096
 AT_ANY_SIZE = ELEMENTWISE | MOVING | EQUINOX_PRIMITIVES | {
-    "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "reduce_precision", "sincos", "tile",
-    "xla_metadata_value",
+    "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "empty2", "reduce_precision", "sincos",
+    "tile", "xla_metadata_value",
 }  # fmt: skip
 SMALL = REDUCING | ACCUMULATING - {"cumlogsumexp"} | {"argmax", "argmin"}
 WITH_BODIES = CALLS | CALLS_WITH_RULES | CONTROL_FLOW | {"one_function"}

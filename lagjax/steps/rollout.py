@@ -176,8 +176,8 @@ def _rows(controls: Any, dtype: DTypeLike):
     if len(lengths) != 1 or None in lengths:
         shapes = jtu.tree_map(np.shape, controls)
         raise ValueError(
-            f"controls must be arrays with one row for each step, as many in all, and have the shapes {shapes!s:.200}.\n"
-            "Usual cause: one value for all steps, which belongs into params; controls of two lengths; or 1e3 steps, a float.\n"
+            f"controls must be arrays with one row for each step, as many in all, and have shapes {shapes!s:.200}.\n"
+            "Usual cause: one value for all steps, which belongs into params; two lengths; or 1e3 steps, a float.\n"
             'Fix: controls={"torque": jnp.zeros(100)} for 100 steps; or controls=100 if there is nothing to control.'
         )
     return found, lengths.pop()
@@ -188,7 +188,7 @@ def _as_rows(x: Any, dtype: DTypeLike):
     if x.dtype.kind not in "fiub" and not jnp.issubdtype(x.dtype, jnp.floating):
         raise TypeError(
             f"controls hold {x.dtype}, and must be real numbers, or the number of steps.\n"
-            'Usual cause: a number of steps that is no whole number, as 1e3; or text.\nFix: controls=1000.'
+            "Usual cause: a number of steps that is no whole number, as 1e3; or text.\nFix: controls=1000."
         )
     return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 

@@ -65,7 +65,8 @@ def step(
     - `TypeError`, `ValueError` for arguments of the wrong kind, shape or dtype; for a `Hybrid`, whose steps would have
       to end at its switches, as those of `lj.integrate` do.
 
-    Order: that of the method, with constraints too; `tests/steps/test_step.py` measures it.
+    Order: that of the method, with constraints too; `tests/steps/test_step.py` measures it. Derivatives are those of
+    the step; with constraints the change of the matrix that returns it is left out, an error of the method's order.
 
     Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.1; Hairer, Lubich & Wanner, *Geometric Numerical
     Integration*, §IV.4 (projection).

@@ -34,9 +34,11 @@ def kutta(t, y, h, last=1 / 6):
 
 
 def after(system, q, v, params, span, count, method):
-    """The position and velocity after so many steps."""
-    _, q, v = lj.rollout(system, q, v, params, count, span / count, method=method)
-    return jax.tree.map(lambda x: x[-1], (q, v))
+    """The position and velocity after so many steps, which are one program whatever their length."""
+    state = 0.0, q, v
+    for _ in range(count):
+        state = lj.step(system, *state, params, span / count, method=method)
+    return state[1:]
 
 
 def orders(errors):
@@ -70,17 +72,19 @@ def test_order_and_residuals_on_a_rod():
     ).y[:, -1]  # fmt: skip
     exact = PARAMS["l"] * np.array([np.sin(swing[0]), -np.cos(swing[0])])
     errors = []
+    # x² + y² is a sum of numbers of the size of l², each a unit of round-off or two off.
+    round_off = 16 * np.finfo(float).eps * PARAMS["l"] ** 2
     for count in (16, 32, 64):
         q, v = after(rod_pendulum, *HORIZONTAL, PARAMS, 1.0, count, None)
         errors.append(np.hypot(q["x"] - exact[0], q["y"] - exact[1]))
-        assert abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2) < 2e-15
-        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 2e-14
+        assert abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2) < round_off
+        assert abs(q["x"] * v["x"] + q["y"] * v["y"]) < 8 * round_off
     assert np.all(np.abs(orders(errors) - 4) < 0.35), errors
     _, q, _ = lj.step(rod_pendulum, 0.0, *HORIZONTAL, PARAMS, 0.4)
-    assert abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2) < 2e-15
-    rates = lambda y: (y[1], lj.accelerations(rod_pendulum, 0.0, *y, PARAMS)[0])
-    term = diffrax.ODETerm(lambda t, y, args: rates(y))
-    (q, _), *_ = lj.RK4().step(term, 0.0, 0.05, HORIZONTAL, None, None, True)
+    assert abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2) < round_off
+    term = diffrax.ODETerm(lambda t, y, args: (y[1], lj.accelerations(rod_pendulum, t, *y, PARAMS)[0]))
+    moving = HORIZONTAL[0], {"x": 0.0, "y": -3.0}
+    (q, _), *_ = jax.jit(lambda y: lj.RK4().step(term, 0.0, 0.2, y, None, None, True))(moving)
     assert abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2) > 1e-6
 
 
@@ -98,13 +102,14 @@ skate = lj.System(
 def test_a_constraint_of_velocities():
     """A skate that turns steadily runs on a circle, and its blade does not slip."""
     errors = []
-    for count in (8, 16, 32):
+    for count in (16, 32, 64):
         q, v = after(skate, jnp.zeros(3), jnp.array([1.5, 0.0, 2.0]), None, 2.0, count, None)
         errors.append(np.max(np.abs(q[:2] - 0.75 * np.array([np.sin(4.0), 1 - np.cos(4.0)]))))
         assert abs(v[0] * np.sin(q[2]) - v[1] * np.cos(q[2])) < 1e-14
     assert np.all(np.abs(orders(errors) - 4) < 0.35), errors
 
 
+@pytest.mark.slow
 def test_a_closed_loop():
     """Two rods of the same equation depend on each other: the step is that with one of them."""
     twice = lj.System(rod_pendulum.lagrangian, {**rod_pendulum.constraints, "again": rod_pendulum.constraints["rod"]})
@@ -120,14 +125,10 @@ def test_float32_stays_and_late_steps_are_as_long():
     assert abs(q - 1e-3) < 1e-9 < abs((np.float32(1e4) + np.float32(1e-3)) - np.float32(1e4) - 1e-3)
 
 
-def height(t, q, v, params):
-    """Where the pendulum hits a wall."""
-    return q
-
-
 def test_refused():
     """A hybrid, an implicit method, a class, and a step that is no number, in words."""
-    bouncing = lj.Hybrid({"flying": damped}, [lj.Switch("flying", to="flying", when=height)])
+    wall = lj.touches(lambda t, q, params: q, restitution=0.5)
+    bouncing = lj.Hybrid({"flying": damped}, [lj.Switch("flying", to="flying", when=wall)])
     with pytest.raises(TypeError, match="has one for each of its phases"):
         lj.step(bouncing, 0.0, 1.0, 0.0, DAMPED, 0.1)
     for method in (lj.Radau5(), lj.RK4, diffrax.Kvaerno5()):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax import Dopri8, Tsit5
+from lagjax import RK4, Dopri8, Tsit5
 
 ENDS = (0.0, 5.0)
 PAIRS = [
@@ -31,7 +31,7 @@ def solve(method, controller, ts=None, dt0=None):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", [Tsit5, Dopri8])
+@pytest.mark.parametrize("kind", [Tsit5, Dopri8, RK4])
 @pytest.mark.parametrize("known", [False, True])
 def test_stages_in_a_loop(kind, known):
     """With the vector field in a loop, steps and reverse derivatives are the same, also with a known first stage."""
@@ -84,7 +84,7 @@ def exact():
 @pytest.mark.optimised
 @pytest.mark.parametrize(
     ("method", "steps", "order"),
-    [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (Misprinted(), (80, 160), 2)],
+    [(Tsit5(), (80, 160), 5), (Dopri8(), (10, 20), 8), (RK4(), (80, 160), 4), (Misprinted(), (80, 160), 2)],
     ids=name_of,
 )
 def test_order(exact, method, steps, order):
@@ -92,6 +92,13 @@ def test_order(exact, method, steps, order):
     run = jax.jit(lambda dt: solve(method, diffrax.ConstantStepSize(), dt0=dt).ys["angle"][-1])
     errors = [abs(float(run(jnp.asarray(ENDS[1] / n))) - exact) for n in steps]
     assert abs(np.log2(errors[0] / errors[1]) - order) < 0.75
+
+
+def test_kuttas_error_estimate():
+    """On y' = y the solution of order 3 is the series up to h³, and leaves h⁴ out by 1/24 - 1/36; twin: not by 1/24."""
+    y1, error, *_ = RK4().step(diffrax.ODETerm(lambda t, y, args: y), 0.0, 1e-2, 1.0, None, None, True)
+    np.testing.assert_allclose(y1, np.sum(1e-2 ** np.arange(5) / [1, 1, 2, 6, 24]), rtol=1e-15)
+    assert abs(error + 1e-8 / 144) < 1e-10 < abs(error + 1e-8 / 24)
 
 
 def test_zero_weights_cost_nothing():
