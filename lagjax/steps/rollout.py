@@ -24,9 +24,8 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools import compiled, numpy_of, one_function_in_both_modes
-from lagjax.mechanics import equations_of
 from lagjax.numerics import ExplicitRungeKutta
-from lagjax.steps.step import advanced, explicit_method, step_length
+from lagjax.steps.step import advanced, equations_for_steps, explicit_method, step_length
 from lagjax.system import Call, State, System, Traced, check_system, coordinates, model_of, traced_call, traced_system
 
 
@@ -132,13 +131,13 @@ def _run(system: System, s: State, t: Array, held: PyTree, merge: Traced | None,
     dts = jnp.where(np.arange(outer * inner) < count, dt, jnp.zeros_like(dt))
     rows = jtu.tree_map(lambda x: _pieces(x, outer, inner), (t, held))
     rows = *rows, dts.reshape(outer, inner)
-    fixed = equations_of(model_of(system, *s), fast=True) if merge is None else None
+    fixed = equations_for_steps(model_of(system, *s)) if merge is None else None
 
     def one(y: tuple, row: tuple):
         t, u, dt = row
         equations = fixed
         if merge is not None:
-            equations = equations_of(model_of(system, t, *y, merge(s.params, u)), fast=True)
+            equations = equations_for_steps(model_of(system, t, *y, merge(s.params, u)))
         y = advanced(equations, method, t, y, dt)
         return y, y
 

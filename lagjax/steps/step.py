@@ -20,7 +20,7 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_traced, kept_as_call, numpy_of, one_function_in_both_modes
 from lagjax.mechanics import Equations, all_finite, equations_of, to_manifold
 from lagjax.numerics import RK4, ExplicitRungeKutta, in_our_form
-from lagjax.system import State, System, check_system, coordinates, model_of, traced_system
+from lagjax.system import Model, State, System, check_system, coordinates, model_of, traced_system
 
 # A state counts as returned to the constraints within so many units of round-off; else it is NaN.
 ROUND_OFFS = 1e4
@@ -57,8 +57,9 @@ def step(
     - `method`: `lj.RK4()` (the default, four evaluations), `lj.Tsit5()` or `lj.Dopri8()`. With constraints each step is
       followed by the return of q and v to them (`lagjax/mechanics/projection.py`), at which they hold to round-off.
 
-    **Returns:** the time, the position and the velocity, in the dtype of the state; NaN where the equations are
-    singular, or a step is too long to be returned to the constraints. Nothing is raised at run time.
+    **Returns:** the time, the position and the velocity, in the dtype of the state; NaN where the mass
+    matrix is singular (or, without constraints, neither definite nor dominated by its diagonal), or a step is too long
+    to be returned to the constraints. Nothing is raised at run time.
 
     **Raises:**
 
@@ -83,8 +84,14 @@ def _stepped(system: System, s: State, dt: Array, method: ExplicitRungeKutta):
 
 
 def _step(system: System, s: State, dt: Array, method: ExplicitRungeKutta):
-    equations = equations_of(model_of(system, *s), fast=True)
+    equations = equations_for_steps(model_of(system, *s))
     return s.t + dt, *advanced(equations, method, s.t, (s.q, s.v), dt)
+
+
+def equations_for_steps(model: Model) -> Equations:
+    """The equations of a model; with constraints, which may depend on each other, also those of the robust way."""
+    # Without the robust way a program compiles in a third of the time, and a definite mass matrix does not need it.
+    return equations_of(model, fast=True, fallback=bool(model.m))
 
 
 def advanced(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array) -> tuple:
