@@ -64,6 +64,8 @@ def test_as_accurate_as_the_steps(rtol):
     reached = np.max(np.abs(np.array(exact(6.0)) - [found.end.q, found.end.v]))
     assert max(worst(found)) < 3 * reached + 15 * rtol
     assert "outputs interpolated" in repr(found)
+    judged = lj.integrate(swing, 1.2, 0.0, ts=MANY, rtol=rtol, outputs="interpolated")
+    assert "the outputs" not in repr(judged) and max(worst(judged)) < 3 * float(np.nanmax(judged.error.v))
 
 
 @pytest.mark.slow

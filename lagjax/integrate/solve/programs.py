@@ -211,12 +211,12 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
 
 def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):
     name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
-    name += ", outputs interpolated" if settings.outputs == "interpolated" else ""
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
     # With many short legs the number of steps does not tell what chose them.
     chosen = chosen if settings.controller else "legs" if in_legs else "tolerance"
-    return SolveInfo(name, method.error_order(terms), evaluations_a_step(method), chosen)
+    interpolated = settings.outputs == "interpolated"
+    return SolveInfo(name, method.error_order(terms), evaluations_a_step(method), chosen, interpolated=interpolated)
 
 
 def method_of(settings: Settings, model: Model):

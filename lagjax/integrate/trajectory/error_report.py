@@ -227,10 +227,10 @@ def _chosen_by(trajectory, accepted):
     if how.steps != "tolerance" or account is None:
         return ""
     per_output = accepted / (len(account.t) - 1)
-    if per_output <= BY_OUTPUTS:
+    if per_output <= BY_OUTPUTS and not how.interpolated:
         return "the outputs: fewer of them cost less"
     growth = how.order * np.log10(int(trajectory.error.steps) / accepted)
-    tells = accepted > ENOUGH and per_output > NOT_BY_OUTPUTS
+    tells = accepted > ENOUGH and (per_output > NOT_BY_OUTPUTS or how.interpolated)
     if tells and growth > BY_LONGEST:
         return "max_step"
     if tells and growth < BY_STABILITY and how.evaluations is not None:

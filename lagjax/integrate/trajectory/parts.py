@@ -26,7 +26,7 @@ class SolveInfo(NamedTuple):
 
     `order`: of the error that chooses steps; `evaluations`: of the equations per step, None for an implicit method;
     `steps`: chosen by the "tolerance", by it over several "legs", "fixed", or by the user's "controller"; `backward`:
-    whether time decreases.
+    whether time decreases; `interpolated`: whether outputs lie inside steps.
     """
 
     method: str
@@ -34,6 +34,7 @@ class SolveInfo(NamedTuple):
     evaluations: int | None
     steps: str
     backward: bool = False
+    interpolated: bool = False
 
 
 class SolveOptions(NamedTuple):
@@ -60,7 +61,7 @@ class StaticPart(NamedTuple):
 
     @property
     def method(self) -> str:
-        return self.how.method
+        return self.how.method + (", outputs interpolated" if self.how.interpolated else "")
 
 
 def pack(problem: tuple, how: SolveInfo, integrate: Callable) -> tuple[PyTree, StaticPart]:
