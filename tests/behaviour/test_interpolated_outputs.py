@@ -14,6 +14,7 @@ from lagjax.numerics import Quintic
 from tests.behaviour.test_bad_input import refusal
 
 HALF, MANY, FEW = np.sin(0.6), np.linspace(0.0, 6.0, 121), np.array([0.0, 6.0])
+TIMES = np.linspace(0.0, 2.0, 21)
 swing = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.cos(q))
 # As many numbers as reverse mode replays for; their sum is one.
 shared = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
@@ -132,3 +133,31 @@ def test_refused():
         lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="linear")
     with refusal(ValueError, "which Dopri8 does not go with", r"method=lj.Tsit5\(\)"):
         lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="interpolated", method=lj.Dopri8())
+
+
+@pytest.mark.slow
+def test_networks_in_lanes_of_float32():
+    """A mass matrix that is a network: the default, at loose tolerance in lanes, has finite and right gradients."""
+    random = np.random.default_rng(0)
+    weights = [0.3 * random.normal(size=(2, 16)), 0.3 * random.normal(size=(16, 16)), 0.3 * random.normal(size=(16, 4))]
+
+    def lagrangian(t, q, v, p):
+        found = jnp.tanh(jnp.tanh(jnp.sin(q) @ p[0]) @ p[1]) @ p[2]
+        return 0.5 * v @ lj.learned.positive_definite(found[:3]) @ v - found[3]
+
+    system, starts = lj.System(lagrangian), random.normal(size=(2, 6, 2))
+
+    def slope(dtype, **how):
+        p, (q0, v0), ts = (
+            *(jax.tree.map(lambda x: jnp.asarray(x, dtype), x) for x in (weights, starts)),
+            TIMES.astype(dtype),
+        )
+        one = lambda p, q0, v0: lj.integrate(system, q0, v0, p, ts=ts, throw=False, **how)
+        assert jax.eval_shape(one, p, q0[0], v0[0]).static.method.startswith(
+            "Tsit5" if dtype == np.float32 else "Dopri8"
+        )
+        loss = lambda p: jnp.mean(jax.vmap(lambda q0, v0: one(p, q0, v0).q, (0, 0))(q0, v0) ** 2)
+        return jax.jit(jax.grad(loss))(p)
+
+    for found, right in zip(slope(np.float32), slope(np.float64)):
+        assert found.dtype == np.float32 and np.max(np.abs(found - right)) < 1e-3 * np.max(np.abs(right))
