@@ -11,6 +11,7 @@ such programs to bytes. Three parts of a motion prevent this, and are removed he
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -44,7 +45,9 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
 
     - `run`: any function that `jax.jit` accepts; it may contain motions and their derivatives.
     - `examples`: example arguments, which give structures, shapes and dtypes: numbers, arrays, `jax.ShapeDtypeStruct`,
-      in dictionaries, lists and tuples. All of them become arguments of the program; Python integers become floats.
+      in dictionaries, lists and tuples. All of them become arguments of the program; Python integers become floats. In
+      place of a module of equinox, such as a network, the program takes the list of its arrays, of whatever values:
+      `jax.tree.leaves(equinox.filter(net, equinox.is_array))`.
       Shapes may be symbolic (`jax.export.symbolic_shape`), for a batch of any size under `jax.vmap`; the number of
       output times may not.
     - `platforms`: such as `("cpu", "cuda")`; by default the platform that JAX uses here.
@@ -65,14 +68,16 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
             f"lj.export takes a function, not {type(run).__name__}.\n"
             "Fix: lj.export(lambda params: lj.integrate(system, q0, v0, params, ts=ts), params)."
         )
-    examples = jtu.tree_map(_as_argument, examples, is_leaf=lambda x: type(x) not in PLAIN)
+    given, places = jtu.tree_flatten(examples, is_leaf=lambda x: type(x) not in PLAIN)
+    examples = jtu.tree_unflatten(places, map(_as_argument, given))
 
     def program(*args):
         leaves, structure = jtu.tree_flatten(args)
         structures = []
 
         def of_leaves(*leaves):
-            results, tree = jtu.tree_flatten(plain(run(*jtu.tree_unflatten(structure, leaves))))
+            taken = places.flatten_up_to(jtu.tree_unflatten(structure, leaves))
+            results, tree = jtu.tree_flatten(plain(run(*jtu.tree_unflatten(places, map(_with_arrays, given, taken)))))
             structures.append(tree)
             return [_as_result(x) for x in results]
 
@@ -129,12 +134,26 @@ def _as_argument(x):
         return float(x)
     if isinstance(x, bool | float | complex | np.ndarray | np.generic | jax.Array | jax.ShapeDtypeStruct):
         return x
+    if (
+        isinstance(x, eqx.Module)
+        and not isinstance(x, ITEM)
+        and (arrays := jtu.tree_leaves(eqx.filter(x, eqx.is_array)))
+    ):
+        return arrays
     raise TypeError(
         f"an argument of an exported program must be a number or an array, in dictionaries, lists and tuples, and not "
         f"{type(x).__name__}, which the other process does not know.\n"
         "Usual cause: a named tuple, a class, a system or a function among the examples.\n"
         'Fix: {"x": 1.0, "y": 0.0} in place of a class; close over everything else: lj.export(lambda q0: ..., q0).'
     )
+
+
+def _with_arrays(example, argument):
+    """An argument as the function takes it: a module with other arrays."""
+    if not isinstance(example, eqx.Module):
+        return argument
+    arrays, rest = eqx.partition(example, eqx.is_array)
+    return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(arrays), argument), rest)
 
 
 def _as_result(x):

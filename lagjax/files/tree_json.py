@@ -113,6 +113,12 @@ class Writer:
             return {"function": function}
         if not isinstance(value, type) and (fields := fields_of(type(value))) is not None:
             return self._object(value, fields, path, inside)
+        if any(cls.__module__.split(".")[0] == "flax" for cls in type(value).__mro__):
+            raise NotWritable(
+                f"{path} is a {type(value).__name__} of flax, and files do not hold flax's objects.\n"
+                "Fix: graphdef, state = nnx.split(model); nnx.to_pure_dict(state) in params, dictionaries of arrays; "
+                "nnx.merge(graphdef, ...) of them in the Lagrangian."
+            )
         if isinstance(value, types.FunctionType) or callable(value):
             raise NotWritable(
                 f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are not "

@@ -183,3 +183,18 @@ def test_whole_numbers_and_structures():
     exported = lj.export(lambda a, b: (a["x"] + b[0], [b[1], None]), {"x": 1}, (2, np.arange(3)))
     found, (whole, nothing) = exported.call({"x": 0.5}, (0.25, np.array([4, 5, 6])))
     assert found == 0.75 and whole.dtype == jnp.int64 and nothing is None
+
+
+def test_weights_are_arguments():
+    """A network among the arguments is a list of arrays there: other weights give what they give here; twin: others."""
+    first, other = (eqx.nn.MLP(1, "scalar", 3, 1, jnp.tanh, key=jax.random.key(i)) for i in (0, 1))
+
+    def run(x, params):
+        return {"y": params["net"](x) + params["k"]}
+
+    program = lj.export(run, jnp.ones(1), {"net": first, "k": 1.0})
+    arrays = {"net": jax.tree.leaves(eqx.filter(other, eqx.is_array)), "k": 2.0}
+    found = export.deserialize(bytearray(program.serialize())).call(0.5 * jnp.ones(1), arrays)["y"]
+    assert np.isclose(found, other(0.5 * jnp.ones(1)) + 2.0) and not np.isclose(found, first(0.5 * jnp.ones(1)) + 2.0)
+    with pytest.raises(TypeError, match="must be a number or an array"):
+        lj.export(run, jnp.ones(1), {"net": eqx.nn.Identity(), "k": 1.0})

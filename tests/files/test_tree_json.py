@@ -25,3 +25,11 @@ def test_a_network_comes_back():
         wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
         with pytest.raises(ValueError, match=f"field {field}"):
             tree_json.Reader(dict(writer.arrays).pop).up(wrong)
+
+
+def test_objects_of_flax():
+    """An object of flax is refused with the calls that make data of it; twin: another class of its name with others."""
+    for module, fix in (("flax.nnx.statelib", "nnx.to_pure_dict"), ("flux", "use numbers, arrays")):
+        state = type("State", (), {"__module__": module})()
+        with pytest.raises(TypeError, match=f"(?s)params.net is a State.*Fix.*{fix}"):
+            tree_json.Writer().down(state, "params.net")

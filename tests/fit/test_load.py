@@ -1,6 +1,11 @@
 """Fits saved to files and loaded bit for bit, with the functions passed again."""
 
+import warnings
+from collections.abc import Callable
+
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -80,3 +85,61 @@ def test_constraints_and_options(tmp_path):
     for whole in (without, again):
         assert jax.tree.map(float, whole.q0) == jax.tree.map(float, found.q0)
     np.testing.assert_array_equal(again.motion().q["x"], found.motion().q["x"])
+
+
+class Own(eqx.Module):
+    """A module of the user's, with a layer in a list, and an activation."""
+
+    layers: list
+    activation: Callable
+
+    def __call__(self, x):
+        """A number."""
+        return jnp.sum(self.activation(self.layers[0](x)))
+
+
+def networks():
+    """Modules of equinox, of lagjax and of the user, and arrays in a dictionary, as flax has them."""
+    keys = iter(jax.random.split(jax.random.key(0), 8))
+    return {
+        "mlp": eqx.nn.MLP(1, "scalar", 3, 1, jax.nn.softplus, key=next(keys)),
+        "linear": eqx.nn.Linear(1, "scalar", key=next(keys)),
+        "in turn": eqx.nn.Sequential([eqx.nn.Linear(1, 3, key=next(keys)), eqx.nn.Lambda(jnp.tanh)]),
+        "conv": eqx.nn.Conv1d(1, 2, 1, key=next(keys)),
+        "own": Own([eqx.nn.Linear(1, 2, key=next(keys))], jnp.sin),
+        "learned": lj.learned.Network({"x": 1.0}, key=next(keys), width=3, first=0.1),
+        "mass": lj.learned.Network({"x": 1.0}, key=next(keys), width=3, first=0.1, out=1),
+        "flax": {"params": {"Dense_0": {"kernel": jnp.full((1, 2), 0.3), "bias": jnp.zeros(2)}}},
+    }
+
+
+def with_networks(t, q, v, params):
+    """A spring with a potential and a mass of networks."""
+    net, x = params["net"], q["x"][None]
+    dense = net["flax"]["params"]["Dense_0"]
+    numbers = [net["mlp"](x), net["linear"](x), net["in turn"](x), net["conv"](x[None]), net["own"](x)]
+    numbers += [net["learned"](q), jnp.tanh(x @ dense["kernel"] + dense["bias"])]
+    mass = lj.learned.positive_definite(net["mass"](q))[0, 0]
+    return 0.5 * mass * v["x"] ** 2 - 0.5 * params["k"] * q["x"] ** 2 - 0.01 * sum(map(jnp.sum, numbers))
+
+
+@pytest.mark.slow
+def test_networks(tmp_path):
+    """A fit and a motion with networks of eight kinds come back and go on; twin: without a class of the user's, not."""
+    path, system, params = tmp_path / "fit.npz", lj.System(with_networks), {"net": networks(), "k": 3.5}
+    record = lj.Record(T, q={"x": np.cos(2.0 * T) + NOISE}, sigma=1e-3, q0={"x": 1.0}, v0={"x": 0.0})
+    with warnings.catch_warnings():
+        # Two steps do not end a search.
+        warnings.simplefilter("ignore", lj.FitWarning)
+        found = lj.fit(system, record, params, iterations=2, rtol=1e-6)
+    found.save(path)
+    with pytest.raises(ValueError, match=r"(?s)class .*Own.*Fix: classes=\[Own\]"):
+        lj.load_fit(path, system)
+    again = lj.load_fit(path, system, classes=[Own])
+    assert jax.tree.structure(found.params) == jax.tree.structure(again.params)
+    np.testing.assert_array_equal(again.values, found.values)
+    traj, more = found.motion(), again.motion()
+    np.testing.assert_array_equal(traj.q["x"], more.q["x"])
+    more.save(tmp_path / "traj.npz")
+    last = lj.load_trajectory(tmp_path / "traj.npz", system, classes=[Own])
+    np.testing.assert_array_equal(last.at(0.7).q["x"], traj.at(0.7).q["x"])

@@ -462,7 +462,8 @@ def _known_of_system(fit: "Fit") -> dict[str, Any]:
     if isinstance(system, UnknownSystem):
         return {name: getattr(system, name) for name in system.__dataclass_fields__}
     q, v = jax.tree.map(np.asarray, fit.starts()[0])
-    params = jax.tree.map(np.asarray, fit.problem.params(fit.unknowns.shared, 0))
+    params = fit.problem.params(fit.unknowns.shared, 0)
+    params = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, params)
     t = np.asarray(np.asarray(fit.problem.windows.ts)[0, 0], jax.tree.leaves(q)[0].dtype)
     state = State(t, q, v, params)
     phase = int(system.first) if system.in_phases else None
