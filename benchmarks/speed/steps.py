@@ -91,7 +91,7 @@ def compared(what, functions, arguments, repeats):
 
 def main():
     """Print one line for each comparison."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Steps beside a Runge-Kutta loop by hand.")
     parser.add_argument("--processor-time", action="store_true")
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()

@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 
 from lagjax.jaxtools.fuse_cpu import one_function
 from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.primitives import ad, front, linear_map_primitive, primitive, split
+from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
 
 
 def one_function_in_both_modes(function: Callable, *args) -> PyTree:
@@ -47,7 +47,7 @@ def one_function_in_both_modes(function: Callable, *args) -> PyTree:
 
     program = jax.make_jaxpr(of_leaves)(*leaves)
     # Jitted, so that it is traced once.
-    call = jax.jit(partial(jax.core.eval_jaxpr, program.jaxpr, program.consts))
+    call = jax.jit(jaxpr_as_fun(program))
     return jtu.tree_unflatten(structures[0], _function_p.bind(*leaves, of=_Function(call, False)))
 
 

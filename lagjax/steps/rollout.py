@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -23,7 +24,7 @@ from jax import lax
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import compiled, numpy_of, one_function_in_both_modes
+from lagjax.jaxtools import compiled, is_array, numpy_of, one_function_in_both_modes, shape_of, varies
 from lagjax.numerics import ExplicitRungeKutta
 from lagjax.steps.step import advanced, equations_for_steps, explicit_method, step_length
 from lagjax.system import Call, State, System, Traced, check_system, coordinates, model_of, traced_call, traced_system
@@ -98,17 +99,32 @@ def rollout(
             _check_names(s.params, held)
         first = jtu.tree_map(lambda u: jax.ShapeDtypeStruct(u.shape[1:], u.dtype), held)
         call = Call("with_control", with_control or _by_name, ("params", "u"))
-        merge = traced_call(call, {"params": s.params, "u": first}, _is_anything, "a function of u alone")
-        s_in_step = s._replace(params=merge.program.value)
+        # Checked as it is; what it returns besides arrays, as the functions in a network, is the same in all steps.
+        traced_call(call, {"params": s.params, "u": first}, _is_anything, "a function of u alone")
+        in_step = shape_of(call.function, s.params, first)
+        arrays = call._replace(function=partial(_arrays_of, call.function))
+        arrays = traced_call(arrays, {"params": s.params, "u": first}, _is_anything)
+        merge = Merge(arrays, eqx.filter(in_step, varies, inverse=True))
+        s_in_step = s._replace(params=in_step)
     else:
         s_in_step = s
     found = traced_system(system, s_in_step)
     return _rolled(found, s, held, merge, step_length(dt, dtype), method, count, by_name)
 
 
+class Merge(eqx.Module):
+    """The parameters of a step with the control u: their `arrays`, and the `rest`."""
+
+    arrays: Traced
+    rest: PyTree
+
+    def __call__(self, params: PyTree, u: PyTree) -> PyTree:
+        return eqx.combine(self.arrays(params, u), self.rest)
+
+
 @compiled
 def _rolled(
-    system: System, s: State, held: PyTree, merge: Traced | None, dt: Array, method: ExplicitRungeKutta, count: int,
+    system: System, s: State, held: PyTree, merge: Merge | None, dt: Array, method: ExplicitRungeKutta, count: int,
     by_name: bool,
 ):  # fmt: skip
     if by_name and count:
@@ -123,7 +139,7 @@ def _rolled(
     return t, q, v
 
 
-def _run(system: System, s: State, t: Array, held: PyTree, merge: Traced | None, dt: Array, method, count: int):
+def _run(system: System, s: State, t: Array, held: PyTree, merge: Merge | None, dt: Array, method, count: int):
     """The states after each step."""
     inner = piece_length(count)
     outer = -(-count // inner)
@@ -192,6 +208,10 @@ def _as_rows(x: Any, dtype: DTypeLike):
     return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
+def _arrays_of(function: Callable, params: PyTree, u: PyTree):
+    return eqx.filter(function(params, u), is_array)
+
+
 def _by_name(params: PyTree, u: PyTree):
     return {**(params or {}), **u}
 
@@ -209,7 +229,7 @@ def _check_names(params: PyTree, held: PyTree):
     )
 
 
-def _check_read(system: System, s: State, held: PyTree, merge: Traced):
+def _check_read(system: System, s: State, held: PyTree, merge: Merge):
     """Raise if no function of the system reads a control."""
 
     def functions(u: PyTree):

@@ -1,5 +1,6 @@
 """Many steps: controls held in each, the steps of a scan by hand with its gradients, lanes, dtypes, and memory."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -150,6 +151,27 @@ def test_a_control_law_of_the_users():
 
     assert end(3.0, "law") == end(3.0, "names") == 6.0
     assert jax.grad(end)(3.0, "law") == 2.0
+
+
+class Driven(eqx.Module):
+    """Parameters that are no dict, with a function among them."""
+
+    net: eqx.nn.MLP
+    push: jax.Array
+
+
+def test_modules_in_params():
+    """A network in `params`, with its functions: the steps are those of `step` with such parameters."""
+    net = eqx.nn.MLP(1, "scalar", 2, 1, activation=jnp.tanh, key=jax.random.key(0))
+    system = lj.System(
+        lambda t, q, v, params: 0.5 * v**2 - params.net(q[None]), force=lambda t, q, v, params: params.push
+    )
+    pushes, drive = jnp.array([1.0, -2.0]), lambda params, u: Driven(params.net, u)
+    _, q, _ = lj.rollout(system, 0.1, 0.0, Driven(net, jnp.zeros(())), pushes, 0.5, with_control=drive)
+    state = 0.0, 0.1, 0.0
+    for push, found in zip(pushes, q[1:]):
+        state = lj.step(system, *state, Driven(net, push), 0.5)
+        np.testing.assert_allclose(found, state[1], rtol=1e-14)
 
 
 def test_few_steps():

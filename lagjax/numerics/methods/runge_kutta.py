@@ -132,20 +132,19 @@ def weighted_sum(start: PyTree, weights: Array, increments):
     return total if start is None else jtu.tree_map(lax.add, start, total)
 
 
-class _KuttaInArrays(diffrax.AbstractERK):
-    """Kutta's method with a stage at the end of the step, which is the first one of the next step."""
+# With a stage at the end of the step, which is the first one of the next step.
+KUTTA = diffrax.ButcherTableau(
+    c=np.array([1 / 2, 1 / 2, 1, 1]),
+    b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6, 0]),
+    b_error=np.array([0, 0, 0, 1 / 6, -1 / 6]),
+    a_lower=(np.array([1 / 2]), np.array([0, 1 / 2]), np.array([0, 0, 1.0]), np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])),
+)
 
-    tableau: ClassVar = diffrax.ButcherTableau(
-        c=np.array([1 / 2, 1 / 2, 1, 1]),
-        b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6, 0]),
-        b_error=np.array([0, 0, 0, 1 / 6, -1 / 6]),
-        a_lower=(
-            np.array([1 / 2]),
-            np.array([0, 1 / 2]),
-            np.array([0, 0, 1.0]),
-            np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
-        ),
-    )
+
+class _KuttaInArrays(diffrax.AbstractERK):
+    """Kutta's method as diffrax steps it."""
+
+    tableau: ClassVar = KUTTA
     interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms: diffrax.AbstractTerm):
@@ -168,7 +167,7 @@ class RK4(ExplicitRungeKutta):
     """
 
     shipped: ClassVar = _KuttaInArrays()
-    tableau: ClassVar = _KuttaInArrays.tableau
+    tableau: ClassVar = KUTTA
     interpolation_cls: ClassVar[Callable] = _KuttaInArrays.interpolation_cls
 
     def order(self, terms: diffrax.AbstractTerm):
