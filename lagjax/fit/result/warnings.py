@@ -51,7 +51,8 @@ def _parameters_caveat(fit: Fit, at: Evaluation):
         return ""
     return (
         f"the data do not determine all parameters.\n{fit.identifiability}\n"
-        "An undetermined parameter has no uncertainty, and stays near its guess.\n"
+        "An undetermined parameter has no uncertainty. One that leaves no trace keeps its guess; of others only the "
+        "combinations above mean something.\n"
         "Fix: leave some out of free=, give priors=, or measure more."
     )
 

@@ -188,6 +188,9 @@ SAME_COST = 1e-6
 UNSEEN = 0.15
 # The slopes of a parameter are round-off, and only the hold fixes it, unless they are this many times its hold.
 BESIDE_HOLD = 2.0
+# A parameter has no trace in the data if a change by its own size, or back to its guess, changes the residuals by less
+# than this many √eps sigmas: about what the round-off in its slopes makes of it.
+NO_TRACE = 100.0
 # A parameter is determined if no larger share (squared) of it than this lies in undetermined directions.
 NEGLIGIBLE_SHARE = 1e-8
 
@@ -279,7 +282,8 @@ def evaluation_from(problem: FitProblem, u: Unknowns, linear: LinearisedResidual
     triangular = eliminate(linear.slopes, linear.values, floor)
     # In units of the slopes: undetermined directions have singular values of about FLOOR.
     size = filled(sizes).shared
-    size = jnp.where(size > BESIDE_HOLD * hold_weights(problem, stage), size, jnp.inf)
+    visible = (size > BESIDE_HOLD * hold_weights(problem, stage)) & ~_without_trace(problem, u.shared, sizes.shared)
+    size = jnp.where(visible, size, jnp.inf)
     left, singular, right = jnp.linalg.svd(triangular.shared / size[None])
     unseen = UNSEEN / np.sqrt(np.finfo(size.dtype).eps)
     seen = singular > 1 / unseen
@@ -300,6 +304,12 @@ def evaluation_from(problem: FitProblem, u: Unknowns, linear: LinearisedResidual
         linear.values.rows, linear.well, cov, determined, singular_values, combinations, chi2,
         freedom.astype(chi2.dtype),
     )  # fmt: skip
+
+
+def _without_trace(problem: FitProblem, x: Float[Array, " p"], sizes: Float[Array, " p"]) -> Bool[Array, " p"]:
+    """Which shared unknowns neither the data nor a prior see, from the sizes of their slopes."""
+    change = jnp.maximum(jnp.abs(x), jnp.abs(x - problem.found.start))
+    return sizes * change < NO_TRACE * np.sqrt(np.finfo(x.dtype).eps)
 
 
 @partial(compiled, in_numpy=True)
@@ -488,6 +498,9 @@ def _search(problem: FitProblem, course: Course, optimiser: Any, limit: int, tel
     if best.slopes is not None:
         _, rate = jax.jvp(problem.found.natural, (best.y.shared,), (jnp.ones_like(best.y.shared),))
         slopes = best.slopes.scaled(jnp.where(rate != 0, 1 / rate, 0.0))
+        # What nothing sees returns from where round-off, or another start, has left it. At a bound the rate vanishes.
+        returns = _without_trace(problem, u.shared, slopes.sizes().shared) & (rate != 0)
+        u = u._replace(shared=jnp.where(returns, problem.found.start, u.shared))
         # The priors alone, without the hold of the search.
         mean, weight = prior_and_hold(problem, WHOLE)
         values = best.values._replace(shared=weight * (u.shared - mean))

@@ -84,6 +84,25 @@ def test_what_only_round_off_sees_keeps_its_guess(monkeypatch):
 
 
 @pytest.mark.slow
+def test_what_leaves_no_trace_keeps_its_guess():
+    """A mass that drops out is at its guess although another start, with another mass, gave the best end; twin: with a
+    prior it is where that says."""
+    scaled = lambda t, q, v, p: p["m"] * (0.5 * v**2 + p["g"] * jnp.cos(q))
+    system, ts = lj.System(scaled), np.linspace(0.0, 4.0, 41)
+    q = lj.integrate(system, 1.0, 0.0, {"m": 1.0, "g": 9.8}, ts=ts).q
+    record = lj.Record(ts, q=q + 0.01 * np.random.default_rng(0).normal(size=41), sigma=0.01)
+    elsewhere = {"restarts": 8, "grow": False, "bounds": {"g": (1.0, 100.0)}}
+    with pytest.warns(lj.FitWarning, match="'m': no trace(.|\n)*One that leaves no trace keeps its guess"):
+        found = lj.fit(system, record, {"m": 1.0, "g": 70.0}, **elsewhere)
+    # The guess itself led elsewhere, so the best end came from another start.
+    assert found.costs[0] > 10 * found.cost
+    assert found.params["m"] == 1.0 and list(found.determined) == [True, False]
+    np.testing.assert_allclose(found.params["g"], 9.8, atol=0.05)
+    with_prior = lj.fit(system, record, {"m": 1.0, "g": 9.0}, priors={"m": (1.3, 0.1)})
+    np.testing.assert_allclose(with_prior.params["m"], 1.3, rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_what_contradicts_sigma_is_no_success(clean):
     """A missing effect or errors larger than sigma: not converged, with a warning, from every start."""
     data = measured(clean, 3) + SIGMA * np.sin(7 * TS)
