@@ -1,6 +1,7 @@
 """Assumptions of `benchmarks/gpu/on_gpu.py`: a batch and its gradient never need the host, and the check detects it."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -41,6 +42,27 @@ def text_of_gradient(system):
 def test_a_gradient_that_replays_steps_stays_on_the_device():
     """The compiled gradient has no operation on the host."""
     assert host_operations(text_of_gradient(learned())) == []
+
+
+def calls_for_cuda(function, *args):
+    """What a program that is lowered for CUDA calls outside of XLA, such as libraries of linear algebra."""
+    lowered = jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",))
+    return set(re.findall(r"custom_call @(\w+)", lowered.as_text()))
+
+
+@pytest.mark.slow
+def test_steps_for_cuda_call_nothing():
+    """Lanes of fixed steps with controls, and their gradient, call nothing on a GPU; twin: an inverse does."""
+    cart = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 + params["push"] * q)
+
+    def end(k, q0):
+        return lj.rollout(cart, q0, 0.0, {"k": k}, {"push": jnp.ones(5)}, 0.1)[1][-1]
+
+    lanes = jax.vmap(end, (None, 0))
+    loss = lambda k, q0: jnp.sum(lanes(k, q0) ** 2)
+    arguments = jnp.asarray(2.0), jnp.linspace(0.0, 1.0, 4)
+    assert calls_for_cuda(lanes, *arguments) == calls_for_cuda(jax.grad(loss), *arguments) == set()
+    assert calls_for_cuda(lambda k, q0: jnp.linalg.inv(jnp.eye(3) * k), *arguments)
 
 
 def test_operations_on_the_host_are_found():
