@@ -271,3 +271,10 @@ def test_marks_reach_the_program():
     """The attributes stand on the call in the program that XLA is given."""
     text = jax.jit(lambda x: marked(jax.jit(jnp.sin)(x), ONE_KERNEL)).lower(1.0).as_text()
     assert all(f'{name} = "{value}"' in text for name, value in ONE_KERNEL.items())
+
+
+def test_the_derivative_of_a_branch_fits():
+    """In reverse mode a branch leaves what the other one would keep empty, which is no reason against one function."""
+    branch = lambda s, _: (lax.cond(s > 0, jnp.sin, lambda s: 2 * s**3 * jnp.exp(s), s), None)
+    program = jax.make_jaxpr(jax.grad(lambda x: lax.scan(branch, x, None, 3)[0]))(1.0)
+    assert "empty" in str(program) and fits(program.jaxpr)
