@@ -16,11 +16,11 @@ from lagjax.jaxtools import is_traced, numpy_of, once
 from lagjax.mechanics import departures
 from lagjax.system import Model, State, coordinates, warn
 
-# Tolerances that each dtype reaches with a margin.
-# From here on, with a network in L, Tsit5 is the default, with outputs inside its steps. Evaluations at rtol 1e-5 with 21
-# outputs, by Tsit5, by it with outputs at ends of steps, and by Dopri8: 54, 132 and 286 (a slow motion), 324, 276 and
-# 1131 (a double pendulum's). With two outputs it takes 162 and Dopri8 130; at 1e-4 102 and 104, at 1e-3 66 and 117.
+# From here on, with a network in L, Tsit5 is the default, with outputs inside its steps. Evaluations at rtol 1e-5 with
+# 21 outputs, by Tsit5, by it with outputs at ends of steps, and by Dopri8: 54, 132 and 286 (a slow motion), 324, 276
+# and 1131 (a double pendulum's). With two outputs it takes 162 and Dopri8 130; at 1e-4 102 and 104, at 1e-3 66 and 117.
 LOOSE = 1e-6
+# Tolerances that each dtype reaches with a margin.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 # The prefix with which a user writes a method, by the package that defines it.
 PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
