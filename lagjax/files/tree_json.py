@@ -6,6 +6,7 @@ them) as the name of their class and the values of their fields. Classes and fun
 """
 
 import dataclasses
+import inspect
 import math
 import types
 from collections.abc import Callable
@@ -113,7 +114,7 @@ class Writer:
             return {"function": function}
         if not isinstance(value, type) and (fields := fields_of(type(value))) is not None:
             return self._object(value, fields, path, inside)
-        if any(cls.__module__.split(".")[0] == "flax" for cls in type(value).__mro__):
+        if any(cls.__module__.split(".")[0] == "flax" for cls in inspect.getmro(type(value))):
             raise NotWritable(
                 f"{path} is a {type(value).__name__} of flax, and files do not hold flax's objects.\n"
                 "Fix: graphdef, state = nnx.split(model); nnx.to_pure_dict(state) in params, dictionaries of arrays; "

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,7 @@ def as_usual(function: Callable) -> Callable:
 
     @wraps(function)
     def without_debugging(*args, **kwargs):
-        config = jax.config
+        config: Any = jax.config
         looks = config.jax_debug_nans or config.jax_debug_infs
         if not (looks or config.jax_disable_jit or config.jax_transfer_guard_host_to_device not in (None, "allow")):
             return function(*args, **kwargs)
