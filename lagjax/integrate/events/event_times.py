@@ -50,8 +50,8 @@ def locate(watching: EventController, watched: Watched) -> Located:
     sight = watching.sight
     equations, guards = sight.motion.equations, sight.guards
 
-    def exact(owner: Array, row):
-        t, y = _exact((guards, equations), *row, owner, sight.resolution, _flow)
+    def exact(owner: Array, there: Array, row):
+        t, y = _exact((guards, equations), *row, owner, there, sight.resolution, _flow)
         return t, y, equations.multipliers(t, *y)
 
     t, y, multipliers = _each(exact, guards, jnp.isfinite(watched.t), (watched.t, watched.y))
@@ -60,33 +60,35 @@ def locate(watching: EventController, watched: Watched) -> Located:
 
 
 def at_known_times(
-    guards: Guards, equations: Equations, resolution: Array, located: Located, y: PyTree, bent: bool
+    guards: Guards, equations: Equations, resolution: Array, located: Located, t: Array, y: PyTree, bent: bool
 ) -> Located:
     """Return the same with the derivatives of the states `y` (S, ...) at the known times, for reverse mode.
 
-    `bent`: these derivatives may be differentiated again.
-    The values stay those of the roots: `y` comes from other steps, and is on the guards only to the tolerance.
+    `t` (S,): these times, and one of the motion where there is no crossing. `bent`: these derivatives may be
+    differentiated again. The values stay those of the roots: `y` comes from other steps, and is on the guards only to
+    the tolerance.
     """
-    y = jtu.tree_map(lambda root, y: root + (y - lax.stop_gradient(y)), located.y, y)
-    flow = _flow_twice if bent else _flow
+    there, flow = jnp.isfinite(located.t), _flow_twice if bent else _flow
+    # In a lane without a crossing a state of the motion: zero times the derivative at NaN would be NaN.
+    y = jtu.tree_map(lambda root, y: jnp.where(like(there, y), root + (y - lax.stop_gradient(y)), y), located.y, y)
 
-    def exact(owner: Array, known):
-        t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, resolution, flow)
+    def exact(owner: Array, there: Array, known):
+        t, y = _exact((guards, equations), lax.stop_gradient(known[0]), known[1], owner, there, resolution, flow)
         return t, y, equations.accelerations(t, *y)[1]
 
-    t, y, multipliers = _each(exact, guards, jnp.isfinite(located.t), (located.t, y))
+    t, y, multipliers = _each(exact, guards, there, (t, y))
     return located._replace(t=t, y=y, multipliers=multipliers)
 
 
 def _each(function: Callable, guards, there, rows):
-    """Return `function(owner, row)` for each place with a crossing, and NaN for the others."""
+    """Return `function(owner, there, row)` for each place with a crossing, and NaN for the others."""
     owners = jnp.asarray(guards.owners)
-    shapes = jax.eval_shape(function, owners[0], jtu.tree_map(lambda x: x[0], rows))
+    shapes = jax.eval_shape(function, owners[0], there[0], jtu.tree_map(lambda x: x[0], rows))
     nothing = jtu.tree_map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), shapes)
 
     def one(place):
         owner, there, row = place
-        found = lax.cond(eqxi.unvmap_any(there), lambda: function(owner, row), lambda: nothing)
+        found = lax.cond(eqxi.unvmap_any(there), lambda: function(owner, there, row), lambda: nothing)
         return jtu.tree_map(lambda x, y: jnp.where(there, x, y), found, nothing)
 
     return lax.map(one, (owners, there, rows))
@@ -126,10 +128,10 @@ def by_name(guards: Guards, located: Located, end, valid) -> dict[str, Crossings
     return found
 
 
-def _exact(live: PyTree, t: Array, y: PyTree, owner: Array, resolution: Array, flow: Callable):
+def _exact(live: PyTree, t: Array, y: PyTree, owner: Array, there: Array, resolution: Array, flow: Callable):
     """Return a time and a state on a guard unchanged, with the derivatives that follow from staying on it."""
     z = lax.stop_gradient(t), y
-    return flow(live, _wait(live, z, owner, resolution, flow=flow), z, rate=_rate)
+    return flow(live, _wait(live, z, owner, there, resolution, flow=flow), z, rate=_rate)
 
 
 def _rate(live: PyTree, z: PyTree):
@@ -174,16 +176,16 @@ def _flow_twice(live: PyTree, tau: Array, z: PyTree, *, rate):
 
 
 @eqx.filter_custom_jvp
-def _wait(live: PyTree, z: PyTree, owner: Array, resolution: Array, *, flow: Callable):
-    """Return the time until a state on a guard reaches it: zero, with derivatives."""
+def _wait(live: PyTree, z: PyTree, owner: Array, there: Array, resolution: Array, *, flow: Callable):
+    """Return the time until a state on a guard reaches it: zero, with derivatives (not if it is not `there`)."""
     # Under vmap the value must be batched, as its derivative is.
     return jnp.where(z[0] > 0, 0.0, jnp.zeros_like(z[0]))
 
 
 @_wait.def_jvp
 def _wait_jvp(primals: Sequence, tangents: Sequence, *, flow: Callable):
-    (live, z, owner, resolution), (moves, dz, *_) = primals, tangents
-    tau = _wait(live, z, owner, resolution, flow=flow)
+    (live, z, owner, there, resolution), (moves, dz, *_) = primals, tangents
+    tau = _wait(live, z, owner, there, resolution, flow=flow)
 
     def after(live: PyTree, tau: Array, z: PyTree):
         return _guard(live, flow(live, tau, z, rate=_rate), owner)
@@ -196,7 +198,7 @@ def _wait_jvp(primals: Sequence, tangents: Sequence, *, flow: Callable):
     may_rest = jnp.asarray([kind.may_rest for kind in live[0].kinds])[owner]
     # The jump of a force in time is where a leg begins, whose time has its derivatives; they are taken there.
     none = jnp.where(may_rest, jnp.inf, jnp.nan)
-    return tau, -dg / jnp.where(jumps, none, rate)
+    return tau, -dg / jnp.where(there, jnp.where(jumps, none, rate), jnp.inf)
 
 
 def _terms(live: PyTree, z: PyTree, owner: Array):

@@ -274,7 +274,7 @@ def _loop_twice(
         reached=jnp.where(jnp.isfinite(second.reached[place[: ts.size]]), first.reached, jnp.inf),
         outputs=of_outputs,
         end=second.end,
-        located=at_known_times(guards, equations, resolution(ts), first.located, of_crossings, bent),
+        located=at_known_times(guards, equations, resolution(ts), first.located, times[ts.size :], of_crossings, bent),
     )
 
 

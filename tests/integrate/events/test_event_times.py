@@ -90,3 +90,21 @@ def test_derivative_by_many_numbers():
     # The state there is computed by other steps than the time, and is on the level only to the tolerance.
     for dt0 in (None, 0.05, 0.3):
         np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_lanes_with_and_without_a_crossing():
+    """By many numbers, in reverse mode: one ball reaches a height, t = (v - √(v² - 2 g h)) / g; the other one does not,
+    q = v T - g T²/2, and its derivative is not that of a crossing at NaN, times zero."""
+    ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.sum(p) * q)
+    up = lj.Crossing(lambda t, q, v, p: q - 1.0)
+    height, last, g, v0 = 1.0, 1.0, 9.8, np.array([6.0, 3.0])
+
+    def end(p, v0):
+        found = lj.integrate(ball, 0.0, v0, p, ts=[0.0, last], events={"up": up}).end
+        return found.t + 10.0 * found.q
+
+    slopes = jax.jit(jax.vmap(jax.grad(end), (None, 0)))(jnp.full(40, g / 40), v0)
+    root = np.sqrt(v0[0] ** 2 - 2 * g * height)
+    of_time = height / (g * root) - (v0[0] - root) / g**2
+    np.testing.assert_allclose(slopes, np.array([of_time, -10.0 * last**2 / 2])[:, None] * np.ones(40), rtol=1e-8)
