@@ -31,6 +31,7 @@ from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
+from lagjax.mechanics import has_networks
 from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates
 
 
@@ -178,6 +179,8 @@ def integrate(
     drift = arguments.check_drift(drift, any(phase.constraints for phase in system.phases))
     arguments.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
     relative = arguments.tolerance(rtol, "rtol", dtype)
+    # Only where it chooses the method: a program serves all tolerances.
+    loose = stepsize_controller is None and arguments.is_loose(relative, dtype) and has_networks((system, state.params))
     settings = Settings(
         method=method,
         controller=stepsize_controller,
@@ -196,7 +199,7 @@ def integrate(
         progress=progress,
         jumps=arguments.check_jumps(jumps),
         outputs=arguments.check_outputs(outputs),
-        loose=stepsize_controller is None and arguments.is_loose(relative, dtype),
+        loose=loose,
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )

@@ -17,13 +17,12 @@ Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (wi
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import TooLong, is_plain
+from lagjax.jaxtools import TooLong, is_array, is_plain
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers
@@ -54,9 +53,9 @@ class WrittenOut(NamedTuple):
     may_fail: bool
 
 
-def has_networks(model: Model) -> bool:
-    """Whether a system or its parameters have matrices as large as those of a network."""
-    arrays = [x for x in jtu.tree_leaves(model) if eqx.is_array(x)]
+def has_networks(model: Model | PyTree) -> bool:
+    """Whether a model, or a system and its parameters, have matrices as large as those of a network."""
+    arrays = [x for x in jtu.tree_leaves(model) if is_array(x)]
     return any(x.ndim > 1 and x.size >= MATRIX for x in arrays)
 
 
