@@ -28,6 +28,8 @@ OF_STATES = (
 DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "explain": (of_states("explain"), True),
     "integrate": (lambda system: lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS), True),
+    "step": (lambda system: lj.step(system, 0.0, 1.0, 0.0, PARAMS, 0.1), False),
+    "rollout": (lambda system: lj.rollout(system, 1.0, 0.0, PARAMS, 10, 0.1), False),
     "poincare": (lambda s: lj.poincare(s, 1.0, 0.0, PARAMS, section=lambda t, q, v, params: q, ts=TS), True),
     "noether_charge": (lambda system: lj.noether_charge(system, TURN), False),
     "is_symmetry": (lambda system: lj.is_symmetry(system, TURN, 1.0, 0.0, PARAMS), False),
