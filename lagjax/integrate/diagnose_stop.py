@@ -303,8 +303,6 @@ def _singularity(path: _Path, steps: Steps, mass: IndefiniteMass | None):
     blown_up = [np.max(x) > many * usual > 0 for x, many, usual in zip(last, BLOWN_UP, path.usual)]
     if not (any(blown_up) or shrinks and any(grows)):
         return None
-    if mass is not None:
-        return mass[:2]
     if shrinks:
         # Steps in a geometric series converge to its limit.
         ratio = min(np.median(lengths[1:] / lengths[:-1]), 1 - 1e-9)
@@ -314,10 +312,12 @@ def _singularity(path: _Path, steps: Steps, mass: IndefiniteMass | None):
     i = int(np.argmax(which))
     what = "velocity" if of_velocity else "acceleration"
     usual = path.usual[0 if of_velocity else 1]
+    # Where M is negative from the start on, as with a relativistic time, it may be meant.
+    also, fix = ("", "") if mass is None else (f". L has {mass.cause}", f". If that is not meant: {mass.fix}")
     return (
         f"a singularity of the motion: the {what} of '{path.names[i]}' grows without bound as t -> {limit:.6g}; it is "
-        f"{which[i]:.2g} already, where the start and the way so far have {usual:.2g}",
-        f"ts that end before {limit:.6g}" + (_event(path, i, usual) if of_velocity else ""),
+        f"{which[i]:.2g} already, where the start and the way so far have {usual:.2g}{also}",
+        f"ts that end before {limit:.6g}" + (_event(path, i, usual) if of_velocity else "") + fix,
     )
 
 

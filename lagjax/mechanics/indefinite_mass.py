@@ -37,7 +37,7 @@ def indefinite_mass(model: Model, start: State, end: State) -> IndefiniteMass | 
     first, last = _Eigenvalues(model, start), _Eigenvalues(model, end)
     if not (first.known and last.known):
         return None
-    found = last if last.below != first.below else _beyond(model, start, end, first.below)
+    found = last if last.differs(first) else _beyond(model, start, end, first)
     if found is not None:
         cause = (
             f"a mass matrix that is not positive definite: its smallest eigenvalue is {first.smallest:.3g} at the "
@@ -74,12 +74,17 @@ class _Eigenvalues:
         self.known = values.size > 0
         if self.known:
             round_off = ROUND_OFFS * np.finfo(found.linear.mass.dtype).eps * np.max(np.abs(values))
-            self.below, self.smallest = int(np.sum(values < -round_off)), float(values[0])
+            self.below, self.above = int(np.sum(values < -round_off)), int(np.sum(values > round_off))
+            self.smallest = float(values[0])
             self.name = model.names[int(np.argmax(np.abs(free @ vectors[:, 0])))]
 
+    def differs(self, first: "_Eigenvalues") -> bool:
+        """Whether an eigenvalue has another sign than at `first`, beyond round-off."""
+        return self.below > first.below or self.above > first.above
 
-def _beyond(model: Model, start: State, end: State, below: int) -> _Eigenvalues | None:
-    """The first state on the straight line beyond the end where not `below` eigenvalues are below zero, but others."""
+
+def _beyond(model: Model, start: State, end: State, first: _Eigenvalues) -> _Eigenvalues | None:
+    """The first state on the straight line beyond the end where an eigenvalue has another sign than at `first`."""
     (x0, _), (x, u) = (model.vectors(s.q, s.v) for s in (start, end))
     way, pace = float(np.max(np.abs(x - x0))), float(np.max(np.abs(u)))
     for part in BEYOND if 0 < way * pace < np.inf else ():
@@ -88,6 +93,6 @@ def _beyond(model: Model, start: State, end: State, below: int) -> _Eigenvalues 
         there = _Eigenvalues(model, end._replace(t=end.t + ahead, q=q))
         if not there.known:
             return None
-        if there.below != below:
+        if there.differs(first):
             return there
     return None
