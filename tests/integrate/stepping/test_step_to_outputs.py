@@ -60,7 +60,7 @@ def test_a_rejected_step_is_not_tried_again(first):
     t1, state = controller.init(
         None, jnp.asarray(0.0), 5.0, jnp.asarray(1.0), jnp.asarray(first), None, lambda *a: 0.0, 5
     )
-    one = jnp.asarray(1.0)
+    one, result = jnp.asarray(1.0), diffrax.RESULTS.successful
     for _ in range(20):
         keep, _, t1, _, state, result = controller.adapt_step_size(
             jnp.asarray(0.0), t1, one, one, None, jnp.asarray(2e-6 * 1.01), 5, state
