@@ -23,11 +23,12 @@ from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import pack
 from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import primitive
+from lagjax.jaxtools import as_usual, primitive
 from lagjax.mechanics import accelerations, describe, explain_failure
 from lagjax.system import Hybrid, State, coordinates
 
 
+@as_usual
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
     """Return the trajectory; if it failed, the program that computes it ends with the message of its result."""
     code = _code_p.bind(jnp.asarray(trajectory.result._value))
