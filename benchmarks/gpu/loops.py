@@ -82,7 +82,8 @@ def swept(points, dtype):
     title = f"{points:,} beads, {dtype}"
     for place, name in ((1, "sweep"), (2, "sweep in one block")):
         yield row(f"{title}: {name} / one vmap", times.ratio(place, 0)[0], 1.25, s=times.medians[place],
-                  vmap_s=times.medians[0], motions_per_s=points / times.medians[place], compile_s=compile_s)  # fmt: skip
+                  vmap_s=times.medians[0], motions_per_s=points / times.medians[place],
+                  compile_s=compile_s)  # fmt: skip
     right = on_gpu.reference(case, "motions")
     yield row(f"{title}: error in radians", on_gpu.error(case, "motions", found.values, right),
               on_gpu.ERROR[dtype]["motions"])  # fmt: skip
