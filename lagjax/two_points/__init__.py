@@ -1,0 +1,1 @@
+"""Motions between two points: connected, shortest, steered. Imported on first use."""
