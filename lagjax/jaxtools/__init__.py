@@ -62,6 +62,7 @@ from lagjax.jaxtools.tracing import (
     SILENT,
     WATCHED,
     as_usual,
+    full_products,
     is_eager,
     is_traced,
     numpy_of,

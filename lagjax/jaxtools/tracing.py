@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import wraps
 from typing import Any
 
@@ -60,6 +60,15 @@ def as_usual(function: Callable) -> Callable:
             return function(*args, **kwargs)
 
     return without_debugging
+
+
+def full_products():
+    """A context in which products of matrices keep every digit of their dtype, unless the user set how many they keep.
+
+    By default an accelerator keeps three digits in float32: constraints and small tolerances are then out of reach.
+    """
+    chosen: Any = jax.config.jax_default_matmul_precision
+    return nullcontext() if chosen else jax.default_matmul_precision("highest")
 
 
 def numpy_of(tree: PyTree):

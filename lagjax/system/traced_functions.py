@@ -22,7 +22,17 @@ import numpy as np
 from jax.core import Tracer, eval_jaxpr
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import FACTS, Itself, Meaning, is_array, meaning_of, once, rules_of, with_own_constants
+from lagjax.jaxtools import (
+    FACTS,
+    Itself,
+    Meaning,
+    full_products,
+    is_array,
+    meaning_of,
+    once,
+    rules_of,
+    with_own_constants,
+)
 
 # Arrays of up to so many numbers, or of so many whole numbers (indices), that are read from outside are part of the
 # jaxpr: the equations can then leave out what is multiplied by their zeros.
@@ -61,14 +71,16 @@ class TracedProgram:
             return [x for x in jtu.tree_leaves(found) if is_array(x) or isinstance(x, NUMBERS)]
 
         arrays = _arrays(args)
-        closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
+        with full_products():
+            closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
         self.value, self._structure, self.jaxpr = returned[0], structures[0], closed.jaxpr
         # A user may write to a NumPy array afterwards.
         constants = [np.array(x) if isinstance(x, np.ndarray) else x for x in closed.consts]
         self._fixed = [x if _is_small(x) else None for x in constants]
         self.arrays = (*(x for x in constants if not _is_small(x)), *jtu.tree_leaves(own))
         small = tuple((str(x.dtype), x.shape, np.asarray(x).tobytes()) for x in self._fixed if x is not None)
-        rules = rules_of(of_arrays, closed, own, arrays)
+        with full_products():
+            rules = rules_of(of_arrays, closed, own, arrays)
         self._meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
 
     def __hash__(self):

@@ -65,6 +65,25 @@ def test_steps_for_cuda_call_nothing():
     assert calls_for_cuda(lambda k, q0: jnp.linalg.inv(jnp.eye(3) * k), *arguments)
 
 
+@pytest.mark.slow
+def test_products_keep_their_digits():
+    """On a GPU each product of matrices of a rod's motion asks for all digits of float32; twin: as the user sets it."""
+    rod = lj.Holonomic(lambda t, q, params: jnp.sum(q**2) - 1.0)
+    mass = np.array([[2.0, 0.5], [0.5, 1.0]], np.float32)
+    swinging = lj.System(lambda t, q, v, params: 0.5 * v @ (mass @ v) - params["g"] * q[1], {"rod": rod})
+
+    def precisions():
+        end = lambda g, x: lj.integrate(swinging, x, 0 * x, {"g": g}, ts=np.array([0, 1], np.float32), rtol=1e-5,
+                                          throw=False).q[-1]  # fmt: skip
+        lanes = jax.jit(jax.vmap(end, (None, 0))).trace(np.float32(9.81), np.eye(2, dtype=np.float32))
+        text = lanes.lower(lowering_platforms=("cuda",)).as_text()
+        return set(re.findall(r"dot_general .*precision = \[(\w+)", text))
+
+    assert precisions() == {"HIGHEST"}
+    with jax.default_matmul_precision("tensorfloat32"):
+        assert "HIGH" in precisions()
+
+
 def test_operations_on_the_host_are_found():
     """Callbacks of any kind in a compiled program, and transfers as XLA names them, are found."""
     shape = jax.ShapeDtypeStruct((), jnp.float64)
