@@ -12,6 +12,7 @@ import argparse
 import time
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,6 +72,20 @@ def ours(q, v, p, torques, dt):
     return q[1:], v[1:]
 
 
+def last_by_hand(q, v, p, torques, dt, steps, pieces):
+    """The last state, with a torque that is the same in all steps."""
+    found = by_hand(q, v, p, jnp.broadcast_to(jnp.sum(torques), steps), dt, pieces)
+    return jax.tree.map(lambda x: x[-1], found)
+
+
+def last_of_fixed(q, v, p, torques, dt, steps):
+    """The same by `integrate`."""
+    fixed = {"method": lj.RK4(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": dt, "max_steps": None}
+    ts, p = jnp.stack([jnp.zeros_like(dt), steps * dt]), p | {"torque": jnp.sum(torques)}
+    end = lj.integrate(double_pendulum, q, v, p, ts=ts, estimate_error=False, **fixed).end
+    return end.q, end.v
+
+
 def compared(what, functions, arguments, repeats):
     """Print the speed of ours, the agreement, and the memory of both."""
     programs, seconds = [], []
@@ -119,6 +134,10 @@ def main():
         pieces = 100 if steps == 10_000 else 400
         both = [partial(by_hand, pieces=pieces), ours]
         compared(f"one motion, {steps} steps", both, given, options.repeats)
+        compared("its gradient", [gradient(f) for f in both], given, options.repeats)
+        given = *given[:3], given[3][:30] / 30, given[4]
+        both = [partial(last_by_hand, steps=steps, pieces=pieces), partial(last_of_fixed, steps=steps)]
+        compared(f"integrate, {steps} fixed steps", both, given, options.repeats)
         compared("its gradient", [gradient(f) for f in both], given, options.repeats)
 
 

@@ -87,8 +87,9 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
         )
     if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
         raise ValueError(
-            "lj.Replay(memory=...) limits a record of steps, and none is kept with a stepsize_controller, a condition "
-            "for diffrax in event, or progress: reverse mode then uses diffrax's own checkpoints.\n"
+            "lj.Replay(memory=...) limits a record of steps, and none is kept with a stepsize_controller (except "
+            "ConstantStepSize), a condition for diffrax in event, or progress: reverse mode then uses diffrax's own "
+            "checkpoints.\n"
             "Fix: leave these out; or adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=100)."
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint) and jump_ts is not None:

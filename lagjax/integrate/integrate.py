@@ -20,7 +20,7 @@ from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
-from lagjax.integrate.settings import Settings, patient
+from lagjax.integrate.settings import Settings, is_recorded, patient
 from lagjax.integrate.solve.backward_time import backward_trajectory_of, runs_backward
 from lagjax.integrate.solve.error_estimate import steps_to_repeat
 from lagjax.integrate.solve.harvest import report
@@ -177,7 +177,7 @@ def integrate(
     else:
         guards = guards_of(crossings, system, state) if crossings else None
     drift = arguments.check_drift(drift, any(phase.constraints for phase in system.phases))
-    arguments.check_adjoint(adjoint, drift, jump_ts, stepsize_controller is None and left is None and not progress)
+    arguments.check_adjoint(adjoint, drift, jump_ts, is_recorded(stepsize_controller, left, progress))
     relative = arguments.tolerance(rtol, "rtol", dtype)
     # Only where it chooses the method: a program serves all tolerances.
     loose = stepsize_controller is None and arguments.is_loose(relative, dtype) and has_networks((system, state.params))

@@ -1,6 +1,7 @@
 """How a motion is integrated: all that is asked for but the system, the state and the times."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -55,6 +56,12 @@ class Settings:
     loose: bool = eqx.field(static=True, default=False)
     # A right-hand side of up to this many operations is copied to each of a method's stages.
     unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
+
+
+def is_recorded(controller: Any, event: Any, progress: Any) -> bool:
+    """Whether reverse mode may use a record of the steps; other controllers may depend on more than is recorded."""
+    fixed = isinstance(controller, diffrax.ConstantStepSize)
+    return not progress and event is None and (controller is None or fixed)
 
 
 def patient(max_steps: int | None) -> int | None:

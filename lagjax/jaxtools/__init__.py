@@ -54,7 +54,16 @@ from lagjax.jaxtools.open_jumps import (
     judging,
 )
 from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
+from lagjax.jaxtools.primitives import (
+    ad,
+    front,
+    is_float,
+    jaxpr_as_fun,
+    linear_map_primitive,
+    no_tangent,
+    primitive,
+    split,
+)
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.sparsity import pattern
 from lagjax.jaxtools.tracing import (

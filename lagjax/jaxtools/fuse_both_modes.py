@@ -15,13 +15,21 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.tree_util as jtu
-from jax import numpy as jnp
 from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jaxtools.fuse_cpu import one_function
 from lagjax.jaxtools.plain import is_plain
-from lagjax.jaxtools.primitives import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split
+from lagjax.jaxtools.primitives import (
+    ad,
+    front,
+    is_float,
+    jaxpr_as_fun,
+    linear_map_primitive,
+    no_tangent,
+    primitive,
+    split,
+)
 
 
 def one_function_in_both_modes(function: Callable, *args) -> PyTree:
@@ -80,9 +88,9 @@ def _jvp(primals: Sequence, tangents: Sequence, *, of: _Function):
     values = _function_p.bind(*primals, of=of)
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
     if not moved:
-        return values, [_zero(y) for y in values]
+        return values, [no_tangent(y) for y in values]
     dy = iter(_tangent_p.bind(*primals, *(tangents[i] for i in moved), of=of, moved=moved))
-    return values, [next(dy) if _is_float(y) else _zero(y) for y in values]
+    return values, [next(dy) if is_float(y) else no_tangent(y) for y in values]
 
 
 def _batched(operands: Sequence, axes: Sequence, *, of: _Function):
@@ -99,7 +107,7 @@ def _of_moved(points: Sequence, *chosen, of: _Function, moved: Sequence[int]):
     every = list(points)
     for i, x in zip(moved, chosen):
         every[i] = x
-    return [y for y in of.call(*every) if _is_float(y)]
+    return [y for y in of.call(*every) if is_float(y)]
 
 
 def _along(points: Sequence, directions: Sequence, *, of: _Function, moved: Sequence[int]):
@@ -112,7 +120,7 @@ def _pushed(points: Sequence, directions: Sequence, *, of: _Function, moved: Seq
 
 
 def _pushed_shapes(*operands, of: _Function, moved: Sequence[int]):
-    return [x for x in _shapes(*split(operands, len(moved))[0], of=of) if _is_float(x)]
+    return [x for x in _shapes(*split(operands, len(moved))[0], of=of) if is_float(x)]
 
 
 def _pulled(
@@ -149,14 +157,6 @@ def _pushed_batched(operands: Sequence, axes: Sequence, *, of: _Function, moved:
     lanes = of.lanes or any(split(batched, len(moved))[0])
     found = _function_p.bind(*operands, of=_pushed_as_function(of, moved).in_lanes(batched, lanes))
     return found, [0] * len(found)
-
-
-def _is_float(x):
-    return jnp.issubdtype(x.dtype, jnp.inexact)
-
-
-def _zero(x):
-    return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 _function_p = primitive("lagjax_function", _evaluated, _shapes, several=True, jvp=_jvp, batched=_batched)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
@@ -9,7 +10,9 @@ from jax.interpreters import ad, batching, mlir
 from lagjax.jaxtools.tracing import as_usual
 from lagjax.jaxtools.without_lapack_batches import one_by_one
 
-__all__ = ["Primitive", "ad", "front", "jaxpr_as_fun", "linear_map_primitive", "primitive", "split"]
+__all__ = [
+    "Primitive", "ad", "front", "is_float", "jaxpr_as_fun", "linear_map_primitive", "no_tangent", "primitive", "split",
+]  # fmt: skip
 
 
 def primitive(
@@ -86,3 +89,13 @@ def front(operands: Sequence, axes: Sequence[int | None]) -> tuple[list, tuple[b
     lanes = next(x.shape[axis] for x, axis in zip(operands, axes) if axis is not None)
     moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     return moved, tuple(axis is not None for axis in axes), lanes
+
+
+def is_float(x) -> bool:
+    """Whether an array has derivatives."""
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def no_tangent(x) -> ad.Zero:
+    """The tangent of an array that does not move."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())

@@ -4,6 +4,9 @@ It goes through the steps in pieces of as many steps as there are rows. The rows
 are at hand; earlier pieces are run again, each from a checkpoint. In a batch one step of all lanes is pulled back at
 once, so that the cotangents of shared arrays are summed inside matrix products. Lanes have different numbers of steps:
 each begins with its own last one, and idles when it has finished.
+
+With steps of a fixed length each output is a shorter step of its own, from the start y_k of the step around it: it is
+pulled back before that step, and its cotangent of y_k waits until the step itself has been pulled back.
 """
 
 from collections.abc import Callable, Sequence
@@ -93,7 +96,8 @@ class BackwardSweep(NamedTuple):
     """The state of the loop back: the next step `k`, and the rows of the piece `number`.
 
     `y`: the cotangent of the state at the end of step k, without that of an output there; `moved`: the cotangents of
-    the arrays so far; `output`: the last output not passed yet.
+    the arrays so far; `output`: the last output not passed yet; `aside`: the cotangent of the state at the start of
+    step k from outputs inside it; None if these are no steps of their own.
     """
 
     k: Int[Array, ""]
@@ -102,6 +106,7 @@ class BackwardSweep(NamedTuple):
     y: PyTree
     moved: list
     output: Int[Array, ""]
+    aside: PyTree = None
 
 
 def swept_back(
@@ -115,10 +120,11 @@ def swept_back(
     way = _Way(leaves, motion, moved, lanes, found.record, of_outputs)
     total = [jnp.zeros_like(leaves[i]) for i in moved]
     if way.of_times:
-        total = way.added(total, way.where.controller.ts, way.at_time(found.t, of_t))
+        total = way.added_at(total, found.t, of_t)
     k = found.record.count - 1
     output = way.at(way.first, found.record.saved - 1)
-    s = BackwardSweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output)
+    aside = jax.tree.map(jnp.zeros_like, of_y) if motion.static.aside else None
+    s = BackwardSweep(k, jnp.where(k >= 0, k // way.many, -1), way.safe(found.record.rows), of_y, total, output, aside)
     s = lax.while_loop(lambda s: eqxi.unvmap_any(s.k >= 0), way.piece, s)
     # Outputs at the start are the first state.
     y, total = jax.tree.map(jnp.add, s.y, way.at(of_outputs, jnp.zeros_like(k))), s.moved
@@ -164,7 +170,8 @@ class _Way:
     @cached_property
     def of_times(self) -> bool:
         """Whether the cotangents of times are wanted."""
-        return bool({self.where.t0, self.where.controller.ts} & set(self.moved))
+        ends = (self.where.t1, self.where.ts) if self.motion.static.fixed else (self.where.controller.ts,)
+        return bool({self.where.t0, *ends} & set(self.moved))
 
     @property
     def many(self) -> int:
@@ -213,13 +220,20 @@ class _Way:
         ct = jnp.sum(ct, axis=0) if self.lanes is not None and not self.is_lane(i) else ct
         return [x + ct if j == i else x for j, x in zip(self.moved, total)]
 
-    def at_time(self, t: Array, ct):
-        """The cotangent of a time as that of the equal end of a step."""
+    def added_at(self, total: list, t: Array, ct):
+        """The cotangents of the arrays, with that of the time t, which is an end of a step."""
+        if not self.motion.static.fixed:
+            return self.added(total, self.where.controller.ts, self.at_time(self.where.controller.ts, t, ct))
+        last = t == self.leaves[self.where.t1]
+        total = self.added(total, self.where.t1, jnp.where(last, ct, 0.0))
+        return self.added(total, self.where.t0, jnp.where(last, 0.0, ct))
+
+    def at_time(self, ends: int, t: Array, ct):
+        """The cotangent of a time as that of the equal one of the times in the array `ends`."""
 
         def of(ts: Array, t: Array, ct):
             return jnp.where((jnp.arange(ts.size) == jnp.sum(ts < t)) & (ts == t), ct, 0.0)
 
-        ends = self.where.controller.ts
         of = of if self.lanes is None else jax.vmap(of, (0 if self.is_lane(ends) else None, 0, 0))
         return of(self.leaves[ends], t, ct)
 
@@ -279,28 +293,35 @@ class _Way:
         on = self.is_on(s)
         t0, t1, y0 = self.at(s.rows, jnp.maximum(s.k, 0) % self.many)
         here = on & (t1 > t0)
-
-        def only(condition: Callable, tree: PyTree):
-            return jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
-
-        ct, output, inside = s.y, s.output, None
+        ct, output, inside, aside = s.y, s.output, None, None
         if self.motion.static.solver.between:
             inside = only(here, self.of_outputs)
         else:
             at = jnp.maximum(output, 0)
-            time = self.at(self.ts, at)
+            time, of_output = self.at(self.ts, at), self.at(self.of_outputs, at)
             hit = here & (output >= 0) & (time > t0) & (time <= t1)
-            ct = jax.tree.map(jnp.add, ct, only(hit, self.at(self.of_outputs, at)))
             output = jnp.where(hit, self.at(self.first, at - 1), output)
+            if self.motion.static.aside:
+                aside, t1 = hit, jnp.where(hit, time, t1)
+                ct = jax.tree.map(lambda y, x: jnp.where(like(hit, x), x, y), ct, of_output)
+            else:
+                ct = jax.tree.map(jnp.add, ct, only(hit, of_output))
         of_arrays, of_t0, of_t1, of_y = self.pulled(t0, t1, y0, only(here, ct), inside)
         total = [x + (only(here, d) if self.is_lane(i) else d) for x, d, i in zip(s.moved, of_arrays, self.moved)]
         if self.of_times:
-            first, ends = here & (s.k == 0), self.where.controller.ts
+            of_t0, of_t1, first = only(here, of_t0), only(here, of_t1), s.k == 0
+            if aside is not None:
+                total = self.added(total, self.where.ts, self.at_time(self.where.ts, t1, only(aside, of_t1)))
+                of_t1 = only(~aside, of_t1)
             total = self.added(total, self.where.t0, only(first, of_t0))
-            total = self.added(total, ends, self.at_time(t1, only(here, of_t1)))
-            total = self.added(total, ends, self.at_time(t0, only(here & ~first, of_t0)))
-        y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
-        return BackwardSweep(s.k - on, s.number, s.rows, y, total, output)
+            total = self.added_at(total, t1, of_t1)
+            total = self.added_at(total, t0, only(~first, of_t0))
+        if aside is None:
+            y = jax.tree.map(lambda x, ct: jnp.where(like(here, x), x, ct), of_y, ct)
+            return BackwardSweep(s.k - on, s.number, s.rows, y, total, output)
+        waiting = jax.tree.map(jnp.add, s.aside, only(here, of_y))
+        y = jax.tree.map(lambda x, y: jnp.where(like(here & ~aside, x), x, y), waiting, s.y)
+        return BackwardSweep(s.k - (on & ~aside), s.number, s.rows, y, total, output, only(aside, waiting))
 
     def piece(self, s: BackwardSweep) -> BackwardSweep:
         """Pull back one piece."""
@@ -314,6 +335,11 @@ class _Way:
 
         rows = lax.cond(eqxi.unvmap_any(further), again, lambda: s.rows)
         return lax.while_loop(lambda s: eqxi.unvmap_any(self.is_on(s)), self.turn, s._replace(number=number, rows=rows))
+
+
+def only(condition: Array, tree: PyTree):
+    """The tree, with zeros where the condition does not hold."""
+    return jax.tree.map(lambda x: jnp.where(like(condition, x), x, 0.0), tree)
 
 
 def _outputs(leaves: Sequence, motion, lanes):

@@ -35,7 +35,17 @@ from jaxtyping import PyTree
 
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.adjoint.second_order import Push, pull, turned
-from lagjax.jaxtools import ad, front, jaxpr_as_fun, linear_map_primitive, primitive, split, stop_gradient
+from lagjax.jaxtools import (
+    ad,
+    front,
+    is_float,
+    jaxpr_as_fun,
+    linear_map_primitive,
+    no_tangent,
+    primitive,
+    split,
+    stop_gradient,
+)
 
 # Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
 # back through checkpoints. From where on a replay is cheaper was not measured.
@@ -62,7 +72,7 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
             adjoint = replace(adjoint, record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
-        return [y for y in solve_flat(adjoint, True, *leaves)[0] if _is_float(y)]
+        return [y for y in solve_flat(adjoint, True, *leaves)[0] if is_float(y)]
 
     # Undifferentiated, the solve is a program that other transformations may look into, as into a call.
     program = jax.make_jaxpr(lambda *leaves: solve_flat(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
@@ -129,16 +139,13 @@ def _solved_jvp(primals: Sequence, tangents: Sequence, *, program: Any, rules: _
     # Arrays without a tangent are constants: a tangent of zeros would be carried through every step.
     moved = [i for i in range(rules.size) if not isinstance(tangents[i], ad.Zero)]
 
-    def zero(y: PyTree):
-        return ad.Zero(jax.typeof(y).to_tangent_aval())
-
     if rules.recorded is None or not moved or _are_few(primals[i] for i in moved):
         # Bind the primitive, so that a second derivative finds this rule again.
         values, record = _solve_p.bind(*primals, program=program, rules=rules), []
     else:
         values, record = rules.recorded(*primals)
     if not moved:
-        return values, [zero(y) for y in values]
+        return values, [no_tangent(y) for y in values]
     # The record only says around which motion to replay; it is not differentiated.
     leaves = [*primals, *stop_gradient(record)]
     order = moved + [i for i in range(len(leaves)) if i not in moved]
@@ -149,10 +156,10 @@ def _solved_jvp(primals: Sequence, tangents: Sequence, *, program: Any, rules: _
         leaves, record = operands[: len(primals)], operands[len(primals) :]
         return rules.outputs(adjoint, *rules.without_refused(leaves, record), *record)
 
-    shapes = tuple((y.shape, y.dtype) for y in values if _is_float(y))
+    shapes = tuple((y.shape, y.dtype) for y in values if is_float(y))
     params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
     dy = iter(_tangent_p.bind(*(leaves[i] for i in order), *(tangents[i] for i in moved), **params))
-    return values, [next(dy) if _is_float(y) else zero(y) for y in values]
+    return values, [next(dy) if is_float(y) else no_tangent(y) for y in values]
 
 
 def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
@@ -165,10 +172,6 @@ def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
 
 def _are_few(leaves: Sequence):
     return sum(a.size for a in leaves) <= PUSH_UP_TO
-
-
-def _is_float(x):
-    return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 # The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the number of leaves of x
@@ -210,9 +213,7 @@ def _tangent_jvp(primals: Sequence, tangents: Sequence, **params):
 
     def along(primals: Sequence, moving):
         moving = iter(moving)
-        each = [
-            next(moving) if moves(t) else ad.Zero(jax.typeof(x).to_tangent_aval()) for x, t in zip(primals, tangents)
-        ]
+        each = [next(moving) if moves(t) else no_tangent(x) for x, t in zip(primals, tangents)]
         return [ad.instantiate_zeros(d) for d in push(primals, each)]
 
     return values, jax.vmap(along, (axes, [axis for axis, t in zip(axes, tangents) if moves(t)]))(list(primals), moving)

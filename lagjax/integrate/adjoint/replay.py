@@ -8,7 +8,8 @@ l_N = c_N at its end,
 differentiates one step at a time, at its start state: the same step, with its return to the constraints and with the
 constraint equations chosen at its start; what the method keeps from step to step is computed again. The controller, the
 steps that it rejected and the search for events do not take part. The ends of steps are constants, as in forward mode;
-but outputs and jumps are ends of steps, and the cotangents of these ends belong to the times of outputs and jumps.
+but outputs and jumps are ends of steps, and the cotangents of these ends belong to the times of outputs and jumps. The
+ends of steps of a fixed length move with the first time, except for the last one, and outputs are steps of their own.
 
 `step_record.py` records the steps, `backward_sweep.py` goes back over them. The loop forward is a primitive, the loop
 back the transpose of its linear derivative; both have rules for lanes.
@@ -26,7 +27,7 @@ from jax.core import ShapedArray
 
 from lagjax.integrate.adjoint.backward_sweep import BackwardMotion, Lanes, filled, swept_back, together
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, recorded
-from lagjax.jaxtools import ad, front, linear_map_primitive, one_function, primitive, split
+from lagjax.jaxtools import ad, front, is_float, linear_map_primitive, no_tangent, one_function, primitive, split
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Replay:
     `adjoint=None` does the same. `record` and `bent` are for internal use.
 
     **Raises:** `ValueError` if `memory` is not a positive number or is too small for the motion, and where steps are
-    not recorded (a controller of one's own, a condition for diffrax, `progress`).
+    not recorded (a controller of one's own except fixed steps, a condition for diffrax, `progress`).
 
     Source: Griewank & Walther, *Evaluating Derivatives*, ch. 12 (reversal by checkpoints).
     """
@@ -149,25 +150,21 @@ def _pushed(leaves: Sequence, tangents: Sequence, motion: BackwardMotion, lanes)
     run = partial(_run, motion=motion, lanes=lanes)
     start = tuple(leaves[i] for i in moved)
     values, found = jax.jvp(lambda *chosen: run(*filled(leaves, moved, chosen)), start, tuple(moving))
-    return values, [d if _is_float(x) else _zero(x) for x, d in zip(values, found)]
+    return values, [d if is_float(x) else no_tangent(x) for x, d in zip(values, found)]
 
 
 def _derivative(leaves: Sequence, values, tangents: Sequence, motion: BackwardMotion, lanes):
     moved, moving = _moving(tangents)
     if not moved:
-        return [_zero(x) for x in values]
+        return [no_tangent(x) for x in values]
     found = iter(_moved_p.bind(*leaves, *values, *moving, motion=motion, lanes=lanes, moved=moved))
-    return [next(found) if _is_float(x) else _zero(x) for x in values]
+    return [next(found) if is_float(x) else no_tangent(x) for x in values]
 
 
 def _moving(tangents: Sequence):
     """The indices of the operands that have tangents, and these tangents."""
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero))
     return moved, [tangents[i] for i in moved]
-
-
-def _zero(x):
-    return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def _run_batched(operands: Sequence, axes: Sequence, *, motion: BackwardMotion, lanes, same_run: bool):
@@ -198,14 +195,14 @@ def _moved(points: Sequence, moving: Sequence, *, motion: BackwardMotion, lanes,
 
     def of_moved(*chosen):
         found = _run(*filled(leaves, moved, chosen), motion=motion, lanes=lanes)
-        return [x for x in found if _is_float(x)]
+        return [x for x in found if is_float(x)]
 
     return jax.jvp(of_moved, tuple(leaves[i] for i in moved), tuple(moving))[1]
 
 
 def _moved_shapes(*operands, motion: BackwardMotion, lanes, moved: Sequence):
     values = split(operands, len(moved))[0][motion.size :]
-    return [ShapedArray(x.shape, x.dtype) for x in values if _is_float(x)]
+    return [ShapedArray(x.shape, x.dtype) for x in values if is_float(x)]
 
 
 def _moved_jvp(primals: Sequence, tangents: Sequence, **params):
@@ -231,7 +228,7 @@ def _moved_transpose(
 ):  # fmt: skip
     leaves, values = points[: motion.size], points[motion.size :]
     given = iter(cotangents)
-    given = jtu.tree_unflatten(motion.found[0][0], [next(given) if _is_float(x) else None for x in values])
+    given = jtu.tree_unflatten(motion.found[0][0], [next(given) if is_float(x) else None for x in values])
     of_record = jtu.tree_leaves(given.record, is_leaf=_is_zero)
     if any(eqx.is_array(ct) for ct in of_record):
         raise NotImplementedError(
@@ -246,10 +243,6 @@ def _moved_transpose(
     if lanes is None:
         return one_function(swept, leaves, motion.recorded(values), asked, checked=motion.checked, in_blocks=True)
     return swept(leaves, motion.recorded(values), asked)
-
-
-def _is_float(x):
-    return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 def _is_zero(x):

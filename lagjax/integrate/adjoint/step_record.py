@@ -7,7 +7,8 @@ checkpoint (`RecordPlace`), from which the loop can run again to fill the rows w
 checkpoints is used up, every other one is dropped, and from then on they are kept half as often. A long motion is thus
 run again in pieces: each piece once up to rows times checkpoints steps, some pieces more often beyond; memory is fixed.
 
-The loop is diffrax's loop of an adaptive solve whose outputs are ends of steps, with diffrax's solvers and controllers.
+The loop is diffrax's loop, with its solvers and controllers. Outputs are ends of steps, or lie inside them on a
+polynomial; with steps of a fixed length each output is a shorter step of its own, from the start of the step around it.
 diffrax's loop keeps a record too (`SaveAt(steps=True)`), with as many rows as there may be steps: a million.
 """
 
@@ -51,7 +52,7 @@ class StepProblem(NamedTuple):
 
     terms: PyTree[diffrax.AbstractTerm]
     solver: ProjectedSolver
-    controller: StepToOutputs
+    controller: StepToOutputs | diffrax.ConstantStepSize
     ts: Float[Array, " T"]
     first: Int[Array, " T"]
     after: Int[Array, " T"]
@@ -61,6 +62,16 @@ class StepProblem(NamedTuple):
     y0: PyTree[Float[Array, "..."]]
     args: PyTree
     room: Room = Room(ROWS, PLACES)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether all steps have one length; their ends then move with the first time, except for the last one."""
+        return isinstance(self.controller, diffrax.ConstantStepSize)
+
+    @property
+    def aside(self) -> bool:
+        """Whether outputs are steps of their own."""
+        return self.fixed and not self.solver.between
 
 
 class RecordPlace(NamedTuple):
@@ -250,6 +261,8 @@ def _until(p: StepProblem, run: _RecordRun, limit, max_steps) -> _RecordRun:
             hit = here & keep & inside
             outputs = jax.tree.map(lambda all, x: jnp.where(like(hit, x), x, all), outputs, states)
             saved = jnp.where(here & keep, jnp.sum(p.ts <= place.t1, dtype=saved.dtype), saved)
+        elif outputs is not None and p.aside:
+            outputs, saved = _outputs_aside(p, place, dense, outputs, saved, here & keep)
         elif outputs is not None:
             i = jnp.minimum(saved, p.ts.size - 1)
             hit = here & keep & (saved < p.ts.size) & (place.t1 >= p.ts[i])
@@ -285,6 +298,22 @@ def outputs_within(p: StepProblem, t0: Array, t1: Array, y0: PyTree, y1: PyTree,
     inside = (p.ts > t0) & (p.ts <= t1)
     between = Quintic(t0=t0, t1=t1, y0=y0, y1=y1, a0=a0, a1=a1)
     return inside, jax.vmap(between.at)(jnp.where(inside, p.ts, t1))
+
+
+def _outputs_aside(p: StepProblem, place: RecordPlace, dense: dict, outputs: PyTree, saved, here):
+    """The outputs with those inside a step, each by a step of its own, and the first that is not reached."""
+    step = p.solver.interpolation_cls(t0=place.t, t1=place.t1, **dense)
+
+    def left(state: tuple):
+        i = jnp.minimum(state[1], p.ts.size - 1)
+        return here & (state[1] < p.ts.size) & (p.ts[i] <= place.t1), i
+
+    def turn(state: tuple):
+        (on, i), (outputs, saved) = left(state), state
+        outputs = jax.tree.map(lambda all, x: _put(all, i, x, on), outputs, step.evaluate(p.ts[i]))
+        return outputs, jnp.where(on, p.after[i], saved)
+
+    return lax.while_loop(lambda state: eqxi.unvmap_any(left(state)[0]), turn, (outputs, saved))
 
 
 def _put(all, i, x, here):

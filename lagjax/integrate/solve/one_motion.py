@@ -24,7 +24,7 @@ from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
-from lagjax.integrate.settings import Settings
+from lagjax.integrate.settings import Settings, is_recorded
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.stepping.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
@@ -189,8 +189,7 @@ def _loop(
     """
     first = State(ts[0], start.q, start.v, equations.model.params)
     y0 = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
-    if isinstance(adjoint, Replay) and (settings.progress or not _arriving(settings)):
-        # A motion that is not stepped from output to output has no record.
+    if isinstance(adjoint, Replay) and not is_recorded(settings.controller, settings.event, settings.progress):
         adjoint = diffrax.RecursiveCheckpointAdjoint()
     feedback = BAUMGARTE_DECAYS / (ts[-1] - ts[0]) if settings.drift == "baumgarte" else None
     fast, written = None, equations.written
@@ -212,7 +211,7 @@ def _loop(
         controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
     silent = not _user_calls_python(equations, terms, first, guards, settings, controller)
     if isinstance(adjoint, Replay):
-        assert isinstance(controller, StepToOutputs)
+        assert isinstance(controller, StepToOutputs | diffrax.ConstantStepSize)
         before, after = (jnp.searchsorted(ts, ts, side=side) for side in ("left", "right"))
         problem = StepProblem(
             terms, solver, controller, ts, before, after, ts[0], ts[-1], settings.dt0, y0, first.params

@@ -65,6 +65,6 @@ def test_a_budget_that_is_none():
         long_swing()(lj.Replay(memory=100.0))(jnp.ones(30))
     with pytest.raises(ValueError, match="positive number of bytes"):
         lj.Replay(memory=-1.0)
-    constant = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
+    chosen = diffrax.PIDController(rtol=1e-6, atol=1e-9)
     with pytest.raises(ValueError, match="none is kept with a stepsize_controller"):
-        lj.integrate(pendulum(), 1.0, 0.0, PARAMS, ts=TS, adjoint=lj.Replay(memory=1e6), **constant)
+        lj.integrate(pendulum(), 1.0, 0.0, PARAMS, ts=TS, adjoint=lj.Replay(memory=1e6), stepsize_controller=chosen)
