@@ -54,7 +54,7 @@ def fit(
     free: str | Iterable[str] | None = None,
     observe: Callable | None = None,
     bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
-    priors: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float] | None] | None = None,
     loss: str = "squares",
     units: Mapping[str, str] | None = None,
     window: float | None = None,
@@ -89,7 +89,8 @@ def fit(
       `"potential"`. By default every floating-point number in `params`.
     - `observe(t, q, v, params)`: the quantities that `observed` in the records measures: positions, for example.
     - `bounds`: by name, `{"m": (0.0, None)}`. The search takes the logarithm of a positive number.
-    - `priors`: by name (mean, standard deviation) of what is known already; needs `sigma` in the records.
+    - `priors`: by name (mean, standard deviation) of what is known already; needs `sigma` in the records. Weights of
+      networks beside other numbers have weak ones; `{"net": None}` leaves these out ([how](/learned.md)).
     - `loss`: `"squares"`; or `"huber"`, `"soft_l1"`, `"cauchy"`, against outliers, which need `sigma`. Until the last
       stage the median residual counts as an ordinary error, since far from the truth all residuals are large.
     - `units`: by name, for the table.

@@ -68,7 +68,9 @@ def identifiability(
     """
 
     def problem_for(records: Sequence[Record], observe: Callable | None):
-        return problem_of(system, records, params, free, observe, None, priors, "squares", window, dict(options))
+        return problem_of(
+            system, records, params, free, observe, None, priors, "squares", window, dict(options), weak=False
+        )
 
     problem = problem_for(records, observe)
     if shrink is None and candidates is not None:

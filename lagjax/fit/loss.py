@@ -79,7 +79,7 @@ def fit_residuals(
     free: str | Iterable[str] | None = None,
     observe: Callable | None = None,
     bounds: Mapping[str, tuple[float | None, float | None]] | None = None,
-    priors: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float] | None] | None = None,
     loss: str = "squares",
     window: float | None = None,
     joined: bool = True,

@@ -21,6 +21,8 @@ from lagjax.system import OF_STATE, Call, Hybrid, State, System, check_system, m
 
 # Arguments of `integrate` that a fit sets itself.
 SET_BY_FIT = {"ts", "throw", "adjoint"}
+# Beside a weak prior an error counts as this fraction of the data's spread, if there is no sigma.
+ASSUMED_ERROR = 1e-3
 
 
 class FitWarning(UserWarning):
@@ -38,8 +40,9 @@ def problem_of(
     loss: str,
     window: float | None,
     options: dict[str, Any],
+    weak: bool = True,
 ) -> FitProblem:
-    """Check all arguments and make arrays of them."""
+    """Check all arguments and make arrays of them; `weak`: with weak priors for the weights of networks."""
     check_system(system, records, params, phases=True)
     # A motion in phases starts in that of `start=`, which is no option of the motions.
     system = system.starting(options.pop("start", None))
@@ -60,7 +63,9 @@ def problem_of(
     absolute = _absolute(records, loss, priors)
     dtype = jnp.result_type(float)
     options = {name: np.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
-    found = find(params, free, bounds or {}, priors or {}, dtype)
+    found = find(
+        params, free, bounds or {}, priors or {}, dtype, (1.0 if absolute else ASSUMED_ERROR) if weak else None
+    )
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
     params_of_records = [
@@ -115,7 +120,7 @@ def _absolute(records: Sequence[Record], loss: str, priors: Mapping | None):
     why = None
     if any(len(record.measured) > 1 for record in records):
         why = f"measurements of several kinds ({listed(list(records[0].measured))}) must be weighed against each other"
-    elif priors:
+    elif any(pair is not None for pair in (priors or {}).values()):
         why = "a prior must be weighed against the data"
     elif loss != "squares":
         why = f"loss={loss!r} must know how large an ordinary error is"

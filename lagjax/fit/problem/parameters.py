@@ -6,6 +6,10 @@ A fitted number x is searched as an unbounded one, z:
     x = low + exp z               above `low`      (positive numbers: z is the logarithm)
     x = high - exp(-z)            below `high`
     x = low + (high - low) / (1 + exp(-z))         between
+
+Weights of a network that the data hardly determine run away beside physical numbers, which then mean nothing. An entry
+of `params` that is more than one array, a matrix among them, counts as a network; if other numbers are free too, each
+of its weights gets a weak prior, normal about its guess.
 """
 
 import math
@@ -25,6 +29,10 @@ from lagjax.jaxtools import is_traced, numpy_of
 from lagjax.mechanics import listed
 from lagjax.system import coordinates
 
+# The standard deviation of a weak prior, relative to the root mean square of the guesses of a network's weights. With
+# ten times a search takes three times as many steps (a spring and a friction network, from three keys).
+WEAK = 3.0
+
 
 class Leaf(NamedTuple):
     """A leaf of `params` by its index, and the indices of its fitted entries; None stands for all."""
@@ -40,7 +48,7 @@ class FreeNumbers:
 
     - `start` (p,): where the search starts. `low`, `high` (p,): bounds, infinite where there are none.
     - `mean`, `sd` (p,): the priors; `sd` is infinite where there is none.
-    - `names`: the name of each number, as the user writes it.
+    - `names`: the name of each number, as the user writes it. `weak`: the entries whose weights have weak priors.
     """
 
     params: PyTree
@@ -51,6 +59,7 @@ class FreeNumbers:
     sd: Float[Array, " p"]
     names: tuple[str, ...] = eqx.field(static=True)
     leaves: tuple[Leaf, ...] = eqx.field(static=True)
+    weak: tuple[str, ...] = eqx.field(static=True, default=())
 
     def into(self, x: Float[Array, " p"]) -> PyTree:
         """`params` with the numbers `x` inserted."""
@@ -118,10 +127,14 @@ def find(
     params: PyTree,
     free: str | Iterable[str] | None,
     bounds: Mapping[str, tuple[float | None, float | None]],
-    priors: Mapping[str, tuple[float, float]],
+    priors: Mapping[str, tuple[float, float] | None],
     dtype: Any,
+    error: float | None = None,
 ) -> FreeNumbers:
-    """Determine the numbers to be fitted from `params`, names, bounds and priors."""
+    """Determine the numbers to be fitted from `params`, names, bounds and priors.
+
+    `error`: that of a measurement as residuals have it, against which weak priors are set; None: there are none.
+    """
     if not is_traced(params):
         with jax.ensure_compile_time_eval():
             params = coordinates.given_params(params, dtype)
@@ -151,15 +164,26 @@ def find(
                 for numbers in by_leaf]  # fmt: skip
 
     low, high = spread(bounds, (-np.inf, np.inf), "bounds")
-    mean, sd = spread(priors, (0.0, np.inf), "priors")
+    mean, sd = spread({name: pair for name, pair in priors.items() if pair is not None}, (0.0, np.inf), "priors")
     if np.any(sd <= 0):
         raise ValueError('the standard deviation of a prior must be positive.\nFix: priors={"g": (9.81, 0.01)}.')
+    # Which network each number belongs to, counted from 1; 0 for one with a prior of its own, or with None for it.
+    networks = _networks(params, chosen) if error else []
+    of = spread({name: (i + 1, None) for i, name in enumerate(networks)}, (0, 0), "priors")[0]
+    physical = np.any(of == 0)
+    of = np.where(spread(dict.fromkeys(priors, (1, None)), (0, 0), "priors")[0], 0, of)
+    weak = tuple(name for i, name in enumerate(networks) if physical and np.any(of == i + 1))
+    for i, name in enumerate(networks):
+        if name in weak:
+            size = xp.sqrt(xp.mean(start[of == i + 1] ** 2))
+            width = WEAK * xp.where(size > 0, size, 1.0) / error
+            mean, sd = xp.where(of == i + 1, start, mean), xp.where(of == i + 1, width, sd)
     numbers = {name: i for i, (name, _) in enumerate(named)}
     leaves = tuple(
         Leaf(numbers[name], None if places.all() else tuple(map(int, np.flatnonzero(places))))
         for name, places in chosen.items()
     )
-    found = FreeNumbers(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), leaves)
+    found = FreeNumbers(params, start, *(x.astype(dtype) for x in (low, high, mean, sd)), tuple(entries), leaves, weak)
     _check_start(found, low, high)
     return found
 
@@ -167,6 +191,16 @@ def find(
 def leaf_name(path: tuple[Any, ...]) -> str:
     """The name of a leaf of `params` as a user writes it."""
     return jtu.keystr(path, simple=True, separator=".") or "params"
+
+
+def _networks(params: PyTree, chosen: Mapping[str, np.ndarray]) -> list[str]:
+    """The entries of `params` that are more than one array, a matrix among them, and have free numbers."""
+    found = []
+    for path, entry in jtu.tree_leaves_with_path(params, is_leaf=lambda x: x is not params):
+        name, arrays = leaf_name(path), [x for x in jax.tree.leaves(entry) if eqx.is_inexact_array(x)]
+        if len(arrays) > 1 and any(x.ndim > 1 for x in arrays) and any(leaf.startswith(f"{name}.") for leaf in chosen):
+            found.append(name)
+    return found
 
 
 def _entries(name: str, x: Array):

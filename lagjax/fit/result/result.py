@@ -64,6 +64,11 @@ def lines_of(fit: "Fit") -> list[str]:
     lines += [f"  {name:<{width}}  {value:<{wide}}  {unit}".rstrip() for name, value, unit in rows]
     if many:
         lines.append(f"  ... and {len(fit.names) - 40} more")
+    if weak := fit.problem.found.weak:
+        none = ", ".join(f'"{name}": None' for name in weak)
+        lines.append(
+            f"  weak priors about their guesses for the weights of {listed(list(weak))}; none: priors={{{none}}}"
+        )
     if windows.max() + 1 < len(windows):
         lines.append(f"  {len(windows)} windows, each from a start of its own")
     rms = ", ".join(f"{name} {value:.3g}" for name, value in fit.rms().items())
