@@ -131,6 +131,9 @@ if TYPE_CHECKING:
     # Many motions, in a notebook.
     from lagjax.sliders import Knobs, interact
 
+    # Two points.
+    from lagjax.two_points import Steering, steer
+
 
 __version__ = "0.2.0"
 
@@ -148,6 +151,7 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
+    "lagjax.two_points": "Steering steer",
 }
 
 
@@ -268,6 +272,8 @@ __all__ = [
     "identifiability",
     "Identifiability",
     "learned",
+    "steer",
+    "Steering",
     "WorkPrecision",
     "work_precision",
     "export",

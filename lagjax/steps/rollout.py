@@ -96,7 +96,7 @@ def rollout(
     if held is not None:
         by_name = with_control is None
         if by_name:
-            _check_names(s.params, held)
+            check_names(s.params, held)
         first = jtu.tree_map(lambda u: jax.ShapeDtypeStruct(u.shape[1:], u.dtype), held)
         call = Call("with_control", with_control or _by_name, ("params", "u"))
         # Checked as it is; what it returns besides arrays, as the functions in a network, is the same in all steps.
@@ -129,7 +129,7 @@ def _rolled(
 ):  # fmt: skip
     if by_name and count:
         assert merge is not None
-        _check_read(system, s, held, merge)
+        check_read(system, s, held, merge)
     if not count:
         return jtu.tree_map(lambda x: jnp.asarray(x)[None], tuple(s[:3]))
     t = s.t + np.arange(count + 1) * dt
@@ -216,7 +216,7 @@ def _by_name(params: PyTree, u: PyTree):
     return {**(params or {}), **u}
 
 
-def _check_names(params: PyTree, held: PyTree):
+def check_names(params: PyTree, held: PyTree):
     """Raise if the controls or the parameters have no names."""
     if isinstance(held, Mapping) and (params is None or isinstance(params, Mapping)):
         return
@@ -229,7 +229,7 @@ def _check_names(params: PyTree, held: PyTree):
     )
 
 
-def _check_read(system: System, s: State, held: PyTree, merge: Merge):
+def check_read(system: System, s: State, held: PyTree, merge: Callable):
     """Raise if no function of the system reads a control."""
 
     def functions(u: PyTree):

@@ -1,0 +1,236 @@
+"""What `steer` found: the plan, the motion that it causes, its cost, and how far it ends from where it was to end."""
+
+from contextlib import suppress
+from threading import Thread
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.display import plots
+from lagjax.integrate import Trajectory, integrate
+from lagjax.jaxtools import has_jumps
+from lagjax.system import System, coordinates
+from lagjax.two_points.layout import Layout
+from lagjax.two_points.nonlinear_program import Solved
+from lagjax.two_points.plan import Plan, Planned, following, plan_of
+from lagjax.two_points.question import Question
+
+STATUS = {
+    "Solve_Succeeded": "least cost near the guess found",
+    "Solved_To_Acceptable_Level": "found to the precision that rounding allows",
+    "Infeasible_Problem_Detected": "no motion satisfies all conditions, as far as the solver sees",
+    "Restoration_Failed": "no motion that satisfies all conditions was found",
+    "Maximum_Iterations_Exceeded": "not found within the largest number of iterations",
+    "Search_Direction_Becomes_Too_Small": "the solver could not go on",
+    "Diverging_Iterates": "the cost falls without limit",
+    "Invalid_Number_Detected": "L, a force, a constraint or the cost is not finite on the way",
+    "Not_Enough_Degrees_Of_Freedom": "there are more conditions than unknown numbers",
+}
+# A motion that ends further from the end than this part of the way is none.
+MISSED = 1e-2
+FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
+
+class Steering(eqx.Module):
+    """The controls that bring a system from one state to another, and the motion that they cause.
+
+    - `controls`: `controls(t)` is a dict of the controls at a time; `controls.knots`, `controls.rows` are the numbers.
+    - `trajectory`: the motion by `lj.integrate`, from the start found, under these controls.
+    - `cost`: that of the program; `cost_change`: by how much it changed when the elements were halved last.
+    - `defect`: the largest distance of the integrated end from the end that was asked, in the units of each number;
+      `defects`: by name, the integrated number less the asked one.
+    - `system`, `params`: the system with its plan, which `lj.integrate` and all else take.
+    - `t_b`: the time of the end, `[t]`.
+    - `status`: what the solver says, in words; `success`, `iterations` (of all meshes), `elements` (of the last).
+    """
+
+    controls: Plan
+    trajectory: Trajectory
+    cost: float
+    cost_change: float
+    defects: dict[str, float]
+    system: System
+    params: PyTree
+    t_b: float
+    status: str
+    success: bool
+    iterations: int
+    elements: int
+
+    @property
+    def defect(self) -> float:
+        """The largest distance of the integrated end from the asked one."""
+        return max((abs(x) for x in self.defects.values()), default=0.0)
+
+    def plot(self):
+        """Draw controls, coordinates and velocities against time.
+
+        **Returns:** a matplotlib `Figure`.
+        """
+        t = np.linspace(float(self.controls.knots[0]), float(self.controls.knots[-1]), 1001)
+        u = self.controls.at(t)
+        controls = dict(zip(coordinates.names(self.controls.example), u.T))
+        q, v = (_columns(x) for x in (self.trajectory.q, self.trajectory.v))
+        at = np.asarray(self.trajectory.t)
+        panels = {"controls": controls}
+        panels |= {
+            kind: {name: np.interp(t, at, x) for name, x in values.items()} for kind, values in (("q", q), ("v", v))
+        }
+        return plots.time_series(t, panels)
+
+    def __repr__(self):
+        worst = max(self.defects, key=lambda name: abs(self.defects[name]), default=None)
+        rows = [
+            ("status", self.status),
+            ("cost", f"{self.cost:.12g}, which changed by {self.cost_change:.2g} from half as many elements"),
+            ("end", f"t = {self.t_b:.12g}"),
+            ("defect", "nothing asked" if worst is None else f"{self.defect:.2g}, of {worst}: integrated less asked"),
+            ("controls", ", ".join(coordinates.names(self.controls.example))),
+            ("elements", f"{self.elements}, {self.iterations} iterations on all meshes"),
+        ]
+        width = max(len(name) for name, _ in rows)
+        return "\n".join(["Steering", *(f"  {name.ljust(width)}  {text}" for name, text in rows)])
+
+
+class Motion(NamedTuple):
+    """How the motion is integrated: outputs, tolerance, the most elements of a plan, and whether to raise."""
+
+    outputs: int
+    rtol: float
+    room: int
+    throw: bool
+
+
+def steering_of(
+    question: Question, layout: Layout, solved: Solved, motion: Motion, change: float, iterations: int
+) -> Steering:
+    """The integrated motion under the controls that were found, beside what was asked."""
+    plant, at = question.plant, layout.places
+    t_a, t_b = question.t_a, float(solved.x[at["end"]][0])
+    knots = t_a + (t_b - t_a) * solved.x[at["parts"]]
+    rows = solved.x[at["controls"]][layout.of_controls]
+    plan = plan_of(knots, rows, question.limits["controls"], plant.controls, plant.control_nodes, motion.room)
+    system, params = following(question.system, plant.merge), Planned(question.params, plan)
+    q, v = (plant.form.tree(solved.x[at[name]][0]) for name in "qv")
+    trajectory = _integrated(question, system, params, (q, v), t_b, motion)
+    defects = _defects(question, trajectory)
+    status, success = STATUS.get(solved.status, solved.status), is_found(solved)
+    path = solved.x[at["q"]]
+    size = max(float(np.max(np.ptp(path, axis=0))), float(np.max(np.abs(path[-1]))))
+    worst = max((abs(x) for name, x in defects.items() if name in question.names["q"]), default=0.0)
+    if success and not worst <= MISSED * size:
+        success, status = False, "what was found is no motion: under its controls the system ends elsewhere"
+        if motion.throw:
+            raise RuntimeError(
+                f"lj.steer: {status}, {worst:.3g} from the end.\n"
+                "Usual cause: a guess that runs through a singular configuration (a straight line through the pivot of "
+                "a rod), or elements too long for what happens in one; or a motion that amplifies every error.\n"
+                "Fix: guess=lambda t: q, a path along which the motion could go; elements=32."
+            )
+    return Steering(
+        plan, trajectory, solved.cost, change, defects, system, params, t_b, status, success, iterations, layout.count
+    )
+
+
+def _integrated(
+    question: Question, system: System, params: Planned, start: tuple, t_b: float, motion: Motion
+) -> Trajectory:
+    # Times at which a plan is cut off at its bounds are many, and no more than kinks: only the user's own are sought.
+    plant = question.plant
+    own = (plant.system.lagrangian, plant.system.force, plant.system.dissipation)
+    jumps = "found" if any(f is not None and has_jumps(f.program.jaxpr) for f in own) else "ignored"
+    knots = params.plan.knots[1:-1]
+    ends = np.append(knots, np.full(motion.room - len(knots), t_b))
+    ts = np.linspace(question.t_a, t_b, motion.outputs)
+    return integrate(system, *start, params, ts=ts, rtol=motion.rtol, jump_ts=ends, jumps=jumps, throw=motion.throw)
+
+
+def compile_ahead(question: Question, motion: Motion) -> Thread:
+    """Compile what integrates the motion beside the solver's own programs, on the first instants of a motion at rest.
+
+    It takes as long as these: a first answer comes a third sooner on two cores.
+    """
+    plant, t_a = question.plant, question.t_a
+    t_b = t_a + 1e-6 * (question.t_b[0] - t_a)
+    rows = np.broadcast_to(question.controls, (1, len(plant.control_nodes), plant.n_controls))
+    knots = np.array([t_a, t_b])
+    plan = plan_of(knots, rows, question.limits["controls"], plant.controls, plant.control_nodes, motion.room)
+    system, params = following(question.system, plant.merge), Planned(question.params, plan)
+    start = tuple(plant.form.tree(np.nan_to_num(x)) for x in question.ends[0])
+
+    def run():
+        # What goes wrong here goes wrong again in the motion itself, or never.
+        with suppress(Exception):
+            _integrated(question, system, params, start, t_b, motion._replace(throw=False))
+
+    thread = Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def _defects(question: Question, trajectory: Trajectory) -> dict[str, float]:
+    """The integrated end less the asked one, by name."""
+    plant, end, found = question.plant, trajectory.end, {}
+    if plant.end is not None:
+        values = coordinates.vector(plant.end(end.t, end.q, end.v, plant.params))
+        found = {f"end[{i}]": float(x) for i, x in enumerate(np.asarray(values))}
+    for kind, wanted, at_end in zip("qv", question.ends[1], (end.q, end.v)):
+        off = np.asarray(coordinates.vector(at_end)) - wanted
+        found |= {question.names[kind][i]: float(off[i]) for i in np.flatnonzero(np.isfinite(wanted))}
+    return found
+
+
+def _columns(tree: PyTree) -> dict[str, np.ndarray]:
+    names = coordinates.names(jtu.tree_map(lambda x: np.asarray(x)[0], tree))
+    return dict(zip(names, np.concatenate([np.reshape(x, (len(x), -1)).T for x in jtu.tree_leaves(tree)])))
+
+
+def is_found(solved: Solved) -> bool:
+    """Whether the solver found a solution."""
+    return solved.status in FOUND
+
+
+def failure_in_words(question: Question, layout: Layout, solved: Solved, of_rows: tuple) -> str:
+    """Why there is no solution, and the condition that is violated most."""
+    text = f"lj.steer: {STATUS.get(solved.status, solved.status)}, after {solved.iterations} iterations.\n"
+    low, high = of_rows
+    off = np.maximum(np.maximum(low - solved.rows, solved.rows - high), 0.0)
+    off = np.where(np.isfinite(off), off, np.inf)
+    worst = int(np.argmax(off))
+    if off[worst] > 1e-6:
+        text += f"Violated most: {_row_in_words(question, layout, solved.x, worst)}, by {off[worst]:.3g}.\n"
+    return text + (
+        "Usual cause: bounds too narrow for the time, an end that no control reaches, or a guess far away.\n"
+        "Fix: wider bounds or t_b=(low, high); guess=lambda t: q of a path; a first answer of an easier question."
+    )
+
+
+def _row_in_words(question: Question, layout: Layout, x: np.ndarray, row: int) -> str:
+    kind, at = next((kind, at) for kind, at in layout.rows.items() if at.size and at.ravel()[-1] >= row)
+    place = tuple(int(i[0]) for i in np.nonzero(at == row))
+    parts, plant = x[layout.places["parts"]], question.plant
+    t_b = float(x[layout.places["end"]][0])
+
+    def time(element: int, part: float):
+        return question.t_a + (t_b - question.t_a) * (parts[element] + part * (parts[element + 1] - parts[element]))
+
+    if kind == "motion":
+        element, node = divmod(place[0], plant.degree)
+        element, node = (element, node) if element < layout.count else (element - 1, plant.degree)
+        name, t = question.names["q"][place[1]], time(element, plant.rule.nodes[node])
+        return f"the equation of motion of '{name}' at t = {t:.4g}"
+    if kind == "bounded":
+        name = question.names["v"][plant.bounded[place[2]]]
+        return f"the bounds of '{name}' at t = {time(place[0], plant.rule.points[place[1]]):.4g}"
+    if kind in ("positions", "velocities"):
+        names = [
+            residual.name
+            for residual in plant.form.residuals
+            for _ in range(residual.size)
+            if residual.of_positions == (kind == "positions")
+        ]
+        return f"the constraint '{names[place[2]]}' at t = {time(place[0], plant.rule.points[place[1]]):.4g}"
+    return f"condition {place[0]} of end(t, q, v, params)" if kind == "end" else f"the constraints at the {kind}"
