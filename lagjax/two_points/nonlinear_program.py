@@ -8,7 +8,6 @@ Source: Wächter & Biegler, *Mathematical Programming* 106 (2006) 25; Ipopt and 
 """
 
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,12 +105,13 @@ class NonlinearProgram:
 def import_casadi():
     """casadi, which brings Ipopt with it."""
     try:
-        return import_module("casadi")
+        import casadi
     except ImportError as error:
         raise ImportError(
             "lj.steer solves its nonlinear program by Ipopt, which comes with casadi, and casadi is not installed.\n"
             'Fix: pip install "lagjax[steer]".'
         ) from error
+    return casadi
 
 
 def _functions(casadi: Any, program: NonlinearProgram) -> dict[str, Any]:

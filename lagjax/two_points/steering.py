@@ -37,6 +37,12 @@ FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 class Steering(eqx.Module):
     """The controls that bring a system from one state to another, and the motion that they cause.
 
+    >>> import lagjax as lj
+    >>> cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
+    >>> found = lj.steer(cart, {"push": 0.0}, (0.0, 0.0), (1.0, 0.0), lambda t, q, v, u, params: u["push"] ** 2, t_b=1.0)
+    >>> print(found.status, found.trajectory.q[100].round(9))
+    least cost near the guess found 0.5
+
     - `controls`: `controls(t)` is a dict of the controls at a time; `controls.knots`, `controls.rows` are the numbers.
     - `trajectory`: the motion by `lj.integrate`, from the start found, under these controls.
     - `cost`: that of the program; `cost_change`: by how much it changed when the elements were halved last.

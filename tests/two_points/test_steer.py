@@ -1,0 +1,195 @@
+"""Optimal control: closed forms, constraints, a published problem, and questions that have no answer."""
+
+from importlib import import_module
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.two_points import mesh
+
+cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
+
+
+def energy(t, q, v, u, params):
+    return u["push"] ** 2
+
+
+def pushed(start=(0.0, 0.0), end=(1.0, 0.0), cost=energy, t_b=1.0, **options):
+    return lj.steer(cart, {"push": 0.0}, start, end, cost, t_b=t_b, **options)
+
+
+@pytest.mark.slow
+def test_least_energy():
+    """A mass moved by one in one unit of time: J = 12, u = 6 - 12 t; three for an end of any speed, u = 3 - 3 t."""
+    found = pushed()
+    ts = np.linspace(0.0, 1.0, 11)
+    assert abs(found.cost - 12) < 1e-9 and found.success
+    np.testing.assert_allclose(found.controls.at(ts)[:, 0], 6 - 12 * ts, atol=1e-9)
+    np.testing.assert_allclose(found.trajectory.q, 3 * found.trajectory.t**2 - 2 * found.trajectory.t**3, atol=1e-9)
+    free = pushed(end=(1.0, None))
+    assert abs(free.cost - 3) < 1e-9 and list(free.defects) == ["q"]
+    np.testing.assert_allclose(free.controls.at(ts)[:, 0], 3 - 3 * ts, atol=1e-9)
+    linear = pushed(interpolation="linear", elements=2, most=2)
+    np.testing.assert_allclose(linear.controls.at(ts)[:, 0], 6 - 12 * ts, atol=1e-9)
+    started = pushed(start=(0.0, None))
+    assert abs(started.cost - 3) < 1e-9 and abs(started.trajectory.v[0] - 1.5) < 1e-9
+
+
+@pytest.mark.slow
+def test_a_held_control_costs_more():
+    """Twin: N constant controls have their best value above 12, by 12 / (N² - 1)."""
+    found = pushed(interpolation="constant", elements=8, most=8)
+    assert abs(found.cost - 12 - 12 / (8**2 - 1)) < 1e-9 and found.defect < 1e-9
+
+
+@pytest.mark.slow
+def test_bounds_end_functions_and_end_costs():
+    """A speed of at most 1.2 costs 15.36, by arcs of parabolas; an end by a function, and one by a cost of its own."""
+    slower = pushed(bounds={"v": (-jnp.inf, 1.2)}, tol=1e-8)
+    assert abs(slower.cost - 15.36) < 1e-6 and np.max(slower.trajectory.v) < 1.2 + 1e-6
+    by_function = pushed(end=lambda t, q, v, params: jnp.stack([q - 1, v]))
+    assert abs(by_function.cost - 12) < 1e-9 and list(by_function.defects) == ["end[0]", "end[1]"]
+    # 3 x² + 10 (x - 1)² is least at x = 10/13.
+    by_cost = pushed(end=(None, None), end_cost=lambda t, q, v, params: 10 * (q - 1) ** 2)
+    assert abs(by_cost.cost - 30 / 13) < 1e-9 and by_cost.defects == {}
+    assert "nothing asked" in repr(by_cost)
+
+
+SHORTEST = {"start": (-1.0, 0.5), "end": (0.0, 0.0), "cost": None, "t_b": (0.1, 10.0), "bounds": {"push": (-1.0, 1.0)}}
+
+
+@pytest.mark.slow
+def test_least_time(monkeypatch):
+    """From x = -1, v = 1/2 to rest at 0 with |u| ≤ 1: T = √4.5 - 1/2, the push turning at (√4.5 - 1)/2."""
+    found, switch = pushed(**SHORTEST), (np.sqrt(4.5) - 1) / 2
+    assert abs(found.t_b - np.sqrt(4.5) + 0.5) < 1e-8 and found.defect < 1e-8
+    assert np.min(np.abs(found.controls.knots - switch)) < 1e-6
+    before, after = found.controls(switch - 1e-5)["push"], found.controls(switch + 1e-5)["push"]
+    assert abs(before - 1) < 1e-6 and abs(after + 1) < 1e-6
+    # Twin: without the cut the turn lies inside an element, whose polynomial is not it.
+    monkeypatch.setattr(import_module("lagjax.two_points.steer"), "jumps_of", lambda *arguments: [])
+    uncut = pushed(**SHORTEST)
+    assert np.min(np.abs(uncut.controls.knots - switch)) > 1e-4 and abs(uncut.t_b - found.t_b) > 1e-8
+
+
+def cart_pole(t, q, v, p):
+    (x, angle), (dx, turn) = (q["x"], q["angle"]), (v["x"], v["angle"])
+    kinetic = 0.5 * (p["m1"] + p["m2"]) * dx**2 + p["m2"] * p["l"] * dx * turn * jnp.cos(angle)
+    return kinetic + 0.5 * p["m2"] * p["l"] ** 2 * turn**2 + p["m2"] * p["g"] * p["l"] * jnp.cos(angle)
+
+
+@pytest.mark.slow
+def test_cart_pole_swings_up():
+    """Kelly's cart-pole: 58.80766746, which Hermite and Simpson's rule with explicit equations tends to.
+
+    Dymos publishes 58.8839489745 of 40 elements of that rule, to a thousandth, with no push asked for at the end: an
+    upper bound, and this motion, integrated, reaches the end for less.
+    """
+    swung = lj.System(cart_pole, force=lambda t, q, v, p: {"x": p["push"], "angle": 0.0})
+    params = {"m1": 1.0, "m2": 0.3, "l": 0.5, "g": 9.81}
+    rest, up = {"x": 0.0, "angle": 0.0}, {"x": 1.0, "angle": jnp.pi}
+    bounds = {"push": (-20.0, 20.0), "x": (-2.0, 2.0)}
+    found = lj.steer(swung, {"push": 0.0}, (rest, rest), (up, rest), energy, params, t_b=2.0, bounds=bounds)
+    assert abs(found.cost - 58.80766746) < 1e-7 and found.cost < 58.8839489745 * (1 - 1e-3)
+    assert found.defect < 1e-7 and abs(found.trajectory.end.q["angle"] - np.pi) < 1e-7
+    # The work of the push is the cost in Simpson's rule on the integrated motion's own times.
+    u = found.controls.at(np.linspace(0.0, 2.0, 4001))[:, 0]
+    assert abs(np.trapezoid(u**2, dx=2.0 / 4000) - found.cost) < 1e-3
+
+
+@pytest.mark.slow
+def test_brachistochrone():
+    """The slope of a wire as a control, which a velocity constraint reads: the cycloid, to 1e-10 of its time."""
+    wire = lj.Nonholonomic(lambda t, q, v, p: v[0] * jnp.sin(p["slope"]) - v[1] * jnp.cos(p["slope"]))
+    bead = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * q[1], {"wire": wire})
+    start, end = (jnp.array([0.0, 10.0]), jnp.zeros(2)), (jnp.array([10.0, 5.0]), None)
+    bounds = {"slope": (-jnp.pi / 2, jnp.pi / 2)}
+    found = lj.steer(
+        bead, {"slope": -0.5}, start, end, params={"g": 9.80665}, t_b=(0.5, 5.0), bounds=bounds, tol=1e-8
+    )
+    assert abs(found.t_b - 1.801603122453) < 1e-10 and found.defect < 1e-6
+    # On a cycloid the slope turns evenly, from straight down.
+    ts = np.linspace(0.0, found.t_b, 9)
+    slope = found.controls.at(ts)[:, 0]
+    assert abs(slope[0] + np.pi / 2) < 1e-6 and np.ptp(np.diff(slope)) < 1e-6
+
+
+@pytest.mark.slow
+def test_constraints_change_nothing():
+    """A pendulum swung up by a torque: its angle, and x and y on a rod, have one cost; the rod's multipliers are kept."""
+    angle = lj.System(lambda t, q, v, p: 0.5 * v**2 + 9.81 * jnp.cos(q), force=lambda t, q, v, p: p["torque"])
+    rod = lj.System(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 9.81 * q[1],
+        {"rod": lj.Holonomic(lambda t, q, p: 0.5 * (jnp.sum(q**2) - 1.0))},
+        force=lambda t, q, v, p: p["torque"] * jnp.stack([-q[1], q[0]]),
+    )
+
+    def cost(t, q, v, u, p):
+        return u["torque"] ** 2
+
+    def guess(t):
+        return jnp.stack([jnp.sin(jnp.pi * t / 1.5), -jnp.cos(jnp.pi * t / 1.5)])
+
+    rest, low, high = jnp.zeros(2), jnp.array([0.0, -1.0]), jnp.array([0.0, 1.0])
+    control, times = {"torque": 0.0}, {"t_b": 1.5, "tol": 1e-9}
+    one = lj.steer(angle, control, (0.0, 0.0), (jnp.pi, 0.0), cost, **times)
+    other = lj.steer(rod, control, (low, rest), (high, rest), cost, guess=guess, **times)
+    assert abs(one.cost - other.cost) < 1e-7 * one.cost and other.defect < 1e-6
+    # At rest below, the rod carries the weight: g + v² with |∂g/∂q| = 1.
+    assert abs(other.trajectory.multipliers["rod"][0] + 9.81) < 1e-6
+    # A straight line runs through the pivot, and what is found from there is no motion.
+    with pytest.raises(RuntimeError, match="is no motion"):
+        lj.steer(rod, control, (low, rest), (high, rest), cost, t_b=1.5)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_is_said():
+    """Too weak a push names the equation that is violated most; more conditions than numbers are counted."""
+    with pytest.raises(RuntimeError, match="Violated most: the equation of motion of 'q' at t = "):
+        pushed(bounds={"push": (-1.0, 1.0)})
+    with pytest.raises(RuntimeError, match="the bounds of 'v' at t = |equation of motion"):
+        pushed(bounds={"v": (-0.5, 0.5)})
+    found = pushed(bounds={"push": (-1.0, 1.0)}, throw=False)
+    assert not found.success and "no motion" in found.status
+    with pytest.raises(ValueError, match="too many conditions: 5 equations for 4 unknown numbers"):
+        pushed(interpolation="constant", elements=1)
+
+
+def test_questions_that_are_wrong():
+    """Each is answered in the user's names before anything is compiled."""
+    for options, words in (
+        ({"cost": None}, "nothing to minimise"),
+        ({"t_b": 0.0}, "the end must come after the start"),
+        ({"t_b": (0.0, jnp.inf)}, "a pair of times"),
+        ({"bounds": {"puhs": (-1, 1)}}, "Fix: 'push'"),
+        ({"bounds": {"q": (-1.0, 0.9)}}, "the end asks for q = 1, and its bounds are -1 and 0.9"),
+        ({"bounds": {"push": (1, -1)}}, "above the upper one"),
+        ({"end": (jnp.zeros(2), 0.0)}, "the start has"),
+        ({"interpolation": "cubic"}, "'smooth', 'linear' and 'constant'"),
+        ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            pushed(**options)
+    with pytest.raises(TypeError, match="neither q nor v"):
+        pushed(start=(None, None))
+    with pytest.raises(ValueError, match="nothing in the system reads the control 'brake'"):
+        lj.steer(cart, {"push": 0.0, "brake": 0.0}, (0.0, 0.0), (1.0, 0.0), energy, t_b=1.0)
+    with pytest.raises(TypeError, match="controls is no dict"):
+        lj.steer(cart, 0.0, (0.0, 0.0), (1.0, 0.0), energy, t_b=1.0)
+    ring = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), {"ring": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - 1)},
+                     force=lambda t, q, v, p: p["push"] * q)  # fmt: skip
+    with pytest.raises(ValueError, match="the start is off the constraint 'ring' by 3"):
+        lj.steer(ring, {"push": 0.0}, (jnp.array([2.0, 0.0]), jnp.zeros(2)), (None, None), energy, t_b=1.0)
+
+
+def test_meshes():
+    """Elements are cut at a jump, near a bound of theirs are moved there, and keep it as they are halved."""
+    even = mesh.Mesh.even(4)
+    cut = even.cut([mesh.Jump(0.6, 0, True), mesh.Jump(0.251, 1, False)])
+    np.testing.assert_allclose(cut.parts, [0.0, 0.251, 0.5, 0.6, 0.75, 1.0])
+    assert sorted(cut.jumps) == [1, 3] and sorted(cut.halved().jumps) == [2, 6] and cut.halved().count == 10
+    low, high = cut.limits()
+    assert np.all(low[[0, 2, 4, 5]] == high[[0, 2, 4, 5]]) and np.all(low[[1, 3]] < high[[1, 3]])
+    assert low[3] > cut.parts[2] and high[3] < cut.parts[4]
