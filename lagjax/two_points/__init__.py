@@ -1,4 +1,4 @@
 """Motions between two points: connected, shortest, steered. Imported on first use."""
 
-from lagjax.two_points.steer import steer
+from lagjax.two_points.optimal_control import steer
 from lagjax.two_points.steering import Steering

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from lagjax.display import plots
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import has_jumps
-from lagjax.system import System, coordinates
+from lagjax.system import System, Traced, coordinates
 from lagjax.two_points.layout import Layout
 from lagjax.two_points.nonlinear_program import Solved
 from lagjax.two_points.plan import Plan, Planned, following, plan_of
@@ -39,7 +39,7 @@ class Steering(eqx.Module):
 
     >>> import lagjax as lj
     >>> cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
-    >>> found = lj.steer(cart, {"push": 0.0}, (0.0, 0.0), (1.0, 0.0), lambda t, q, v, u, params: u["push"] ** 2, t_b=1.0)
+    >>> found = lj.steer(cart, {"push": 0.0}, (0.0, 0.0), (1.0, 0.0), lambda t, q, v, u, p: u["push"] ** 2, t_b=1.0)
     >>> print(found.status, found.trajectory.q[100].round(9))
     least cost near the guess found 0.5
 
@@ -147,7 +147,8 @@ def _integrated(
     # Times at which a plan is cut off at its bounds are many, and no more than kinks: only the user's own are sought.
     plant = question.plant
     own = (plant.system.lagrangian, plant.system.force, plant.system.dissipation)
-    jumps = "found" if any(f is not None and has_jumps(f.program.jaxpr) for f in own) else "ignored"
+    own_jumps = any(isinstance(f, Traced) and has_jumps(f.program.jaxpr) for f in own)
+    jumps = "found" if own_jumps else "ignored"
     knots = params.plan.knots[1:-1]
     ends = np.append(knots, np.full(motion.room - len(knots), t_b))
     ts = np.linspace(question.t_a, t_b, motion.outputs)

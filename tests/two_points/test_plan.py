@@ -8,7 +8,7 @@ from lagjax.two_points.plan import plan_of
 
 
 def test_a_plan_is_its_polynomials():
-    """Between knots a cubic through its points, the next one from each knot on; what is beyond the last knot goes on."""
+    """Between knots a cubic through its points, and the next one from each knot on."""
     knots, nodes = np.array([1.0, 1.5, 3.0]), np.array([0.1, 0.3, 0.6, 0.9])
     polynomials = [np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0]), np.polynomial.Polynomial([0.0, 1.0, -1.0, 0.2])]
     times = knots[:-1, None] + np.diff(knots)[:, None] * nodes

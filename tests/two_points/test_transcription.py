@@ -1,4 +1,4 @@
-"""The nonlinear program of a steered motion: its derivatives and their sparsity, and the same motion on other meshes."""
+"""The nonlinear program of a steered motion: its derivatives, their sparsity, and the same motion on other meshes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,7 @@ skate = lj.System(
 
 
 def program(count, interpolation):
+    """The skate's program on so many elements."""
     start = jnp.array([1.0, 0.0, 0.3]), jnp.zeros(3)
 
     def cost(t, q, v, u, p):

@@ -1,22 +1,22 @@
 """Optimal control: closed forms, constraints, a published problem, and questions that have no answer."""
 
-from importlib import import_module
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.two_points import mesh
+from lagjax.two_points import mesh, optimal_control
 
 cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
 
 
 def energy(t, q, v, u, params):
+    """The square of the push."""
     return u["push"] ** 2
 
 
 def pushed(start=(0.0, 0.0), end=(1.0, 0.0), cost=energy, t_b=1.0, **options):
+    """A mass steered from a start to an end."""
     return lj.steer(cart, {"push": 0.0}, start, end, cost, t_b=t_b, **options)
 
 
@@ -69,13 +69,14 @@ def test_least_time(monkeypatch):
     before, after = found.controls(switch - 1e-5)["push"], found.controls(switch + 1e-5)["push"]
     assert abs(before - 1) < 1e-6 and abs(after + 1) < 1e-6
     # Twin: without the cut the turn lies inside an element, whose polynomial is not it.
-    monkeypatch.setattr(import_module("lagjax.two_points.steer"), "jumps_of", lambda *arguments: [])
+    monkeypatch.setattr(optimal_control, "jumps_of", lambda *arguments: [])
     uncut = pushed(**SHORTEST)
     assert np.min(np.abs(uncut.controls.knots - switch)) > 1e-4 and abs(uncut.t_b - found.t_b) > 1e-8
 
 
 def cart_pole(t, q, v, p):
-    (x, angle), (dx, turn) = (q["x"], q["angle"]), (v["x"], v["angle"])
+    """Kelly's cart with a pole that hangs down at an angle of zero."""
+    angle, dx, turn = q["angle"], v["x"], v["angle"]
     kinetic = 0.5 * (p["m1"] + p["m2"]) * dx**2 + p["m2"] * p["l"] * dx * turn * jnp.cos(angle)
     return kinetic + 0.5 * p["m2"] * p["l"] ** 2 * turn**2 + p["m2"] * p["g"] * p["l"] * jnp.cos(angle)
 
@@ -106,9 +107,7 @@ def test_brachistochrone():
     bead = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * q[1], {"wire": wire})
     start, end = (jnp.array([0.0, 10.0]), jnp.zeros(2)), (jnp.array([10.0, 5.0]), None)
     bounds = {"slope": (-jnp.pi / 2, jnp.pi / 2)}
-    found = lj.steer(
-        bead, {"slope": -0.5}, start, end, params={"g": 9.80665}, t_b=(0.5, 5.0), bounds=bounds, tol=1e-8
-    )
+    found = lj.steer(bead, {"slope": -0.5}, start, end, params={"g": 9.80665}, t_b=(0.5, 5.0), bounds=bounds, tol=1e-8)
     assert abs(found.t_b - 1.801603122453) < 1e-10 and found.defect < 1e-6
     # On a cycloid the slope turns evenly, from straight down.
     ts = np.linspace(0.0, found.t_b, 9)
@@ -118,7 +117,7 @@ def test_brachistochrone():
 
 @pytest.mark.slow
 def test_constraints_change_nothing():
-    """A pendulum swung up by a torque: its angle, and x and y on a rod, have one cost; the rod's multipliers are kept."""
+    """A pendulum swung up by a torque: its angle, and x and y on a rod, have one cost."""
     angle = lj.System(lambda t, q, v, p: 0.5 * v**2 + 9.81 * jnp.cos(q), force=lambda t, q, v, p: p["torque"])
     rod = lj.System(
         lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 9.81 * q[1],

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from lagjax.system import System, coordinates
 from lagjax.two_points.layout import Layout
 from lagjax.two_points.mesh import Mesh, jumps_of, moved
-from lagjax.two_points.nonlinear_program import NonlinearProgram, Solved
+from lagjax.two_points.nonlinear_program import NonlinearProgram, Solved, import_casadi
 from lagjax.two_points.question import Question, asked
 from lagjax.two_points.steering import Motion, Steering, compile_ahead, failure_in_words, is_found, steering_of
 
@@ -54,7 +54,7 @@ def steer(
     >>> import lagjax as lj
     >>> cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
     >>> found = steer(cart, {"push": 0.0}, (0.0, 0.0), (1.0, 0.0), lambda t, q, v, u, params: u["push"] ** 2, t_b=1.0)
-    >>> print(found.cost.round(9), found.controls(0.25)["push"].round(9))  # 12, and 6 - 12 t
+    >>> print(round(found.cost, 9), found.controls(0.25)["push"].round(9))  # 12, and 6 - 12 t
     12.0 3.0
 
     A control is an entry of `params`, which L, the force, the dissipation and the constraints read by its name, as in
@@ -106,8 +106,21 @@ def steer(
     times, options = (t_a, t_b), (degree, interpolation)
     question = asked(system, controls, start, end, cost, params, times, end_cost, bounds, with_control, options)
     motion = Motion(outputs, rtol, max(most, elements) + CUTS, throw)
+    import_casadi()
     ahead = compile_ahead(question, motion)
-    mesh = Mesh.even(elements)
+    try:
+        layout, solved, change, iterations = _searched(question, Mesh.even(elements), guess, most, tol)
+    finally:
+        ahead.join()
+    if throw and not is_found(solved):
+        raise RuntimeError(failure_in_words(question, layout, solved, _limits_of_rows(question, layout)))
+    return steering_of(question, layout, solved, motion, change, iterations)
+
+
+def _searched(
+    question: Question, mesh: Mesh, guess: Callable | None, most: int, tol: float
+) -> tuple[Layout, Solved, float, int]:
+    """The solution on the last mesh, by how much the cost changed from the mesh before, and all iterations."""
     layout = Layout(question.plant, mesh.count)
     solved = _solve(question, layout, mesh, _first(question, layout, mesh, guess), {})
     iterations, change = solved.iterations, np.inf
@@ -125,10 +138,7 @@ def steer(
         iterations, change = iterations + solved.iterations, abs(solved.cost - coarse.cost)
         if not jumps and change <= tol * abs(solved.cost):
             break
-    if throw and not is_found(solved):
-        raise RuntimeError(failure_in_words(question, layout, solved, _limits_of_rows(question, layout)))
-    ahead.join()
-    return steering_of(question, layout, solved, motion, change, iterations)
+    return layout, solved, change, iterations
 
 
 def _first(question: Question, layout: Layout, mesh: Mesh, guess: Callable | None) -> np.ndarray:
