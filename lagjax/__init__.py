@@ -132,7 +132,7 @@ if TYPE_CHECKING:
     from lagjax.sliders import Knobs, interact
 
     # Two points.
-    from lagjax.two_points import Steering, steer
+    from lagjax.two_points import LQR, Steering, lqr, steer
 
 
 __version__ = "0.2.0"
@@ -151,7 +151,7 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
-    "lagjax.two_points": "Steering steer",
+    "lagjax.two_points": "LQR Steering lqr steer",
 }
 
 
@@ -274,6 +274,8 @@ __all__ = [
     "learned",
     "steer",
     "Steering",
+    "lqr",
+    "LQR",
     "WorkPrecision",
     "work_precision",
     "export",

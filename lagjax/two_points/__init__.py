@@ -1,4 +1,5 @@
 """Motions between two points: connected, shortest, steered. Imported on first use."""
 
 from lagjax.two_points.optimal_control import steer
+from lagjax.two_points.regulator import LQR, lqr
 from lagjax.two_points.steering import Steering

@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -14,6 +15,8 @@ from lagjax.steps import check_names, check_read
 from lagjax.system import (
     OF_STATE,
     Call,
+    Form,
+    State,
     System,
     check_system,
     coordinates,
@@ -62,6 +65,16 @@ class Question(NamedTuple):
         return float(self.plant.t_a)
 
 
+class Controlled(eqx.Module):
+    """A traced system, a state without controls, the controls, and how both make the parameters: `merge(params, u)`."""
+
+    system: System
+    state: State
+    controls: PyTree
+    merge: Callable = eqx.field(static=True)
+    form: Form = eqx.field(static=True)
+
+
 def asked(
     system: System, controls: Any, start: Any, end: Any, cost: Callable | None, params: PyTree, times: tuple,
     end_cost: Callable | None, bounds: Mapping | None, with_control: Callable | None, options: tuple[int, str],
@@ -92,15 +105,8 @@ def asked(
             f"lj.steer needs float64, and this is {s.t.dtype}: its solver asks for ten digits.\n"
             'Fix: jax.config.update("jax_enable_x64", True) before the first array, and starts in Python floats.'
         )
-    check_names(s.params, controls) if with_control is None else None
-    merge = with_control or by_name
-    guess = jtu.tree_map(lambda x: np.asarray(x, float), controls)
-    merged = s._replace(params=coordinates.given_params(merge(s.params, guess), s.t.dtype))
-    found = traced_system(system, merged)
-    check_read(found, s, jtu.tree_map(lambda x: jnp.asarray(x)[None], guess), merge)
-    form = model_of(found, *merged).form
+    given = controlled(system, controls, s, with_control)
     t_free = t_b[1] > t_b[0]
-    given = {"t": s.t, "q": s.q, "v": s.v, "u": guess, "params": s.params}
     if cost is None and end_cost is None and not t_free:
         raise ValueError(
             "there is nothing to minimise: neither cost nor end_cost is given, and t_b is one number.\n"
@@ -108,22 +114,43 @@ def asked(
         )
     if cost is None and end_cost is None:
         end_cost = _time
-    of_path = None if cost is None else traced_call(Call("cost", cost, OF_COST), given, _check_number)
-    of_end = None if end_cost is None else traced_call(Call("end_cost", end_cost, OF_STATE), given, _check_number)
+    of_path = None if cost is None else checked_cost(cost, given)
+    of_end, state = None, s._asdict()
+    if end_cost is not None:
+        of_end = traced_call(Call("end_cost", end_cost, OF_STATE), state, _check_number)
     condition = None
     if end_function is not None:
-        condition = traced_call(Call("end", end_function, OF_STATE), given, _check_conditions)
-    names_of_q, names_of_u = coordinates.names(s.q), coordinates.names(guess)
+        condition = traced_call(Call("end", end_function, OF_STATE), state, _check_conditions)
+    names_of_q, names_of_u = coordinates.names(s.q), coordinates.names(given.controls)
     names = {"q": names_of_q, "v": [velocity_name(name) for name in names_of_q], "controls": names_of_u}
     limits = _limits(names, bounds or {})
     plant = Plant(
-        found, s.params, s.t, of_path, of_end, condition, guess, merge, form, options[1], options[0],
+        given.system, s.params, s.t, of_path, of_end, condition, given.controls, given.merge, given.form,
+        options[1], options[0],
         tuple(int(i) for i in np.flatnonzero(np.any(np.isfinite(limits["v"]), axis=0))),
         sum(int(np.prod(np.shape(x))) for x in jtu.tree_leaves(condition.program.value)) if condition else 0,
     )  # fmt: skip
-    question = Question(plant, system, s.params, (first, last), t_b, coordinates.vector(guess), limits, names)
+    question = Question(plant, system, s.params, (first, last), t_b, coordinates.vector(given.controls), limits, names)
     _check_ends(question)
     return question
+
+
+def controlled(system: System, controls: PyTree, s: State, with_control: Callable | None) -> Controlled:
+    """The system checked and traced with its controls among the parameters."""
+    if with_control is None:
+        check_names(s.params, controls)
+    merge = with_control or by_name
+    controls = jtu.tree_map(lambda x: np.asarray(x, s.t.dtype), controls)
+    merged = s._replace(params=coordinates.given_params(merge(s.params, controls), s.t.dtype))
+    found = traced_system(system, merged)
+    check_read(found, s, jtu.tree_map(lambda x: jnp.asarray(x)[None], controls), merge)
+    return Controlled(found, s, controls, merge, model_of(found, *merged).form)
+
+
+def checked_cost(cost: Callable, given: Controlled) -> Callable:
+    """The cost per unit of time, traced."""
+    arguments = given.state._asdict() | {"u": given.controls}
+    return traced_call(Call("cost", cost, OF_COST), arguments, _check_number)
 
 
 def by_name(params: PyTree, u: PyTree):

@@ -1,0 +1,97 @@
+"""The linear-quadratic regulator: closed forms, an upright pole, and the same pole on a constraint."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+mass = lj.System(
+    lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2,
+    force=lambda t, q, v, p: p["push"] + 0.0 * v,
+)
+
+
+def squares(t, q, v, u, p):
+    """A cost with a product of position and push."""
+    return 3.0 * q**2 + 0.5 * v**2 + 2.0 * u["push"] ** 2 + 0.8 * q * u["push"]
+
+
+def test_a_mass():
+    """Riccati's equation of a mass on a spring, with a cost of position times push, is solved."""
+    m, k = 2.0, -5.0
+    found = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": k})
+    a, b = np.array([[0.0, 1.0], [-k / m, 0.0]]), np.array([[0.0], [1 / m]])
+    cross, s = np.array([[0.4], [0.0]]), np.asarray(found.cost_to_go)
+    residual = a.T @ s + s @ a - (s @ b + cross) @ (b.T @ s + cross.T) / 2.0 + np.diag([3.0, 0.5])
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12 * np.max(np.abs(a.T @ s)))
+    np.testing.assert_allclose(found.gain, (b.T @ s + cross.T) / 2.0, rtol=1e-12)
+    assert np.max(found.eigenvalues.real) < 0 and np.all(np.linalg.eigvalsh(s) > 0)
+    # Twin: the sign of the spring changes the gain.
+    other = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": -k})
+    assert np.max(np.abs(other.gain - found.gain)) > 1.0
+    assert abs(found.control(1.0, 2.0)["push"] + found.gain[0, 0] + 2 * found.gain[0, 1]) < 1e-12
+
+
+def test_questions_that_are_wrong():
+    """No equilibrium, a cost that is not least there, a control for nothing, a motion that is not reached."""
+    spring, rest = {"m": 1.0, "k": 1.0}, (0.0, 0.0)
+    with pytest.raises(ValueError, match="not an equilibrium: 'q' accelerates by -1"):
+        lj.lqr(mass, {"push": 0.0}, (1.0, 0.0), lambda t, q, v, u, p: (q - 1) ** 2 + u["push"] ** 2, spring)
+    held = lj.lqr(mass, {"push": 1.0}, (1.0, 0.0), lambda t, q, v, u, p: (q - 1) ** 2 + (u["push"] - 1) ** 2, spring)
+    assert abs(held.control(1.0, 0.0)["push"] - 1.0) < 1e-12
+    with pytest.raises(ValueError, match="the cost is not least"):
+        lj.lqr(mass, {"push": 1.0}, (1.0, 0.0), lambda t, q, v, u, p: (q - 1) ** 2 + u["push"] ** 2, spring)
+    with pytest.raises(ValueError, match="'push' costs nothing"):
+        lj.lqr(mass, {"push": 0.0}, rest, lambda t, q, v, u, p: q**2, spring)
+    two = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), force=lambda t, q, v, p: jnp.array([1.0, 0.0]) * p["push"])
+    with pytest.raises(ValueError, match=r"do not reach the motion of '(q|v)\[1\]'"):
+        lj.lqr(two, {"push": 0.0}, (jnp.zeros(2), jnp.zeros(2)), lambda t, q, v, u, p: jnp.sum(q**2) + u["push"] ** 2)
+
+
+@pytest.mark.slow
+def test_an_upright_pole():
+    """A pole on a cart, by its angle and by its tip on a rod: one cost to go, one push; under it the motion comes back.
+
+    From nearby, the integrated cost of the motion under the feedback is the cost to go; without it the pole falls.
+    """
+    cart, g, length = {"M": 1.0, "m": 0.3}, 9.81, 0.5
+
+    def by_angle(t, q, v, p):
+        tip = v["x"] + length * v["angle"] * jnp.cos(q["angle"]), length * v["angle"] * jnp.sin(q["angle"])
+        kinetic = 0.5 * p["M"] * v["x"] ** 2 + 0.5 * p["m"] * (tip[0] ** 2 + tip[1] ** 2)
+        return kinetic - p["m"] * g * length * jnp.cos(q["angle"])
+
+    def by_tip(t, q, v, p):
+        kinetic = 0.5 * p["M"] * v["x"] ** 2 + 0.5 * p["m"] * jnp.sum(v["tip"] ** 2)
+        return kinetic - p["m"] * g * q["tip"][1]
+
+    rod = lj.Holonomic(lambda t, q, p: (q["tip"][0] - q["x"]) ** 2 + q["tip"][1] ** 2 - length**2)
+    angle = lj.System(by_angle, force=lambda t, q, v, p: {"x": p["push"], "angle": 0.0})
+    tip = lj.System(by_tip, {"rod": rod}, force=lambda t, q, v, p: {"x": p["push"], "tip": jnp.zeros(2)})
+    zero, up = {"x": 0.0, "angle": 0.0}, {"x": 0.0, "tip": jnp.array([0.0, length])}
+    rest = {"x": 0.0, "tip": jnp.zeros(2)}
+
+    def of_angle(t, q, v, u, p):
+        return q["x"] ** 2 + 10 * jnp.sin(q["angle"]) ** 2 + u["push"] ** 2
+
+    def of_tip(t, q, v, u, p):
+        return q["x"] ** 2 + 10 * ((q["tip"][0] - q["x"]) / length) ** 2 + u["push"] ** 2
+
+    one = lj.lqr(angle, {"push": 0.0}, (zero, zero), of_angle, cart)
+    other = lj.lqr(tip, {"push": 0.0}, (up, rest), of_tip, cart)
+    np.testing.assert_allclose(np.sort_complex(one.eigenvalues), np.sort_complex(other.eigenvalues), rtol=1e-8)
+    # A lean of one thousandth, and the same of the tip.
+    lean = {"x": 0.0, "angle": 1e-3}
+    same = {"x": 0.0, "tip": jnp.array([length * 1e-3, length])}
+    assert abs(one.control(lean, zero)["push"] - other.control(same, rest)["push"]) < 1e-9
+
+    held = lj.System(by_angle, force=lambda t, q, v, p: {"x": one.control(q, v)["push"], "angle": 0.0})
+    ts = np.linspace(0.0, 20.0, 4001)
+    motion = lj.integrate(held, lean, zero, cart, ts=ts)
+    x = np.stack([motion.q["angle"], motion.q["x"], motion.v["angle"], motion.v["x"]])
+    push = -np.asarray(one.gain)[0] @ x
+    spent = np.trapezoid(x[1] ** 2 + 10 * np.sin(x[0]) ** 2 + push**2, ts)
+    assert abs(spent / (one.cost_to_go[0, 0] * 1e-6) - 1) < 1e-3 and abs(motion.q["angle"][-1]) < 1e-6
+    fallen = lj.integrate(angle, lean, zero, {**cart, "push": 0.0}, ts=[0.0, 3.0])
+    assert abs(fallen.q["angle"][-1]) > 1.0
