@@ -39,6 +39,8 @@ class FitFunction:
       `"starts"` (W, k): how far the start of each window is from its guess, as `found.sampling["starts"]` has it.
     - `params(unknowns)`: `params` with these numbers inserted, within their bounds.
     - `windows`: the number of windows, W.
+    - `with_failed(unknowns, batch)`: the same value, and the share of these windows whose motion fails, a number from 0
+      to 1: for `jax.value_and_grad(loss.with_failed, has_aux=True)`.
     """
 
     problem: FitProblem
@@ -60,11 +62,16 @@ class FitFunction:
         return found.into(found.natural(found.vector(unknowns["params"])))
 
     def __call__(self, unknowns: Mapping[str, PyTree], batch: Int[Array, " B"] | Sequence[int] | None = None) -> Array:
+        return self.with_failed(unknowns, batch)[0]
+
+    def with_failed(
+        self, unknowns: Mapping[str, PyTree], batch: Int[Array, " B"] | Sequence[int] | None = None
+    ) -> tuple[Array, Array]:
         if self.joined and batch is not None:
             raise ValueError("joined windows continue each other and make no batches.\nFix: joined=False.")
         batch = jnp.arange(self.windows) if batch is None else jnp.asarray(batch)
-        rows = _residuals(self.problem, self.stage, dict(unknowns), batch, self.joined)
-        return 0.5 * jnp.sum(rows**2) if self.summed else rows
+        rows, failed = _residuals(self.problem, self.stage, dict(unknowns), batch, self.joined)
+        return (0.5 * jnp.sum(rows**2) if self.summed else rows), failed
 
     def __repr__(self):
         what = "loss" if self.summed else "residuals"
@@ -140,7 +147,8 @@ def fit_loss(system: System | Hybrid, records: Record | Sequence[Record], params
     **Arguments:** as for `lj.fit_residuals`.
 
     **Returns:** a function of unknowns like that of `lj.fit_residuals`, to a number. `loss(unknowns, batch)` takes W/B
-    times the windows with the indices `batch` (B,), which estimates the loss of all. Networks are trained with it, by
+    times the windows with the indices `batch` (B,), which estimates the loss of all; `loss.with_failed` also gives the
+    share of motions that fail. Networks are trained with it, by
     an optimiser of optax: [a recipe](/learned.md#training).
 
     **Raises:** as `lj.fit_residuals`.
@@ -152,17 +160,18 @@ def fit_loss(system: System | Hybrid, records: Record | Sequence[Record], params
 @jitted
 def _residuals(
     problem: FitProblem, stage: Stage, unknowns: Mapping[str, PyTree], batch: Int[Array, " B"], joined: bool
-) -> Float[Array, " r"]:
-    """All residuals in one vector; those of a batch of windows are scaled to the size of all."""
+) -> tuple[Float[Array, " r"], Float[Array, ""]]:
+    """All residuals in one vector, those of a batch scaled to the size of all; the share of windows that fail."""
     u = Unknowns(problem.found.natural(problem.found.vector(unknowns["params"])), unknowns["starts"])
 
     def part(w: Int[Array, ""], s: Array):
         found, well = window_part(problem, u.shared, s, w, stage)
-        return jax.tree.map(lambda x: jnp.where(well, x, lax.stop_gradient(x)), found)
+        return jax.tree.map(lambda x: jnp.where(well, x, lax.stop_gradient(x)), found), well
 
     # All lanes share the parameters, so that products with the weights of a network are products of matrices.
-    parts = jax.vmap(part)(batch, u.local[batch])
+    parts, well = jax.vmap(part)(batch, u.local[batch])
     mean, weight = prior_and_hold(problem, stage)
     seams = [jnp.ravel(assemble(problem, u, parts, stage).seams)] if joined else []
     scale = np.sqrt(problem.windows.count / batch.size)
-    return jnp.concatenate([jnp.ravel(scale * parts.rows), *seams, weight * (u.shared - mean)])
+    rows = jnp.concatenate([jnp.ravel(scale * parts.rows), *seams, weight * (u.shared - mean)])
+    return rows, 1 - jnp.mean(well, dtype=rows.dtype)

@@ -243,3 +243,30 @@ def test_bounds_forgiveness_and_other_solvers():
     of_vector = jax.jit(lambda y: residuals({"params": {"k": y[0]}, "starts": residuals.guess["starts"]}))
     by_scipy = least_squares(of_vector, [np.log(3.5)], jax.jit(jax.jacfwd(of_vector)))
     np.testing.assert_allclose(np.exp(by_scipy.x), quietly(spring, dirty, {"k": 3.5}, bounds=bounds).values, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::lagjax.FitWarning")
+def test_the_share_of_motions_that_fail():
+    """Beyond a wall at 1/p nothing is defined: the loss rises with the share of motions there, which stands beside it;
+    twin: the mean square of what is reached falls. A fit says the share, too."""
+    walled = lj.System(lambda t, q, v, params: 0.5 * v**2 + 0.1 * jnp.log(1 - params["p"] * q))
+    t, amplitudes = np.linspace(0.0, 1.0, 11), np.arange(1.0, 5.0)
+
+    def records(**held):
+        return [lj.Record(t, q=a * np.cos(t), q0=a, v0=0.0, hold_q=True, sigma=0.1, **held) for a in amplitudes]
+
+    loss = lj.fit_loss(walled, records(hold_v=True), {"p": 0.1})
+
+    @jax.jit
+    def judged(p):
+        of_p, found = loss.guess | {"params": {"p": p}}, jax.value_and_grad(loss.with_failed, has_aux=True)
+        (value, failed), slope = found(of_p)
+        q = jax.vmap(lambda a: lj.integrate(walled, a, 0.0, {"p": p}, ts=t, throw=False).q)(amplitudes)
+        return value, failed, slope["params"]["p"], jnp.nanmean((q - np.outer(amplitudes, np.cos(t))) ** 2)
+
+    value, failed, slope, masked = map(np.array, zip(*map(judged, (0.2, 0.3, 0.4, 0.6))))
+    np.testing.assert_array_equal(failed, [0.0, 0.25, 0.5, 0.75])
+    assert np.all(np.diff(value) > 0) and np.all(np.diff(masked) < 0) and np.all(np.isfinite(slope))
+    with pytest.warns(lj.FitWarning, match=r"2 of 4 motions \(50 %\), the first of them of record 2, stop early"):
+        lj.fit(walled, records(), {"p": 0.4}, free=[])

@@ -63,9 +63,7 @@ def problem_of(
     absolute = _absolute(records, loss, priors)
     dtype = jnp.result_type(float)
     options = {name: np.asarray(x, dtype) if isinstance(x, float) else x for name, x in options.items()}
-    found = find(
-        params, free, bounds or {}, priors or {}, dtype, (1.0 if absolute else ASSUMED_ERROR) if weak else None
-    )
+    found = find(params, free, bounds or {}, priors or {}, dtype, (1.0 if absolute else ASSUMED_ERROR) if weak else 0.0)
     windows = cut(records, window, dtype)
     overrides = _overrides(records, windows, found)
     params_of_records = [

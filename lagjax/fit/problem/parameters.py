@@ -129,11 +129,11 @@ def find(
     bounds: Mapping[str, tuple[float | None, float | None]],
     priors: Mapping[str, tuple[float, float] | None],
     dtype: Any,
-    error: float | None = None,
+    error: float = 0.0,
 ) -> FreeNumbers:
     """Determine the numbers to be fitted from `params`, names, bounds and priors.
 
-    `error`: that of a measurement as residuals have it, against which weak priors are set; None: there are none.
+    `error`: that of a measurement as residuals have it, against which weak priors are set; 0: there are none.
     """
     if not is_traced(params):
         with jax.ensure_compile_time_eval():

@@ -61,9 +61,13 @@ def _motion_caveat(fit: Fit, at: Evaluation):
     failed = np.flatnonzero(~np.asarray(at.well))
     if not failed.size:
         return ""
-    record = int(fit.problem.windows.record[failed[0]])
+    record, windows = int(fit.problem.windows.record[failed[0]]), fit.problem.windows.count
+    which = f"the motion of record {record} stops"
+    if failed.size > 1:
+        share = f"{failed.size} of {windows} motions ({100 * failed.size / windows:.0f} %)"
+        which = f"{share}, the first of them of record {record}, stop"
     return (
-        f"at the estimates the motion of record {record} stops early; samples after that count as large residuals.\n"
+        f"at the estimates {which} early; samples after that count as large residuals.\n"
         f"Fix: found.motion({record}).result says why; give a better guess, or bounds=."
     )
 
