@@ -132,7 +132,18 @@ if TYPE_CHECKING:
     from lagjax.sliders import Knobs, interact
 
     # Two points.
-    from lagjax.two_points import LQR, Steering, lqr, steer
+    from lagjax.two_points import (
+        LQR,
+        Connection,
+        ConnectWarning,
+        Geodesic,
+        Steering,
+        connect,
+        exponential_map,
+        geodesic,
+        lqr,
+        steer,
+    )
 
 
 __version__ = "0.2.0"
@@ -151,7 +162,7 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
-    "lagjax.two_points": "LQR Steering lqr steer",
+    "lagjax.two_points": ("Connection ConnectWarning Geodesic LQR Steering connect exponential_map geodesic lqr steer"),
 }
 
 
@@ -254,6 +265,12 @@ __all__ = [
     "Floquet",
     "lyapunov_exponents",
     "LyapunovExponents",
+    "connect",
+    "Connection",
+    "ConnectWarning",
+    "geodesic",
+    "Geodesic",
+    "exponential_map",
     "sweep",
     "Sweep",
     "Status",

@@ -40,6 +40,7 @@ from lagjax.mechanics import accelerations
 from lagjax.report import Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.system import Holonomic, System
+from lagjax.two_points import geodesic
 
 PARAMS = {"R": 2.5}
 # The end points of the generic arc: ψ₁, θ₁, ψ₂, θ₂.
@@ -303,9 +304,19 @@ def cases():
         error = relative_error(q, cartesian(PARAMS, *ends[2:]))
         rows.append(Case(name, f"arrives after s = {float(arc):.6g}", error, 1e-9))
     rows += _over_azimuth_cases()
+    rows += [_from_two_points(name) for name in ("generic", "along a meridian", "over the pole")]
     for name, ends in (("coincident points", (1.0, 0.5, 1.0, 0.5)), ("antipodal points", (0.0, 0.0, np.pi, 1.0))):
         rows.append(_undetermined(name, ends))
     return [*rows, _at_the_pole(), _thousand_turns()]
+
+
+def _from_two_points(name: str):
+    """The shortest path between two points, as the source asks for it: its length and its first direction."""
+    ends = ARCS[name]
+    q, v = start_towards(PARAMS, *ends)
+    found = geodesic(embedded, np.asarray(q), np.asarray(cartesian(PARAMS, *ends[2:])), PARAMS, outputs=2)
+    error = relative_error((found.length, found.start_direction), (distance(PARAMS, *ends), v))
+    return Case(f"{name}, from two points", f"length {float(found.length):.6g}, {found.kind}", error, 1e-12)
 
 
 def _over_azimuth_cases():

@@ -59,8 +59,10 @@ def error(s, count, constrained, node_weights=None):
     for _ in range(5):
         y = y - np.linalg.solve(matrix(y), inner(y))
     assert np.max(np.abs(inner(y))) < 1e-13
-    found = np.asarray(y).reshape(len(t) - 2, n + m)[s - 1 :: s, :n]
-    return np.max(np.abs(found - exact[s:-1:s]))
+    x, multipliers = np.split(np.asarray(y).reshape(len(t) - 2, n + m)[s - 1 :: s], [n], axis=1)
+    # By energy, the rod pulls with three times the weight's component along it.
+    tension = -3 * np.cos(theta[s:-1:s])[:, None]
+    return np.max(np.abs(x - exact[s:-1:s])), np.max(np.abs(multipliers - tension), initial=0.0)
 
 
 @pytest.mark.slow

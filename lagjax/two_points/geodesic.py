@@ -1,0 +1,237 @@
+"""Geodesics: stationary paths of a length, found as motions without forces, L = ½ g(v, v).
+
+With constant speed the energy ∫ ½ g(v, v) dt over a time of one is half the square of the length l, and its stationary
+paths are the geodesics, independent of coordinates:
+
+    l = √g(v_a, v_a),    δE = l δl
+
+The index is that of the length: one for each conjugate point between the ends.
+
+Source: Milnor, *Morse Theory*, §12-15; do Carmo, *Riemannian Geometry*, ch. 3, 5, 9.
+"""
+
+from collections.abc import Callable, Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+
+from lagjax.integrate import Trajectory, integrate
+from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.mechanics import listed
+from lagjax.system import System, coordinates, model_of, prepare
+from lagjax.two_points.connect import ELEMENTS, connect
+from lagjax.two_points.result import Connection
+
+TURN = 2 * np.pi
+
+
+class Geodesic(eqx.Module):
+    """A stationary path between two points; the shortest found, with the others by rising length.
+
+    - `length`; `start_direction`, `end_direction`: velocities of unit length, NaN where the points coincide.
+    - `connection`: the motion along it in a time of one. `index`, `kind`: of the length, as of a `Connection`.
+    - `conjugate_lengths`: the distances along it of the points conjugate to the start.
+    """
+
+    length: Float[Array, ""]
+    start_direction: PyTree[Float[Array, "..."]]
+    end_direction: PyTree[Float[Array, "..."]]
+    connection: Connection
+    others: "tuple[Geodesic, ...]" = ()
+
+    @property
+    def index(self) -> Int[Array, ""]:
+        return self.connection.index
+
+    @property
+    def kind(self) -> str:
+        return self.connection.kind
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        return self.connection.trajectory
+
+    @property
+    def conjugate_lengths(self) -> np.ndarray:
+        return self.connection.conjugate_times * np.asarray(self.length)
+
+    def __repr__(self):
+        if np.ndim(self.length):
+            return f"Geodesic({np.size(self.length)} lanes)"
+        more = f"; {len(self.others)} longer" if self.others else ""
+        return f"Geodesic(length {float(self.length):.12g}, {self.kind}{more})"
+
+
+class LineElement(eqx.Module):
+    """½ ds² as a Lagrangian."""
+
+    metric: Callable
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
+        return 0.5 * self.metric(q, v, params)
+
+
+def geodesic(
+    metric: Callable | System,
+    a: PyTree[ArrayLike],
+    b: PyTree[ArrayLike],
+    params: PyTree = None,
+    *,
+    starts=1,
+    angles: str | Iterable[str] = (),
+    elements: int = ELEMENTS,
+    outputs: int = 33,
+    rtol: ArrayLike | None = None,
+) -> Geodesic:
+    """Find the shortest path between two points, and other stationary ones.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> def sphere(q, v, params):
+    ...     return v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2
+    >>> quarter = geodesic(sphere, {"psi": jnp.pi / 2, "theta": 0.0}, {"psi": jnp.pi / 2, "theta": jnp.pi / 2})
+    >>> print(f"{quarter.length:.9f}", quarter.kind)
+    1.570796327 minimum
+
+    **Arguments:**
+
+    - `metric`: the square of the line element, `metric(q, v, params)` -> g(v, v), quadratic in v; or a `System` whose
+      Lagrangian is ½ g(v, v), with holonomic constraints for a surface in space, such as |r| = R.
+    - `a`, `b`: the points, alike.
+    - `angles`: the names of coordinates that come back after a turn of 2π: the nearer way round is taken, and for each
+      the other way as well.
+    - `starts`, `elements`, `outputs`, `rtol`: as for `connect`.
+
+    **Returns:** a `Geodesic`; longer ones in `others`. Differentiable in both modes; under `jit` and `vmap` the one
+    from the straight line.
+
+    **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v.
+
+    Source: do Carmo, *Riemannian Geometry*, §9.2.
+    """
+    system = metric if isinstance(metric, System) else System(LineElement(metric))
+    model, s = prepare(system, 0.0, a, a, params)
+    one = prepare(system, 0.0, b, b, params)[1] if jax.tree.structure(a) == jax.tree.structure(b) else s
+    eager = is_eager() and not is_traced((s, one, eqx.filter(system, eqx.is_array)))
+    if eager:
+        _check_quadratic(model, s)
+    if eager and all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(s.q), jax.tree.leaves(one.q))):
+        return _point(system, s, outputs)
+    options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol)
+    ends = _round_the_other_way(model, s.q, b, angles) if eager and angles else [b]
+    found: list[Geodesic] = []
+    for i, end in enumerate(ends):
+        quiet = i > 0 or len(ends) > 1
+        for answer in _answers(system, s, end, options, quiet):
+            if not any(_same(answer, other) for other in found):
+                found.append(answer)
+    if not found:
+        return _of(system, s, connect(system, s.q, b, 0.0, 1.0, s.params, **options))
+    if eager:
+        found.sort(key=lambda answer: float(answer.length))
+    return eqx.tree_at(lambda g: g.others, found[0], tuple(found[1:]), is_leaf=lambda x: isinstance(x, tuple))
+
+
+def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[ArrayLike], params: PyTree = None):
+    """Return where the geodesic from a with the velocity v is after a time of one, and its velocity there.
+
+    >>> import lagjax as lj
+    >>> q, v = exponential_map(lambda q, v, params: v**2 / q**2, 1.0, 1.0)
+    >>> print(f"{q:.9f}")
+    2.718281828
+
+    **Arguments:** as for `geodesic`; `v` like `a`, its length is that of the path.
+
+    **Returns:** (q, v), like `a`; differentiable in both modes.
+
+    **Raises:** as `integrate`.
+
+    Source: do Carmo, *Riemannian Geometry*, §3.2.
+    """
+    system = metric if isinstance(metric, System) else System(LineElement(metric))
+    trajectory = integrate(system, a, v, params, ts=np.array([0.0, 1.0]), rtol=1e-12)
+    return jax.tree.map(lambda x: x[-1], (trajectory.q, trajectory.v))
+
+
+def _answers(system, s, end, options, quiet) -> list[Geodesic]:
+    found = connect(system, s.q, end, 0.0, 1.0, s.params, **options, quiet=quiet)
+    if quiet and not bool(found.converged):
+        return []
+    return [_of(system, s, answer) for answer in (found, *found.others)]
+
+
+def _of(system, s, connection: Connection) -> Geodesic:
+    length, starting, ending = _lengths(
+        system, s, connection.start_velocity, jax.tree.map(lambda x: x[-1], (connection.q, connection.v)),
+        connection.action, connection.trajectory is not None,
+    )  # fmt: skip
+    return Geodesic(length, starting, ending, eqx.tree_at(lambda c: c.others, connection, ()))
+
+
+@compiled
+def _lengths(system: System, s, v: PyTree, last: tuple, action: Array, moves: bool):
+    """The length, and both directions."""
+    model = model_of(system, *s)
+    x, u = model.vectors(s.q, v)
+    # Where there is no motion, L may be singular at the start.
+    length = jnp.sqrt(2 * model.lagrangian(s.t, x, u)) if moves else jnp.sqrt(2 * action)
+    return length, model.tree(u / length), jax.tree.map(lambda v: v / length, last[1])
+
+
+def _point(system, s, outputs) -> Geodesic:
+    """The path of no length."""
+    still = jax.tree.map(np.zeros_like, s.q)
+    none = jax.tree.map(lambda x: np.full_like(x, np.nan), still)
+    trajectory = integrate(system, s.q, still, s.params, ts=np.linspace(0.0, 1.0, outputs), estimate_error=False)
+    zero = np.zeros((), s.t.dtype)
+    fields = (trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, still, still, zero + 1)
+    measures = (zero, np.zeros((), int), zero + 1, zero, zero, np.asarray(True), np.zeros(0))
+    return Geodesic(zero, none, none, Connection(*fields, *measures, tried="the points coincide"))
+
+
+def _round_the_other_way(model, a: PyTree, b: PyTree, angles) -> list[PyTree]:
+    """The ends that are the same point: the nearest way round, and for each angle the other way."""
+    names = [angles] if isinstance(angles, str) else list(angles)
+    unknown = [name for name in names if name not in model.names]
+    if unknown:
+        raise ValueError(
+            f"angles names '{unknown[0]}', and the coordinates are {listed(model.names)}.\n"
+            f'Fix: angles="{model.names[0]}".'
+        )
+    x, y = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(q)]).astype(float) for q in (a, b))
+    around = np.array([name in names for name in model.names])
+    nearest = np.where(around, y - TURN * np.round((y - x) / TURN), y)
+    ends = [nearest]
+    for i in np.flatnonzero(around):
+        other = nearest.copy()
+        other[i] -= TURN * (1.0 if nearest[i] >= x[i] else -1.0)
+        ends.append(other)
+    return [coordinates.like(b, end.astype(model.form.dtype)) for end in ends]
+
+
+def _check_quadratic(model, s):
+    single, double = (float(x) for x in _at_speeds(model, s))
+    if not np.isclose(double, 4 * single, rtol=1e-4, atol=0.0) and np.isfinite(single):
+        raise ValueError(
+            f"the Lagrangian is not quadratic in the velocities: it is {single:.6g} for one velocity, and "
+            f"{double:.6g} for its double.\n"
+            "Usual cause: a potential energy, or the length √g(v, v) in place of its square.\n"
+            "Fix: return g(v, v); for motions in a potential lj.connect."
+        )
+
+
+@compiled
+def _at_speeds(model, s):
+    x = model.vectors(s.q, s.q)[0]
+    u = jnp.asarray(np.random.default_rng(0).normal(size=model.n), x.dtype)
+    at = x + 1e-3 * jnp.maximum(jnp.abs(x), 1.0)
+    return jax.vmap(lambda u: model.lagrangian(s.t, at, u))(jnp.stack([u, 2 * u]))
+
+
+def _same(a: Geodesic, b: Geodesic) -> bool:
+    """Whether two answers are the same: by length and direction."""
+    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(g.connection.start_velocity)]) for g in (a, b)]
+    return bool(np.max(np.abs(flat[0] - flat[1])) <= 1e-6 * np.max(np.abs(flat)))

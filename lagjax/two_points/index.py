@@ -1,0 +1,101 @@
+"""The second variation along a path: its index, and the conjugate points.
+
+The matrix of Newton's method is the second variation of the discrete action, bordered by the constraints. Eliminated
+from the start, its pivots Δ have together as many negative eigenvalues as the matrix (Haynsworth), one for each
+constraint equation, and one for each direction in which the action has a maximum. With the end fixed at a node, this is
+the Morse index of the path up to there: the number of conjugate points before, with their multiplicities.
+
+Between two nodes where the index grows, the path is cut at a time inside the element, and the time bisected.
+
+Source: Milnor, *Morse Theory*, §15; Haynsworth, *Linear Algebra Appl.* 1 (1968) 73.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from lagjax.jaxtools import compiled
+from lagjax.numerics import lapack
+from lagjax.system import Model
+from lagjax.two_points.elements import rule_of_degree
+from lagjax.two_points.path import Ends, Found, Path, momentum_matrix
+from lagjax.two_points.path_mesh import states
+
+BISECTIONS = 52
+
+
+def index_at_nodes(model: Model, found: Found) -> Int[Array, " K"]:
+    """The index of the path up to the end of each element, that end fixed."""
+    count, s, size = found.path.y.shape
+    m, inner = size - model.n, (s - 1) * size
+    whole = jax.vmap(_negative)(found.deltas) - s * m
+    # The last node is an end: its rows and columns are left out.
+    cut = jax.vmap(_negative)(found.deltas[:, :inner, :inner]) - (s - 1) * m if inner else 0 * whole
+    before = jnp.concatenate([jnp.zeros(1, whole.dtype), jnp.cumsum(whole)[:-1]])
+    return before + cut
+
+
+def index_of_free_end(model: Model, found: Found) -> Int[Array, ""]:
+    """The index of a path whose end is free altogether."""
+    s, m = found.path.y.shape[1], found.path.y.shape[2] - model.n
+    return jnp.sum(jax.vmap(_negative)(found.deltas) - s * m)
+
+
+def _negative(matrix: Array) -> Array:
+    return jnp.sum(_eigenvalues((matrix + matrix.T) / 2) < 0)
+
+
+@lapack.one_by_one
+def _eigenvalues(matrix: Array):
+    # LAPACK may not return if the matrix is not finite.
+    return jnp.linalg.eigvalsh(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
+
+
+def conjugate_times(model: Model, ends: Ends, found: Found, index: np.ndarray) -> Float[np.ndarray, " c"]:
+    """The times of the points conjugate to the start, each as often as its multiplicity; the end itself left out."""
+    times, before = [], 0
+    for element, after in enumerate(index):
+        times += [_bisected(model, ends, found, element, wanted) for wanted in range(before + 1, int(after) + 1)]
+        before = max(before, int(after))
+    return np.array(times, np.asarray(ends.t_a).dtype)
+
+
+def _bisected(model: Model, ends: Ends, found: Found, element: int, wanted: int) -> float:
+    """The time inside an element at which the index reaches a number."""
+    s, size = found.path.y.shape[1:]
+    deltas, m = np.asarray(found.deltas), size - model.n
+    earlier = sum(int(np.sum(np.linalg.eigvalsh((d + d.T) / 2) < 0)) - s * m for d in deltas[: max(element - 1, 0)])
+    t, h = (float(x[element]) for x in found.path.times(ends))
+
+    def index(part: float) -> int:
+        whole, cut = (np.asarray(x) for x in _matrices(model, ends, found.path, element, part))
+        if element:
+            matrix = np.zeros((2 * s * size - size,) * 2, cut.dtype)
+            matrix[: s * size, : s * size] = deltas[element - 1]
+            first = (s - 1) * size
+            matrix[first : s * size, first : s * size] -= whole[:size, :size]
+            matrix[first:, first:] += cut[:-size, :-size]
+            rows = (2 * s - 1) * m
+        else:
+            matrix, rows = cut[size:-size, size:-size], (s - 1) * m
+        return earlier + int(np.sum(np.linalg.eigvalsh((matrix + matrix.T) / 2) < 0)) - rows
+
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if index(middle) >= wanted else (middle, high)
+    return t + h * high
+
+
+@compiled
+def _matrices(model: Model, ends: Ends, path: Path, element: Array, part: Array):
+    """The second variation of an element and of a part of it, ((s + 1) N, (s + 1) N) each."""
+    rule, (t, h) = rule_of_degree(path.y.shape[1]), path.times(ends)
+    t, h, size = t[element], h[element], path.y.shape[2] * (path.y.shape[1] + 1)
+
+    def of_part(part: Array) -> Array:
+        nodes, _ = states(ends, path, t + part * h * rule.nodes)
+        return momentum_matrix(model, rule, t, part * h, nodes)[1].reshape(size, size)
+
+    return jax.vmap(of_part)(jnp.stack([jnp.ones_like(part), part]))

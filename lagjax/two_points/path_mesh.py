@@ -1,0 +1,171 @@
+"""The elements of a path: where they meet, how good they are, and the path between their nodes.
+
+The size of the highest Legendre coefficient of a path on an element, c_s, says how well the polynomial follows it:
+it falls as h^s. Elements are laid anew so that it is the same on all, by the density (|c_s|)^(1/s) / h.
+
+Source: Ascher, Mattheij & Russell, *Numerical Solution of Boundary Value Problems for ODEs* (1995), §9.2.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+from numpy.polynomial import legendre
+
+from lagjax.jaxtools import once
+from lagjax.numerics import dense
+from lagjax.system import Model, constraints
+from lagjax.two_points.elements import rule_of_degree
+from lagjax.two_points.path import NATURAL, Ends, Found, Path, extent, newton, unfound
+
+# An element is at most so many times longer than the mean would have it.
+EVEN = 0.2
+# Newton's steps onto the constraints for the nodes of a straight start.
+ONTO = 60
+# How often a path is solved for, the elements laid anew in between; how many parts of the way are tried at most, and
+# the shortest. A path that is lost on other elements ends the search as well, after some tries: it is good enough.
+ROUNDS, ATTEMPTS, SHORTEST = 3, 24, 1e-2
+
+
+@once
+def _to_coefficients(s: int) -> np.ndarray:
+    """From values at an element's nodes to Legendre coefficients."""
+    return np.linalg.inv(legendre.legvander(2 * rule_of_degree(s).nodes - 1, s))
+
+
+def errors(ends: Ends, path: Path) -> Float[Array, " K"]:
+    """The highest coefficient on each element, in units of the path's extent."""
+    n, s = ends.x_a.size, path.y.shape[1]
+    highest = jnp.asarray(_to_coefficients(s)[-1], path.y.dtype)
+    c = jnp.einsum("j,kjn->kn", highest, path.nodes(ends)[..., :n])
+    return jnp.max(jnp.abs(c) / extent(ends, path)[None], axis=1)
+
+
+def states(ends: Ends, path: Path, t: Float[Array, " T"]) -> tuple[Float[Array, "T N"], Float[Array, "T n"]]:
+    """Positions with multipliers, and velocities, at any times on the path."""
+    n, s, dtype = ends.x_a.size, path.y.shape[1], path.y.dtype
+    part = (t - ends.t_a) / path.duration(ends)
+    i = jnp.clip(jnp.searchsorted(path.parts, part, side="right") - 1, 0, len(path.parts) - 2)
+    h = jnp.diff(path.parts)[i]
+    xi = 2 * (part - path.parts[i]) / h - 1
+    c = jnp.einsum("cj,kjn->kcn", jnp.asarray(_to_coefficients(s), dtype), _with_end_multipliers(ends, path))[i]
+    values, slopes = [jnp.ones_like(xi), xi], [jnp.zeros_like(xi), jnp.ones_like(xi)]
+    for k in range(2, s + 1):
+        values.append(((2 * k - 1) * xi * values[-1] - (k - 1) * values[-2]) / k)
+        slopes.append((2 * k - 1) * values[-2] + slopes[-2])
+    y = jnp.einsum("ct,tcn->tn", jnp.stack(values[: s + 1]), c)
+    slope = jnp.einsum("ct,tcn->tn", jnp.stack(slopes[: s + 1]), c[..., :n])
+    return y, slope * (2 / (h * path.duration(ends)))[:, None]
+
+
+def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:
+    """All nodes; multipliers at given ends, which nothing determines, continued from the other nodes."""
+    nodes, n = path.nodes(ends), ends.x_a.size
+    if nodes.shape[2] == n:
+        return nodes
+    weights = jnp.asarray(_continuation(path.y.shape[1]), nodes.dtype)
+    nodes = nodes.at[0, 0, n:].set(weights @ nodes[0, 1:, n:])
+    if ends.kind == NATURAL:
+        return nodes
+    return nodes.at[-1, -1, n:].set(weights[::-1] @ nodes[-1, :-1, n:])
+
+
+@once
+def _continuation(s: int) -> np.ndarray:
+    """The weights of all nodes but the first in the polynomial through them, at the first."""
+    nodes = rule_of_degree(s).nodes
+    return np.array([np.prod([(nodes[0] - b) / (a - b) for b in nodes[1:] if b != a]) for a in nodes[1:]])
+
+
+def node_times(ends: Ends, path: Path) -> Float[Array, "K s"]:
+    """The times of all nodes but the first."""
+    t, h = path.times(ends)
+    nodes = rule_of_degree(path.y.shape[1]).nodes[1:].astype(path.y.dtype)
+    return t[:, None] + h[:, None] * nodes[None]
+
+
+def parts_anew(ends: Ends, path: Path) -> Float[Array, " K+1"]:
+    """Where elements of equal quality meet."""
+    s, dtype = path.y.shape[1], path.y.dtype
+    width = jnp.diff(path.parts)
+    density = jnp.maximum(errors(ends, path), jnp.finfo(dtype).eps) ** (1 / s) / width
+    density = jnp.maximum(density, EVEN * jnp.sum(density * width))
+    whole = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(density * width)])
+    parts = jnp.interp(jnp.linspace(0.0, 1.0, len(whole), dtype=dtype) * whole[-1], whole, path.parts)
+    return parts.at[0].set(0.0).at[-1].set(1.0)
+
+
+def onto_constraints(model: Model, t: Array, x: Array) -> Array:
+    """The point near x that satisfies the holonomic constraints, by Gauss and Newton's shortest steps."""
+
+    def step(x: Array, _):
+        g = constraints.position_residual(model, t, x)
+        slope = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
+        return x - slope.T @ (dense.inverse(slope @ slope.T) @ g), None
+
+    if not model.holonomic.any():
+        return x
+    near = lax.scan(step, x, None, ONTO)[0]
+    return jnp.where(jnp.all(jnp.isfinite(near)), near, x)
+
+
+def path_through(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"]) -> Path:
+    """The path through given nodes, moved onto the constraints."""
+    m = int(model.holonomic.sum())
+    nu = jnp.zeros(ends.border - ends.free_time, x.dtype)
+    border = jnp.concatenate([nu, ends.duration[None]]) if ends.free_time else nu
+    empty = Path(parts, x, border)
+    onto = jax.vmap(lambda t, x: onto_constraints(model, t, x))
+    x = onto(node_times(ends, empty).ravel(), x.reshape(-1, x.shape[2])).reshape(x.shape)
+    return empty._replace(y=jnp.concatenate([x, jnp.zeros((*x.shape[:2], m), x.dtype)], axis=2))
+
+
+class Attempt(NamedTuple):
+    """The last path that converged, for a part of the ends' distance and time; and the next part to try."""
+
+    found: Found
+    part: Float[Array, ""]
+    step: Float[Array, ""]
+    rounds: Int[Array, ""]
+    attempts: Int[Array, ""]
+
+
+def found_path(model: Model, ends: Ends, start: Path, rounds: int = ROUNDS) -> Attempt:
+    """Newton's method at once; where it fails, along the start from a short time to the whole one, since the shorter a
+    motion is, the straighter it is; then on elements laid anew."""
+    n = model.n
+
+    def attempt(last: Attempt) -> Attempt:
+        there, path = last.part >= 1.0, last.found.path
+        part = jnp.minimum(1.0, last.part + last.step)
+        # Once there: the path itself on other elements. On the way: the start up to this part of its time.
+        source = jax.tree.map(lambda a, b: jnp.where(there, a, b), path, start)
+        parts = jnp.where(there, parts_anew(ends, path), path.parts)
+        shares = (node_times(ends, path._replace(parts=parts)) - ends.t_a) / path.duration(ends)
+        known, _ = states(ends, source, ends.t_a + part * source.duration(ends) * shares.ravel())
+        known = known.reshape(path.y.shape)
+        x_b = jnp.where(part >= 1.0, ends.x_b, known[-1, -1, :n])
+        aim = eqx.tree_at(lambda ends: (ends.x_b, ends.duration), ends, (x_b, part * ends.duration))
+        stretched = path.y[..., :n] + shares[..., None] * (x_b - path.y[-1, -1, :n])[None, None]
+        x = jnp.where(there | (last.part == 0), known[..., :n], stretched)
+        trial = path_through(model, aim, x, parts)
+        y = trial.y.at[..., n:].set(jnp.where(there, known, path.y)[..., n:])
+        trial = Path(parts, y, jnp.where(last.part > 0, path.border, trial.border))
+        found = newton(model, aim, trial)
+        well = found.converged
+        kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), found, last.found)
+        step = jnp.where(well, 1.5 * last.step, last.step / 3)
+        return Attempt(
+            kept, jnp.where(well, part, last.part), step, last.rounds + (well & (part >= 1.0)), last.attempts + 1
+        )
+
+    def unfinished(last: Attempt):
+        going = (last.rounds < rounds) & (last.attempts < ATTEMPTS)
+        return going & (last.step > SHORTEST)
+
+    zero, none = jnp.zeros_like(ends.duration), jnp.zeros((), int)
+    return lax.while_loop(unfinished, attempt, Attempt(unfound(start), zero, zero + 1, none, none))

@@ -1,0 +1,83 @@
+"""What `connect` returns: a motion between two ends, and what kind of stationary path it is."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.integrate import Trajectory
+
+# Ends count as conjugate where an error of the path, but at least this round-off, decides what the start velocity is.
+ROUND_OFF = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-5}
+
+
+class Connection(eqx.Module):
+    """A motion between two ends; the answer of least action, where several were found.
+
+    - `q`, `v`: the path at `t` (T,), in the structure of the ends; `multipliers` of its constraints by name.
+    - `trajectory`: the motion of `integrate` from the start with `start_velocity`, on which the end is met; None where
+      there is none: L is singular at the start, or an error there grows too much on the way (`missed`).
+    - `start_velocity`, `end_velocity`: in the structure of the ends; `duration`: T = t_b - t_a.
+    - `action`: S = ∫ L dt along the path.
+    - `index`: the Morse index, the number of independent variations with fixed ends that lower the action; -1 where
+      there is no action principle. `kind`: the same in words. `conjugate_times`: the times of the points conjugate to
+      the start, one for each direction; None while JAX traces.
+    - `amplification`: the relative change of the start velocity by one of the end; large near a conjugate end.
+    - `missed`: the last correction of the start velocity, relative. `converged`: whether the path was found; its last
+      step, `mesh_error`, the highest Legendre coefficients on its elements, and the `elements`.
+    - `others`: further answers, by rising action. `tried`: what was tried, in words.
+    """
+
+    t: Float[Array, " T"]
+    q: PyTree[Float[Array, "T ..."]]
+    v: PyTree[Float[Array, "T ..."]]
+    multipliers: dict[str, Array]
+    trajectory: Trajectory | None
+    start_velocity: PyTree[Float[Array, "..."]]
+    end_velocity: PyTree[Float[Array, "..."]]
+    duration: Float[Array, ""]
+    action: Float[Array, ""]
+    index: Int[Array, ""]
+    amplification: Float[Array, ""]
+    missed: Float[Array, ""]
+    mesh_error: Float[Array, ""]
+    converged: Bool[Array, ""]
+    conjugate_times: Any
+    others: "tuple[Connection, ...]" = ()
+    tried: str = eqx.field(static=True, default="")
+    elements: int = eqx.field(static=True, default=0)
+    why_not_variational: str = eqx.field(static=True, default="")
+
+    @property
+    def kind(self) -> str:
+        """ "minimum", "saddle of index 1", "degenerate: ends are conjugate", or "not variational: ..."."""
+        if self.why_not_variational:
+            return f"not variational: {self.why_not_variational}"
+        if not bool(self.converged):
+            return "not found"
+        round_off = ROUND_OFF[np.asarray(self.amplification).dtype]
+        if float(self.amplification) * max(float(self.mesh_error), round_off) > 0.1:
+            return "degenerate: ends are conjugate"
+        return "minimum" if int(self.index) == 0 else f"saddle of index {int(self.index)}"
+
+    def plot(self, *names: str, **options):
+        """Plot the motion: `Trajectory.plot`."""
+        if self.trajectory is None:
+            raise ValueError("there is a path and no motion to plot.\nFix: plot .t and .q yourself.")
+        return self.trajectory.plot(*names, **options)
+
+    def __repr__(self):
+        if np.ndim(self.action) or not isinstance(self.action, (np.ndarray, np.generic, float)):
+            try:
+                action = np.asarray(self.action)
+            except Exception:
+                return "Connection(traced)"
+            if action.ndim:
+                return f"Connection({action.size} lanes)"
+        motion = f"motion misses {float(self.missed):.0e}" if self.trajectory is not None else "no motion"
+        more = f"; {len(self.others)} more" if self.others else ""
+        return (
+            f"Connection({self.kind}; action {float(self.action):.9g} in a time of {float(self.duration):.6g}; "
+            f"{self.elements} elements to {float(self.mesh_error):.0e}, {motion}{more})"
+        )

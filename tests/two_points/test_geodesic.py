@@ -1,0 +1,101 @@
+"""Shortest paths against closed forms: the sphere in a chart and in space, the torus's equator, singular metrics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.scenes import sphere_geodesic as sphere
+
+R = sphere.PARAMS["R"]
+
+
+def in_chart(q, v, params):
+    """The line element of the sphere."""
+    return params["R"] ** 2 * (v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2)
+
+
+def in_space(ends):
+    """The geodesic on |r| = R, and the closed form's length and start direction."""
+    a, b = (np.asarray(sphere.cartesian(sphere.PARAMS, *end)) for end in (ends[:2], ends[2:]))
+    found = lj.geodesic(sphere.embedded, a, b, sphere.PARAMS, outputs=2)
+    return found, sphere.distance(sphere.PARAMS, *ends), sphere.start_towards(sphere.PARAMS, *ends)[1]
+
+
+@pytest.mark.slow
+def test_sphere_in_space():
+    """Lengths and directions to 1e-12: generic, meridian, over the pole and from it, more than π of azimuth; from
+    1e-8 to antipodal the direction to 1e-7. Twin: the straight distance is another length."""
+    for name in ("generic", "along a meridian", "over the pole", "from the pole"):
+        found, length, direction = in_space(sphere.ARCS[name])
+        assert abs(found.length - length) < 1e-12 and found.kind == "minimum", name
+        assert np.max(np.abs(found.start_direction - direction)) < 1e-12, name
+    found, length, direction = in_space(sphere.WIDE)
+    assert abs(found.length - length) < 1e-12 and found.index == 0
+    straight = np.linalg.norm(found.connection.q[-1] - found.connection.q[0])
+    assert abs(straight - length) > 0.1
+    found, length, direction = in_space(sphere.ARCS["antipodal but for 1e-8"])
+    assert abs(found.length - length) < 1e-12 and found.connection.amplification > 1e7
+    assert np.max(np.abs(found.start_direction - direction)) < 1e-7
+
+
+@pytest.mark.exhaustive
+def test_sphere_in_a_chart():
+    """More than π of azimuth: the shorter way first, the longer one with index 1 and its conjugate point at π R."""
+    psi_a, theta_a, psi_b, theta_b = sphere.WIDE
+    a, b = {"psi": psi_a, "theta": theta_a}, {"psi": psi_b, "theta": theta_b}
+    found = lj.geodesic(in_chart, a, b, sphere.PARAMS, angles="theta", outputs=2)
+    (longer,), length = found.others, sphere.distance(sphere.PARAMS, *sphere.WIDE)
+    assert abs(found.length - length) < 1e-12 and found.kind == "minimum"
+    assert abs(longer.length - (2 * np.pi * R - length)) < 1e-12 and longer.kind == "saddle of index 1"
+    assert abs(longer.conjugate_lengths[0] - np.pi * R) < 1e-9
+    one_way = lj.geodesic(in_chart, a, b | {"theta": theta_b - 2 * np.pi}, sphere.PARAMS, outputs=2)
+    assert one_way.others == ()
+
+
+def test_coincident_points():
+    """Identical points: no length, and no direction."""
+    a = np.array([1.0, 2.0])
+    found = lj.geodesic(lambda q, v, params: v @ v / q[1] ** 2, a, a.copy(), outputs=2)
+    assert found.length == 0 and np.all(np.isnan(found.start_direction)) and found.kind == "minimum"
+
+
+@pytest.mark.exhaustive
+def test_brachistochrone():
+    """The metric |dx|² / (2 g depth) is singular at the start, where nothing is evaluated: its length is the time of
+    descent, that of the cycloid through the ends, to 1e-10. Twin: the time along the start's own path."""
+    g, start = 9.80665, lambda t: jnp.stack([10 * t**3, 5 * t**2])
+    falls = lambda q, v, params: v @ v / (2 * params * q[1])
+    found = lj.geodesic(falls, np.zeros(2), np.array([10.0, 5.0]), g, starts=start, outputs=2)
+    assert abs(found.length - 1.801603122453) < 1e-10 and found.trajectory is None
+    t = (np.arange(1000) + 0.5) / 1000
+    speed = np.sqrt(((30 * t**2) ** 2 + (10 * t) ** 2) / (2 * g * 5 * t**2))
+    assert np.mean(speed) > 1.81
+
+
+def test_refused():
+    """A length in place of its square, and an unknown angle, are refused in words."""
+    a, b = np.array([1.0, 2.0]), np.array([2.0, 1.0])
+    with pytest.raises(ValueError, match="not quadratic in the velocities"):
+        lj.geodesic(lambda q, v, params: jnp.sqrt(v @ v), a, b)
+    with pytest.raises(ValueError, match="angles names 'phi'"):
+        lj.geodesic(lambda q, v, params: v @ v, a, b, angles="phi")
+
+
+@pytest.mark.exhaustive
+def test_lanes_and_derivatives():
+    """Distances in the half plane under vmap, and their gradients: those of the closed form. Twin: of other ends."""
+
+    def distance(b):
+        return lj.geodesic(lambda q, v, params: v @ v / q[1] ** 2, jnp.array([0.0, 1.0]), b, outputs=2).length
+
+    ends = jnp.array([[1.0, 2.0], [2.0, 0.5], [-1.0, 1.0]])
+
+    def by_hand(b):
+        return 2 * jnp.arcsinh(0.5 * jnp.sqrt((b[0] ** 2 + (b[1] - 1) ** 2) / b[1]))
+
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(distance)))(ends)
+    expected, by_end = jax.vmap(jax.value_and_grad(by_hand))(ends)
+    assert np.max(np.abs(value - expected)) < 1e-12 and np.max(np.abs(slope - by_end)) < 1e-10
+    assert np.max(np.abs(slope - by_end[::-1])) > 0.1
