@@ -30,13 +30,9 @@ class Block(NamedTuple):
             found.append(jax.tree.map(np.asarray, function(self.plant, self.form, *pieces)))
         return jax.tree.map(lambda *x: np.concatenate(x)[: len(self.columns)], *found)
 
-    def values(self, x: np.ndarray):
-        """Costs (B,) and rows (B, r)."""
-        return self._together(transcription.values, x[self.columns])
-
-    def slopes(self, x: np.ndarray):
-        """Their derivatives by what each part sees, (B, d) and (B, r, d)."""
-        return self._together(transcription.slopes, x[self.columns])
+    def values_and_slopes(self, x: np.ndarray):
+        """Costs (B,) and rows (B, r), and their derivatives by what each part sees, (B, d) and (B, r, d)."""
+        return self._together(transcription.values_and_slopes, x[self.columns])
 
     def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray):
         """The second derivatives (B, d, d) of `share` times the cost plus the rows times `multipliers`."""

@@ -23,6 +23,15 @@ class Solved(NamedTuple):
     iterations: int
 
 
+class FirstOrder(NamedTuple):
+    """f, g, the gradient of f, and the entries of the Jacobian of g."""
+
+    f: float
+    g: np.ndarray
+    gradient: np.ndarray
+    jacobian: np.ndarray
+
+
 class _Pattern:
     """A sum of dense blocks as a sparse matrix: which entries there are, and where each block adds to them."""
 
@@ -50,27 +59,24 @@ class NonlinearProgram:
 
     def __init__(self, blocks: Sequence[Any], size: int, count: int):
         self.blocks, self.size, self.count = blocks, size, count
+        self.last: tuple[np.ndarray, FirstOrder] | None = None
         columns = [b.columns for b in blocks]
         self.jacobian = _Pattern((count, size), [b.rows for b in blocks], columns, False)
         self.hessian = _Pattern((size, size), columns, columns, True)
 
-    def values(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """f and g."""
-        f, g = 0.0, np.zeros(self.count)
+    def first_order(self, x: np.ndarray) -> FirstOrder:
+        """f, g, the gradient of f and the entries of the Jacobian of g; the last ones are kept."""
+        if self.last is not None and np.array_equal(self.last[0], x):
+            return self.last[1]
+        f, g, gradient, parts = 0.0, np.zeros(self.count), np.zeros(self.size), []
         for b in self.blocks:
-            cost, rows = b.values(x)
+            (cost, rows), (of_cost, of_rows) = b.values_and_slopes(x)
             f += float(np.sum(cost))
             np.add.at(g, b.rows, rows)
-        return f, g
-
-    def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The gradient of f, and the entries of the Jacobian of g."""
-        gradient, parts = np.zeros(self.size), []
-        for b in self.blocks:
-            of_cost, of_rows = b.slopes(x)
             np.add.at(gradient, b.columns, of_cost)
             parts.append(of_rows)
-        return gradient, self.jacobian.sum(parts)
+        self.last = x.copy(), FirstOrder(f, g, gradient, self.jacobian.sum(parts))
+        return self.last[1]
 
     def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray) -> np.ndarray:
         """The entries of the upper half of the Hessian of share f + multipliers g."""
@@ -150,13 +156,15 @@ def _functions(casadi: Any, program: NonlinearProgram) -> dict[str, Any]:
             return [casadi.DM(s, v) for s, v in zip(self.returns, self.function(*given))]
 
     def values(x: np.ndarray, _: np.ndarray):
-        return program.values(x)
+        return program.first_order(x)[:2]
 
     def gradient(x: np.ndarray, _: np.ndarray):
-        return program.values(x)[0], program.slopes(x)[0]
+        found = program.first_order(x)
+        return found.f, found.gradient
 
     def jacobian(x: np.ndarray, _: np.ndarray):
-        return program.values(x)[1], program.slopes(x)[1]
+        found = program.first_order(x)
+        return found.g, found.jacobian
 
     def hessian(x: np.ndarray, _: np.ndarray, share: np.ndarray, multipliers: np.ndarray):
         return [program.curvatures(x, share[0], multipliers)]

@@ -189,15 +189,15 @@ def _function(plant: Plant, form: tuple):
 
 
 @compiled
-def values(plant: Plant, form: tuple, z: Array):
-    """The costs and equations of the parts z (B, d)."""
-    return jax.vmap(_function(plant, form))(z)
+def values_and_slopes(plant: Plant, form: tuple, z: Array):
+    """The costs (B,) and equations (B, r) of the parts z (B, d), and the derivatives of both."""
 
+    def twice(z: Array):
+        found = _function(plant, form)(z)
+        return found, found
 
-@compiled
-def slopes(plant: Plant, form: tuple, z: Array):
-    """Their first derivatives."""
-    return jax.vmap(jax.jacfwd(_function(plant, form)))(z)
+    slopes, values = jax.vmap(jax.jacfwd(twice, has_aux=True))(z)
+    return values, slopes
 
 
 @compiled

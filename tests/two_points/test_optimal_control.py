@@ -81,7 +81,7 @@ def cart_pole(t, q, v, p):
     return kinetic + 0.5 * p["m2"] * p["l"] ** 2 * turn**2 + p["m2"] * p["g"] * p["l"] * jnp.cos(angle)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cart_pole_swings_up():
     """Kelly's cart-pole: 58.80766746, which Hermite and Simpson's rule with explicit equations tends to.
 
@@ -100,7 +100,7 @@ def test_cart_pole_swings_up():
     assert abs(np.trapezoid(u**2, dx=2.0 / 4000) - found.cost) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_brachistochrone():
     """The slope of a wire as a control, which a velocity constraint reads: the cycloid, to 1e-10 of its time."""
     wire = lj.Nonholonomic(lambda t, q, v, p: v[0] * jnp.sin(p["slope"]) - v[1] * jnp.cos(p["slope"]))

@@ -26,7 +26,7 @@ def test_a_mass():
     residual = a.T @ s + s @ a - (s @ b + cross) @ (b.T @ s + cross.T) / 2.0 + np.diag([3.0, 0.5])
     np.testing.assert_allclose(residual, 0.0, atol=1e-12 * np.max(np.abs(a.T @ s)))
     np.testing.assert_allclose(found.gain, (b.T @ s + cross.T) / 2.0, rtol=1e-12)
-    assert np.max(found.eigenvalues.real) < 0 and np.all(np.linalg.eigvalsh(s) > 0)
+    assert np.max(np.real(found.eigenvalues)) < 0 and np.all(np.linalg.eigvalsh(s) > 0)
     # Twin: the sign of the spring changes the gain.
     other = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": -k})
     assert np.max(np.abs(other.gain - found.gain)) > 1.0
