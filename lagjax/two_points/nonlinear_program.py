@@ -96,7 +96,7 @@ class NonlinearProgram:
             "steer", "ipopt", functions["oracle"],
             {
                 "grad_f": functions["grad_f"], "jac_g": functions["jac_g"], "hess_lag": functions["hess_lag"],
-                "no_nlp_grad": True, "print_time": False, "error_on_fail": False,
+                "no_nlp_grad": True, "print_time": False, "show_eval_warnings": False, "error_on_fail": False,
                 "ipopt": {"print_level": 0, "sb": "yes", **options},
             },
         )  # fmt: skip

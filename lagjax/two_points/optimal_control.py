@@ -104,7 +104,8 @@ def steer(
     Source: Betts, *Practical Methods for Optimal Control*, ch. 4; Leyendecker et al. (2010).
     """
     times, options = (t_a, t_b), (degree, interpolation)
-    question = asked(system, controls, start, end, cost, params, times, end_cost, bounds, with_control, options)
+    counts = ("elements", elements, 1), ("most", most, 1), ("degree", degree, 1), ("outputs", outputs, 2)
+    question = asked(system, controls, start, end, cost, params, times, end_cost, bounds, with_control, options, counts)
     motion = Motion(outputs, rtol, max(most, elements) + CUTS, throw)
     import_casadi()
     ahead = compile_ahead(question, motion)

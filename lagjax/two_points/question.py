@@ -78,6 +78,7 @@ class Controlled(eqx.Module):
 def asked(
     system: System, controls: Any, start: Any, end: Any, cost: Callable | None, params: PyTree, times: tuple,
     end_cost: Callable | None, bounds: Mapping | None, with_control: Callable | None, options: tuple[int, str],
+    counts: tuple[tuple[str, Any, int], ...],
 ) -> Question:  # fmt: skip
     """The question, after all that can be wrong with it was looked for."""
     check_system(system)
@@ -93,6 +94,9 @@ def asked(
             f"interpolation={options[1]!r} is none of {listed(INTERPOLATIONS)}.\n"
             'Fix: interpolation="linear", for a control that is linear between knots.'
         )
+    for name, value, least in counts:
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+            raise ValueError(f"{name}={value!r} must be a whole number of at least {least}.\nFix: leave it out.")
     t_a, t_b = _times(*times)
     start, end_function = _pair(start, "start"), end if callable(end) else None
     q_like = _example(start, system)

@@ -25,12 +25,27 @@ STATUS = {
     "Restoration_Failed": "no motion that satisfies all conditions was found",
     "Maximum_Iterations_Exceeded": "not found within the largest number of iterations",
     "Search_Direction_Becomes_Too_Small": "the solver could not go on",
+    "Error_In_Step_Computation": "the solver could not go on",
     "Diverging_Iterates": "the cost falls without limit",
     "Invalid_Number_Detected": "L, a force, a constraint or the cost is not finite on the way",
     "Not_Enough_Degrees_Of_Freedom": "there are more conditions than unknown numbers",
 }
 # A motion that ends further from the end than this part of the way is none.
 MISSED = 1e-2
+# What is usually behind it, and what helps: for conditions that contradict each other, and for the rest.
+CONTRADICTORY = ("Infeasible_Problem_Detected", "Restoration_Failed")
+OF_CONDITIONS = (
+    "Usual cause: bounds too narrow for the time, an end that no control reaches, or a guess far away.\n"
+    "Fix: wider bounds or t_b=(low, high); guess=lambda t: q of a path; a first answer of an easier question."
+)
+OF_COST = (
+    "Usual cause: a cost that falls without limit, or has a kink where it is least (jnp.abs(u)), or a guess far away.\n"
+    "Fix: bounds on what the cost rewards; u**2, or a control for each sign; guess=lambda t: q of a path."
+)
+OF_NUMBERS = (
+    "Usual cause: a root or a logarithm of what is negative, or a division by zero, along the first guess.\n"
+    "Fix: a guess where all is finite: other numbers in controls, guess=lambda t: q, and bounds that keep it so."
+)
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -209,10 +224,9 @@ def failure_in_words(question: Question, layout: Layout, solved: Solved, of_rows
     worst = int(np.argmax(off))
     if off[worst] > 1e-6:
         text += f"Violated most: {_row_in_words(question, layout, solved.x, worst)}, by {off[worst]:.3g}.\n"
-    return text + (
-        "Usual cause: bounds too narrow for the time, an end that no control reaches, or a guess far away.\n"
-        "Fix: wider bounds or t_b=(low, high); guess=lambda t: q of a path; a first answer of an easier question."
-    )
+    if solved.status == "Invalid_Number_Detected":
+        return text + OF_NUMBERS
+    return text + (OF_CONDITIONS if solved.status in CONTRADICTORY else OF_COST)
 
 
 def _row_in_words(question: Question, layout: Layout, x: np.ndarray, row: int) -> str:

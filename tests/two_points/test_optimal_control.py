@@ -150,6 +150,8 @@ def test_what_cannot_be_is_said():
         pushed(bounds={"push": (-1.0, 1.0)})
     with pytest.raises(RuntimeError, match="the bounds of 'v' at t = |equation of motion"):
         pushed(bounds={"v": (-0.5, 0.5)})
+    with pytest.raises(RuntimeError, match="not finite on the way"):
+        pushed(cost=lambda t, q, v, u, params: jnp.sqrt(u["push"] - 100.0))
     found = pushed(bounds={"push": (-1.0, 1.0)}, throw=False)
     assert not found.success and "no motion" in found.status
     with pytest.raises(ValueError, match="too many conditions: 5 equations for 4 unknown numbers"):
@@ -166,6 +168,7 @@ def test_questions_that_are_wrong():
         ({"bounds": {"q": (-1.0, 0.9)}}, "the end asks for q = 1, and its bounds are -1 and 0.9"),
         ({"bounds": {"push": (1, -1)}}, "above the upper one"),
         ({"end": (jnp.zeros(2), 0.0)}, "the start has"),
+        ({"elements": 0}, "elements=0 must be a whole number of at least 1"),
         ({"interpolation": "cubic"}, "'smooth', 'linear' and 'constant'"),
         ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
     ):

@@ -32,7 +32,7 @@ def program(count, interpolation):
 
     question = asked(
         skate, {"push": jnp.zeros(2), "turn": 0.1}, start, lambda t, q, v, p: q[2] ** 2 - v[0], cost, {"m": 2.0},
-        (0.0, (0.5, 3.0)), lambda t, q, v, p: t * q[1] ** 2, {"v[1]": (-1.0, 1.0)}, None, (2, interpolation),
+        (0.0, (0.5, 3.0)), lambda t, q, v, p: t * q[1] ** 2, {"v[1]": (-1.0, 1.0)}, None, (2, interpolation), (),
     )  # fmt: skip
     layout = Layout(question.plant, count)
     return layout, NonlinearProgram(layout.blocks(), layout.size, layout.row_count)
