@@ -79,14 +79,21 @@ def _of_equation(equation: JaxprEqn, given: list[int]) -> list[int]:
 
 def _of_scan(equation: JaxprEqn, given):
     """A loop of known length: what it carries is of the last kind that its body makes of it."""
-    consts, carried = equation.params["num_consts"], equation.params["num_carry"]
+    body = equation.params["jaxpr"]
+    # What a loop takes or gives in rows has one axis less in its body; the parameters' names depend on JAX's version.
+    carried = _without_rows(equation.outvars, body.out_avals)
+    consts = _without_rows(equation.invars, body.in_avals) - carried
     kinds = list(given)
     while True:
-        made = _kinds(equation.params["jaxpr"], kinds)
+        made = _kinds(body, kinds)
         new = [max(x, y) for x, y in zip(kinds[consts : consts + carried], made)]
         if new == kinds[consts : consts + carried]:
             return made
         kinds[consts : consts + carried] = new
+
+
+def _without_rows(outside, inside):
+    return sum(x.aval.ndim == y.ndim for x, y in zip(outside, inside))
 
 
 def _all_floating(equation):
