@@ -118,9 +118,10 @@ def watched(function: Callable, *args) -> tuple[ClosedJaxpr, PyTree]:
         rest.append(shape)
         for x in found:
             if not isinstance(x, Array | np.ndarray | np.generic | bool | int | float | complex):
+                fix = "a module without its functions, eqx.filter(net, eqx.is_array), or " if callable(x) else ""
                 raise TypeError(
                     f"run must return numbers and arrays, and returned {x!r:.60}, a {type(x).__name__}.\n"
-                    "Fix: return only what differs from point to point."
+                    f"Fix: return {fix}only what differs from point to point."
                 )
         return [jnp.asarray(x) for x in found]
 
