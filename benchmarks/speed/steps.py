@@ -104,6 +104,40 @@ def compared(what, functions, arguments, repeats):
     )
 
 
+def one_lane(options):
+    """Print the first and the next call of one motion, by what a user writes and by diffrax with the formula."""
+    torque = {"torque": 0.3}
+    ts = np.linspace(0.0, 2.0, 21)
+
+    def field(t, y, p):
+        return y[1], accelerations(*y, p, p["torque"])
+
+    @jax.jit
+    def formula(q, v, p):
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(field), diffrax.Tsit5(), ts[0], ts[-1], None, (q, v), args=p,
+            saveat=diffrax.SaveAt(ts=ts), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6),
+        ).ys  # fmt: skip
+
+    def ours(q, v, p, **options):
+        found = lj.integrate(double_pendulum, q, v, p, ts=ts, rtol=1e-6, atol=1e-6, **options)
+        return found.q, found.v
+
+    inside = jax.jit(partial(ours, estimate_error=False))
+    given, firsts = (np.array([1.0, 0.5]), np.zeros(2), PARAMS | torque), []
+    for function in (formula, ours):
+        started = measure.CLOCK["seconds"]()
+        jax.block_until_ready(function(*given))
+        firsts.append(measure.CLOCK["seconds"]() - started)
+    times = measure.in_turn(*(partial(f, *given) for f in (formula, ours, inside)), repeats=5 * options.repeats)
+    print(
+        f"one lane, first call {firsts[1]:.1f} s, {firsts[1] / firsts[0]:.2f} x diffrax with the formula; next "
+        f"{1e3 * times.medians[1]:.2f} ms, {times.ratio(1, 0)[0]:.2f} x, with checks and errors; in jit without the "
+        f"estimate of errors {1e3 * times.medians[2]:.2f} ms, {times.ratio(2, 0)[0]:.2f} x",
+        flush=True,
+    )
+
+
 def main():
     """Print one line for each comparison."""
     parser = argparse.ArgumentParser(description="Steps beside a Runge-Kutta loop by hand.")
@@ -113,6 +147,7 @@ def main():
     jax.config.update("jax_enable_x64", True)
     if options.processor_time:
         measure.CLOCK["seconds"] = time.process_time
+    one_lane(options)
     random = np.random.default_rng(0)
 
     def arguments(lanes, steps, dtype):
