@@ -1,6 +1,6 @@
 """`connect`: the motions from one configuration to another.
 
-check the ends  ->  a path for each start (`path_mesh.py`)  ->  its motion (`shoot.py`)  ->  sort, and say what was found
+check the ends  ->  a path for each start (`path_mesh.py`)  ->  its motion (`shoot.py`)  ->  sort, say what was found
 """
 
 import warnings

@@ -69,7 +69,9 @@ def _bisected(model: Model, ends: Ends, found: Found, element: int, wanted: int)
     t, h = (float(x[element]) for x in found.path.times(ends))
 
     def index(part: float) -> int:
-        whole, cut = (np.asarray(x) for x in _matrices(model, ends, found.path, element, part))
+        # As arrays: a program is compiled for each Python number.
+        at = np.asarray(element), np.asarray(part, deltas.dtype)
+        whole, cut = (np.asarray(x) for x in _matrices(model, ends, found.path, *at))
         if element:
             matrix = np.zeros((2 * s * size - size,) * 2, cut.dtype)
             matrix[: s * size, : s * size] = deltas[element - 1]

@@ -148,25 +148,22 @@ def momentum_matrix(model: Model, rule: Rule, t: Array, h: Array, nodes: Array):
 
 def end_rows(model: Model, ends: Ends, t_b: Array, x: Array, u: Array, multipliers: Array, p: Array, nu: Array):
     """The equations of the end: N of the last node (to be added to R where the end is natural), then the border's."""
-    m, kind = multipliers.size, ends.kind
-    if kind == FIXED:
-        at_node, border = x - ends.x_b, []
-    elif kind == NATURAL:
-        value, back = jax.vjp(lambda t, x: ends.condition(t, x, u), t_b, x)
-        by_t, by_x = back(nu)
-        at_node, border = by_x, [value]
+    m, border = multipliers.size, []
+    if ends.condition is None:
+        at_node, by_t = x - ends.x_b, 0.0
+    elif ends.kind == NATURAL:
+        condition = ends.condition
+        value, back = jax.vjp(lambda t, x: condition(t, x, u), t_b, x)
+        by_t, at_node = back(nu)
+        border = [value]
     else:
         conditions = ends.condition(t_b, x, u)
-        own = conditions[: x.size - m]
-        at_node, border = jnp.concatenate([own, constraints.position_residual(model, t_b, x)]), []
+        at_node = jnp.concatenate([conditions[: x.size - m], constraints.position_residual(model, t_b, x)])
+        return jnp.concatenate([at_node, multipliers, conditions[x.size - m :]])
     if ends.free_time:
-        if kind == COMPLETE:
-            border = [conditions[x.size - m :]]
-        else:
-            energy = u @ p - model.lagrangian(t_b, x, u)
-            border.append((energy - (by_t if kind == NATURAL else 0.0))[None])
+        border.append((u @ p - model.lagrangian(t_b, x, u) - by_t)[None])
     # Where the end is given, nothing determines the impulse of the constraints there.
-    of_multipliers = jnp.zeros_like(multipliers) if kind == NATURAL else multipliers
+    of_multipliers = jnp.zeros_like(multipliers) if ends.kind == NATURAL else multipliers
     return jnp.concatenate([at_node, of_multipliers, *border])
 
 

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from lagjax.integrate import ENDED_WELL, Trajectory, integrate, is_among
-from lagjax.jaxtools import compiled, stop_gradient
+from lagjax.jaxtools import compiled, numpy_of, stop_gradient
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import rule_of_degree
@@ -100,7 +100,7 @@ def corrected(ends: Ends, aim: Aim, response: Array, rho: Array) -> Aim:
 
 def times(ends: Ends, aim: Aim, outputs: int):
     """The output times of a motion."""
-    xp = jnp if any(isinstance(x, jax.core.Tracer) for x in (ends.t_a, ends.duration, aim.border)) else np
+    xp = numpy_of((ends.t_a, ends.duration, aim.border))
     return xp.asarray(ends.t_a) + xp.asarray(duration(ends, aim)) * np.linspace(0.0, 1.0, outputs, dtype=aim.u.dtype)
 
 
