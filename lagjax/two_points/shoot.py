@@ -5,8 +5,8 @@ Newton's method leaves behind, says how the start velocity v_a, a free time T an
 
     z = (v_a, ν, T),    z <- z - W ρ(z),    W = dz/dρ of the discrete path
 
-W is as good as the path, so few corrections reach round-off; one more of them, with a constant W, gives z its
-derivatives by the implicit function theorem.
+W is as good as the path, so few corrections reach round-off; two of them, with a constant W, give z its derivatives
+by the implicit function theorem.
 """
 
 from functools import partial
@@ -26,7 +26,7 @@ from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.path import NATURAL, Ends, Found, end_rows
 
 # Corrections at most, from Python and inside a program; and how much each has to shrink.
-SHOTS, SHOTS_INSIDE = 8, 2
+SHOTS, SHOTS_INSIDE = 8, 1
 SHRINKS = 0.5
 # So many round-offs of the end count as none.
 ROUND_OFF = 1e4
@@ -157,7 +157,9 @@ def shot_inside(model: Model, ends: Ends, aim: Aim, response: Array, rtol) -> Sh
 
     aim, _ = lax.scan(once, aim, None, length=SHOTS_INSIDE)
     aim = stop_gradient(aim)
-    # A free time's motion is differentiated at the path's own time.
-    rho = missed(model, ends, aim, *last_of(end(model, ends, aim)))
-    size = jnp.max(jnp.abs(lax.stop_gradient(response @ rho)[: aim.u.size])) / jnp.max(jnp.abs(aim.u))
-    return Shot(corrected(ends, aim, response, rho), lax.stop_gradient(size))
+    # W is that of the path: one correction has derivatives as good as the path, the second one squares their error.
+    for _ in range(2):
+        rho = missed(model, ends, aim, *last_of(end(model, ends, aim)))
+        size = jnp.max(jnp.abs(response @ rho)[: aim.u.size]) / jnp.max(jnp.abs(aim.u))
+        aim = corrected(ends, aim, response, rho)
+    return Shot(aim, lax.stop_gradient(size))
