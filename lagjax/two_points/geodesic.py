@@ -26,6 +26,8 @@ from lagjax.two_points.connect import ELEMENTS, connect
 from lagjax.two_points.result import Connection
 
 TURN = 2 * np.pi
+# Starts, the straight line among them, where that one leads to a path that is not the shortest.
+STARTS = 8
 
 
 class Geodesic(eqx.Module):
@@ -103,7 +105,8 @@ def geodesic(
     - `a`, `b`: the points, alike.
     - `angles`: the names of coordinates that come back after a turn of 2π: the nearer way round is taken, and for each
       the other way as well.
-    - `starts`, `elements`, `outputs`, `rtol`: as for `connect`.
+    - `starts`, `elements`, `outputs`, `rtol`: as for `connect`. Where the straight line leads to nothing but a saddle,
+      seven random starts follow.
 
     **Returns:** a `Geodesic`; longer ones in `others`. Differentiable in both modes; under `jit` and `vmap` the one
     from the straight line.
@@ -122,12 +125,10 @@ def geodesic(
         return _point(system, s, outputs)
     options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol)
     ends = _round_the_other_way(model, s.q, b, angles) if eager and angles else [b]
-    found: list[Geodesic] = []
-    for i, end in enumerate(ends):
-        quiet = i > 0 or len(ends) > 1
-        for answer in _answers(system, s, end, options, quiet):
-            if not any(_same(answer, other) for other in found):
-                found.append(answer)
+    found = _different([], system, s, ends, options)
+    # The shortest path is no saddle: the straight line was a start on a ridge.
+    if eager and starts == 1 and found and all(answer.kind.startswith("saddle") for answer in found):
+        found = _different(found, system, s, ends, {**options, "starts": STARTS})
     if not found:
         return _of(system, s, connect(system, s.q, b, 0.0, 1.0, s.params, **options))
     if eager:
@@ -156,11 +157,15 @@ def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[A
     return jax.tree.map(lambda x: x[-1], (trajectory.q, trajectory.v))
 
 
-def _answers(system, s, end, options, quiet) -> list[Geodesic]:
-    found = connect(system, s.q, end, 0.0, 1.0, s.params, **options, quiet=quiet)
-    if quiet and not bool(found.converged):
-        return []
-    return [_of(system, s, answer) for answer in (found, *found.others)]
+def _different(found: list[Geodesic], system, s, ends, options) -> list[Geodesic]:
+    """The answers that are there, and those to these ends that are others."""
+    quiet = bool(found) or len(ends) > 1
+    for end in ends:
+        first = connect(system, s.q, end, 0.0, 1.0, s.params, **options, quiet=quiet)
+        if not quiet or bool(first.converged):
+            answers = [_of(system, s, answer) for answer in (first, *first.others)]
+            found = [*found, *(x for x in answers if not any(_same(x, other) for other in found))]
+    return found
 
 
 def _of(system, s, connection: Connection) -> Geodesic:

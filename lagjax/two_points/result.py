@@ -11,6 +11,9 @@ from lagjax.integrate import Trajectory
 # Ends count as conjugate where an error of the path, but at least this round-off, decides what the start velocity is.
 ROUND_OFF = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-5}
 
+# A path that no motion confirms says nothing where its elements follow it less well than this.
+UNRESOLVED = 1e-6
+
 
 class Connection(eqx.Module):
     """A motion between two ends; the answer of least action, where several were found.
@@ -51,11 +54,13 @@ class Connection(eqx.Module):
 
     @property
     def kind(self) -> str:
-        """ "minimum", "saddle of index 1", "degenerate: ends are conjugate", or "not variational: ..."."""
+        """ "minimum", "saddle of index 1", "degenerate: ends are conjugate", "not found", or why none."""
         if self.why_not_variational:
             return f"not variational: {self.why_not_variational}"
         if not bool(self.converged):
             return "not found"
+        if self.trajectory is None and float(self.mesh_error) > UNRESOLVED:
+            return f"not resolved: the elements follow the path to {float(self.mesh_error):.0e}"
         round_off = ROUND_OFF[np.asarray(self.amplification).dtype]
         if float(self.amplification) * max(float(self.mesh_error), round_off) > 0.1:
             return "degenerate: ends are conjugate"

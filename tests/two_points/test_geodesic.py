@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.scenes import sphere_geodesic as sphere
@@ -52,6 +53,55 @@ def test_sphere_in_a_chart():
     assert abs(longer.conjugate_lengths[0] - np.pi * R) < 1e-9
     one_way = lj.geodesic(in_chart, a, b | {"theta": theta_b - 2 * np.pi}, sphere.PARAMS, outputs=2)
     assert one_way.others == ()
+
+
+@pytest.mark.slow
+def test_equator_of_a_torus():
+    """The outer equator is conjugate after π √(r (R + r)); beyond, one off it is shorter. Twin: before, it is not."""
+
+    def torus(q, v, params):
+        return (params["R"] + params["r"] * jnp.cos(q[1])) ** 2 * v[0] ** 2 + params["r"] ** 2 * v[1] ** 2
+
+    params, out = {"R": 2.0, "r": 0.7}, 2.7
+    conjugate = np.pi * np.sqrt(0.7 * out)
+    near = lj.geodesic(torus, np.zeros(2), np.array([0.99 * conjugate / out, 0.0]), params, outputs=2)
+    assert near.kind == "minimum" and abs(near.length - 0.99 * conjugate) < 1e-12 and near.others == ()
+    far = lj.geodesic(torus, np.zeros(2), np.array([1.5 * conjugate / out, 0.0]), params, outputs=2)
+    assert far.kind == "minimum" and far.length < 1.5 * conjugate - 0.1
+    along = far.others[-1]
+    assert along.kind == "saddle of index 1" and abs(along.length - 1.5 * conjugate) < 1e-12
+    assert abs(along.conjugate_lengths[0] - conjugate) < 1e-9
+
+
+@pytest.mark.slow
+def test_triaxial_ellipsoid():
+    """Pairs of points: by SciPy, from the start direction over the length, the end is met. Twin: from another one."""
+    axes, random = np.array([1.0, 0.8, 0.6]), np.random.default_rng(0)
+    surface = lj.System(
+        lambda t, q, v, params: 0.5 * v @ v,
+        {"ellipsoid": lj.Holonomic(lambda t, q, axes: jnp.sum((q / axes) ** 2) - 1)},
+    )
+
+    def rates(s, y):
+        normal = y[:3] / axes**2
+        return np.concatenate([y[3:], -normal * np.sum((y[3:] / axes) ** 2) / np.sum(normal**2)])
+
+    def end(a, direction, length):
+        return solve_ivp(rates, (0, length), [*a, *direction], method="DOP853", rtol=1e-13, atol=1e-14).y[:3, -1]
+
+    for _ in range(4):
+        a, b = (x / np.linalg.norm(x / axes) for x in random.normal(size=(2, 3)))
+        found = lj.geodesic(surface, a, b, axes, outputs=2)
+        length, direction = float(found.length), np.asarray(found.start_direction)
+        assert np.max(np.abs(end(a, direction, length) - b)) < 1e-12 and found.kind == "minimum"
+        assert np.max(np.abs(end(a, direction, length + 1e-6) - b)) > 1e-7
+
+
+@pytest.mark.slow
+def test_antipodal_points():
+    """A family of shortest paths: said, with their length."""
+    found = lj.geodesic(sphere.embedded, np.array([R, 0.0, 0.0]), np.array([-R, 0.0, 0.0]), sphere.PARAMS, outputs=2)
+    assert abs(found.length - np.pi * R) < 1e-12 and found.kind == "degenerate: ends are conjugate"
 
 
 def test_coincident_points():
