@@ -31,7 +31,7 @@ from lagjax.system import (
 )
 from lagjax.two_points import elements, index, path, path_mesh, shoot
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, Found
+from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath
 from lagjax.two_points.result import Connection
 
 DEGREE, ELEMENTS, MOST_ELEMENTS = 6, 16, 128
@@ -319,10 +319,10 @@ def _straight(model: Model, ends: Ends, guess, count: int):
 # -- One answer. --
 
 
-class Solved(NamedTuple):
+class SolvedPath(NamedTuple):
     """A path with what is known of it."""
 
-    found: Found
+    found: FoundPath
     part: Array
     attempts: Array
     index: Array
@@ -334,7 +334,7 @@ class Solved(NamedTuple):
 
 
 @compiled
-def _solved(model: Model, ends: Ends, x: Array, parts: Array) -> Solved:
+def _solved(model: Model, ends: Ends, x: Array, parts: Array) -> SolvedPath:
     start = path_mesh.path_through(model, ends, x, parts)
     last = path_mesh.found_path(model, ends, start)
     found = last.found
@@ -343,13 +343,13 @@ def _solved(model: Model, ends: Ends, x: Array, parts: Array) -> Solved:
     response = shoot.response_of(model, ends, found)
     scale = path.extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
-    return Solved(
+    return SolvedPath(
         found, last.part, last.attempts, at_nodes, path_mesh.errors(ends, found.path), _action(model, ends, found),
         jnp.max(sizes), shoot.start_of(model, ends, found), response,
     )  # fmt: skip
 
 
-def _action(model: Model, ends: Ends, found: Found) -> Array:
+def _action(model: Model, ends: Ends, found: FoundPath) -> Array:
     """S of the path, whose inner nodes are held: the path is stationary, so S has its right first derivatives."""
     still = lax.stop_gradient(found.path)
     n, rule = model.n, rule_of_degree(still.y.shape[1])
@@ -409,7 +409,7 @@ def _halved(of: path.Path, ends: Ends):
 
 
 @compiled
-def _states(model: Model, ends: Ends, found: Found, aim: shoot.Aim, t: Array):
+def _states(model: Model, ends: Ends, found: FoundPath, aim: shoot.Aim, t: Array):
     """Positions, velocities and multipliers of a path."""
     y, u = path_mesh.states(ends, found.path, t)
     split = jax.vmap(model.split)(y[:, model.n :]) if model.m else {}
@@ -417,7 +417,7 @@ def _states(model: Model, ends: Ends, found: Found, aim: shoot.Aim, t: Array):
 
 
 def _connection(
-    model: Model, ends: Ends, solved: Solved, shot: shoot.Shot | None, outputs: int, words: str = "", rtol=None
+    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | None, outputs: int, words: str = "", rtol=None
 ) -> Connection:
     aim = solved.aim if shot is None else shot.aim
     trajectory = None

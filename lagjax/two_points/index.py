@@ -19,13 +19,13 @@ from lagjax.jaxtools import compiled
 from lagjax.numerics import lapack
 from lagjax.system import Model
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import Ends, Found, Path, momentum_matrix
+from lagjax.two_points.path import Ends, FoundPath, Path, momentum_matrix
 from lagjax.two_points.path_mesh import states
 
 BISECTIONS = 52
 
 
-def index_at_nodes(model: Model, found: Found) -> Int[Array, " K"]:
+def index_at_nodes(model: Model, found: FoundPath) -> Int[Array, " K"]:
     """The index of the path up to the end of each element, that end fixed."""
     count, s, size = found.path.y.shape
     m, inner = size - model.n, (s - 1) * size
@@ -36,7 +36,7 @@ def index_at_nodes(model: Model, found: Found) -> Int[Array, " K"]:
     return before + cut
 
 
-def index_of_free_end(model: Model, found: Found) -> Int[Array, ""]:
+def index_of_free_end(model: Model, found: FoundPath) -> Int[Array, ""]:
     """The index of a path whose end is free altogether."""
     s, m = found.path.y.shape[1], found.path.y.shape[2] - model.n
     return jnp.sum(jax.vmap(_negative)(found.deltas) - s * m)
@@ -52,7 +52,7 @@ def _eigenvalues(matrix: Array):
     return jnp.linalg.eigvalsh(jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0))
 
 
-def conjugate_times(model: Model, ends: Ends, found: Found, index: np.ndarray) -> Float[np.ndarray, " c"]:
+def conjugate_times(model: Model, ends: Ends, found: FoundPath, index: np.ndarray) -> Float[np.ndarray, " c"]:
     """The times of the points conjugate to the start, each as often as its multiplicity; the end itself left out."""
     times, before = [], 0
     for element, after in enumerate(index):
@@ -61,7 +61,7 @@ def conjugate_times(model: Model, ends: Ends, found: Found, index: np.ndarray) -
     return np.array(times, np.asarray(ends.t_a).dtype)
 
 
-def _bisected(model: Model, ends: Ends, found: Found, element: int, wanted: int) -> float:
+def _bisected(model: Model, ends: Ends, found: FoundPath, element: int, wanted: int) -> float:
     """The time inside an element at which the index reaches a number."""
     s, size = found.path.y.shape[1:]
     deltas, m = np.asarray(found.deltas), size - model.n

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
-class Solved(NamedTuple):
+class SolverAnswer(NamedTuple):
     """A solution x, its cost, the equations' values and multipliers, and the solver's status and iterations."""
 
     x: np.ndarray
@@ -88,7 +88,7 @@ class NonlinearProgram:
         limits: tuple[np.ndarray, np.ndarray],
         of_rows: tuple[np.ndarray, np.ndarray],
         options: dict,
-    ) -> Solved:
+    ) -> SolverAnswer:
         """Ipopt's solution from the guess `x`, between these limits of x and of g."""
         casadi = import_casadi()
         functions = _functions(casadi, self)
@@ -103,7 +103,7 @@ class NonlinearProgram:
         found = solver(x0=x, lbx=limits[0], ubx=limits[1], lbg=of_rows[0], ubg=of_rows[1])
         stats = solver.stats()
         at = np.asarray(found["x"]).ravel()
-        return Solved(
+        return SolverAnswer(
             at, float(found["f"]), np.asarray(found["g"]).ravel(), stats["return_status"], int(stats["iter_count"])
         )
 

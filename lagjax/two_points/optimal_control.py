@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from lagjax.system import System, coordinates
 from lagjax.two_points.layout import Layout
 from lagjax.two_points.mesh import Mesh, jumps_of, moved
-from lagjax.two_points.nonlinear_program import NonlinearProgram, Solved, import_casadi
+from lagjax.two_points.nonlinear_program import NonlinearProgram, SolverAnswer, import_casadi
 from lagjax.two_points.question import Question, asked
 from lagjax.two_points.steering import Motion, Steering, compile_ahead, failure_in_words, is_found, steering_of
 
@@ -120,7 +120,7 @@ def steer(
 
 def _searched(
     question: Question, mesh: Mesh, guess: Callable | None, most: int, tol: float
-) -> tuple[Layout, Solved, float, int]:
+) -> tuple[Layout, SolverAnswer, float, int]:
     """The solution on the last mesh, by how much the cost changed from the mesh before, and all iterations."""
     layout = Layout(question.plant, mesh.count)
     solved = _solve(question, layout, mesh, _first(question, layout, mesh, guess), {})
@@ -202,7 +202,7 @@ def _limits_of_rows(question: Question, layout: Layout) -> tuple[np.ndarray, np.
     return low, high
 
 
-def _solve(question: Question, layout: Layout, mesh: Mesh, x: np.ndarray, options: dict) -> Solved:
+def _solve(question: Question, layout: Layout, mesh: Mesh, x: np.ndarray, options: dict) -> SolverAnswer:
     limits, of_rows = _limits_of(question, layout, mesh), _limits_of_rows(question, layout)
     unknowns, equations = int(np.sum(limits[0] < limits[1])), int(np.sum(of_rows[0] == of_rows[1]))
     if equations > unknowns:

@@ -93,7 +93,7 @@ class Path(NamedTuple):
         return ends.t_a + duration * self.parts[:-1], duration * jnp.diff(self.parts)
 
 
-class Equations(NamedTuple):
+class PathEquations(NamedTuple):
     """Residuals r and their derivatives at a path, by groups; `before` is L, `after` is U of the docstring above."""
 
     r: Float[Array, "K sN"]
@@ -167,7 +167,7 @@ def end_rows(model: Model, ends: Ends, t_b: Array, x: Array, u: Array, multiplie
     return jnp.concatenate([at_node, of_multipliers, *border])
 
 
-def equations(model: Model, ends: Ends, path: Path) -> Equations:
+def equations(model: Model, ends: Ends, path: Path) -> PathEquations:
     """The equations of a path and their derivatives."""
     count, s, size = path.y.shape
     rule, n = rule_of_degree(s), model.n
@@ -203,7 +203,7 @@ def equations(model: Model, ends: Ends, path: Path) -> Equations:
         before = before.at[-1, -1].set(keep * before[-1, -1] + by_nodes[:size, 0])
     columns = columns.at[-1, -1].set(keep * columns[-1, -1] + by_border[:size])
     flat = s * size
-    return Equations(
+    return PathEquations(
         total.reshape(count, flat), at_end[size:], diagonal.reshape(count, flat, flat),
         before.reshape(count - 1, flat, size), after.reshape(count - 1, size, flat),
         columns.reshape(count, flat, path.border.size), by_nodes[size:], by_border[size:],
@@ -233,7 +233,7 @@ class Pivots(NamedTuple):
     inverses: Float[Array, "K sN sN"]
 
 
-def eliminated(found: Equations) -> Pivots:
+def eliminated(found: PathEquations) -> Pivots:
     """The block elimination from the start to the end."""
     size = found.diagonal.shape[1] if found.before.shape[0] == 0 else found.before.shape[2]
 
@@ -258,7 +258,7 @@ class Solved(NamedTuple):
     border: Float[Array, "b c"]
 
 
-def solve(found: Equations, inverses: Float[Array, "K sN sN"], r: Float[Array, "K sN"], of_border: Array) -> Solved:
+def solve(found: PathEquations, inverses: Float[Array, "K sN sN"], r: Float[Array, "K sN"], of_border: Array) -> Solved:
     """The step for residuals r, in the first column, and the response to a unit of each equation of the end."""
     size, b = found.before.shape[2], found.corner.shape[0]
     count, flat = r.shape
@@ -290,7 +290,7 @@ def solve(found: Equations, inverses: Float[Array, "K sN sN"], r: Float[Array, "
     return Solved(own - columns @ border, border)
 
 
-class Found(NamedTuple):
+class FoundPath(NamedTuple):
     """A path after Newton's method.
 
     - `size`: the largest entry of the last step in units of the path's extent; `small`: what counts as zero, 1e-7 or
@@ -329,7 +329,7 @@ def extent(ends: Ends, path: Path) -> Float[Array, " n"]:
     return jnp.where(moved > floor, moved, jnp.maximum(jnp.max(jnp.abs(x), axis=0), 1.0))
 
 
-def newton(model: Model, ends: Ends, start: Path) -> Found:
+def newton(model: Model, ends: Ends, start: Path) -> FoundPath:
     """Newton's method, shortened where steps do not shrink."""
     n, scale = ends.x_a.size, extent(ends, start)
     eps = float(jnp.finfo(scale.dtype).eps)
@@ -377,13 +377,13 @@ def newton(model: Model, ends: Ends, start: Path) -> Found:
     ended = lax.while_loop(lambda search: search.going, iterate, search)
     response = jax.tree.map(lambda x: x[..., 1:], ended.solved)
     zero_below = jnp.maximum(CONVERGED, 1e3 * amplified(ended.solved))
-    return Found(ended.path, ended.size, zero_below, ended.iterations, ended.deltas, response)
+    return FoundPath(ended.path, ended.size, zero_below, ended.iterations, ended.deltas, response)
 
 
-def unfound(start: Path) -> Found:
+def unfound(start: Path) -> FoundPath:
     """What is known before Newton's method."""
     count, s, size = start.y.shape
     b, dtype, infinite = start.border.size, start.y.dtype, jnp.full((), jnp.inf, start.y.dtype)
     response = Solved(jnp.zeros((count, s * size, size + b), dtype), jnp.zeros((b, size + b), dtype))
     deltas = jnp.zeros((count, s * size, s * size), dtype)
-    return Found(start, infinite, 0 * infinite + CONVERGED, jnp.zeros((), int), deltas, response)
+    return FoundPath(start, infinite, 0 * infinite + CONVERGED, jnp.zeros((), int), deltas, response)

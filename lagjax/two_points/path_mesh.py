@@ -20,7 +20,7 @@ from lagjax.jaxtools import once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import NATURAL, Ends, Found, Path, extent, newton, unfound
+from lagjax.two_points.path import NATURAL, Ends, FoundPath, Path, extent, newton, unfound
 
 # An element is at most so many times longer than the mean would have it.
 EVEN = 0.2
@@ -127,7 +127,7 @@ def path_through(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Floa
 class Attempt(NamedTuple):
     """The last path that converged, for a part of the ends' distance and time; and the next part to try."""
 
-    found: Found
+    found: FoundPath
     part: Float[Array, ""]
     step: Float[Array, ""]
     rounds: Int[Array, ""]

@@ -23,7 +23,7 @@ from lagjax.jaxtools import compiled, numpy_of, stop_gradient
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import NATURAL, Ends, Found, end_rows
+from lagjax.two_points.path import NATURAL, Ends, FoundPath, end_rows
 
 # Corrections at most, from Python and inside a program; and how much each has to shrink.
 SHOTS, SHOTS_INSIDE = 8, 1
@@ -52,7 +52,7 @@ def tangent(model: Model, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
     return u - rows.T @ (dense.inverse(rows @ rows.T) @ constraints.velocity_residual(model, t, x, u))
 
 
-def start_of(model: Model, ends: Ends, found: Found) -> Aim:
+def start_of(model: Model, ends: Ends, found: FoundPath) -> Aim:
     """The unknowns as the path has them."""
     n, s = model.n, found.path.y.shape[1]
     row = jnp.asarray(rule_of_degree(s).node_derivative[0], ends.x_a.dtype)
@@ -61,7 +61,7 @@ def start_of(model: Model, ends: Ends, found: Found) -> Aim:
     return Aim(tangent(model, ends.t_a, ends.x_a, u), found.path.border)
 
 
-def response_of(model: Model, ends: Ends, found: Found) -> Float[Array, "n+b N+b"]:
+def response_of(model: Model, ends: Ends, found: FoundPath) -> Float[Array, "n+b N+b"]:
     """W: what a unit of each equation of the end changes in (v_a, ν, T)."""
     s, size = found.path.y.shape[1:]
     row = jnp.asarray(rule_of_degree(s).node_derivative[0, 1:], ends.x_a.dtype)

@@ -14,7 +14,7 @@ from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import has_jumps
 from lagjax.system import System, Traced, coordinates
 from lagjax.two_points.layout import Layout
-from lagjax.two_points.nonlinear_program import Solved
+from lagjax.two_points.nonlinear_program import SolverAnswer
 from lagjax.two_points.plan import Plan, Planned, following, plan_of
 from lagjax.two_points.question import Question
 
@@ -126,7 +126,7 @@ class Motion(NamedTuple):
 
 
 def steering_of(
-    question: Question, layout: Layout, solved: Solved, motion: Motion, change: float, iterations: int
+    question: Question, layout: Layout, solved: SolverAnswer, motion: Motion, change: float, iterations: int
 ) -> Steering:
     """The integrated motion under the controls that were found, beside what was asked."""
     plant, at = question.plant, layout.places
@@ -210,12 +210,12 @@ def _columns(tree: PyTree) -> dict[str, np.ndarray]:
     return dict(zip(names, np.concatenate([np.reshape(x, (len(x), -1)).T for x in jtu.tree_leaves(tree)])))
 
 
-def is_found(solved: Solved) -> bool:
+def is_found(solved: SolverAnswer) -> bool:
     """Whether the solver found a solution."""
     return solved.status in FOUND
 
 
-def failure_in_words(question: Question, layout: Layout, solved: Solved, of_rows: tuple) -> str:
+def failure_in_words(question: Question, layout: Layout, solved: SolverAnswer, of_rows: tuple) -> str:
     """Why there is no solution, and the condition that is violated most."""
     text = f"lj.steer: {STATUS.get(solved.status, solved.status)}, after {solved.iterations} iterations.\n"
     low, high = of_rows
