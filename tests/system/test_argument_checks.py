@@ -31,7 +31,7 @@ DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "step": (lambda system: lj.step(system, 0.0, 1.0, 0.0, PARAMS, 0.1), False),
     "rollout": (lambda system: lj.rollout(system, 1.0, 0.0, PARAMS, 10, 0.1), False),
     "connect": (lambda system: lj.connect(system, 1.0, 0.0, 0.0, 1.0, PARAMS), False),
-    "steer": (lambda s: lj.steer(s, {"u": 0.0}, (0.0, 0.0), (1.0, 0.0), lambda t, q, v, u, p: 1.0, PARAMS, t_b=1.0), False),
+    "steer": (lambda s: lj.steer(s, {"u": 0.0}, (0.0, 0.0), (1.0, 0.0), None, PARAMS, t_b=(0.1, 1.0)), False),
     "lqr": (lambda system: lj.lqr(system, {"u": 0.0}, (0.0, 0.0), lambda t, q, v, u, p: q**2, PARAMS), False),
     "poincare": (lambda s: lj.poincare(s, 1.0, 0.0, PARAMS, section=lambda t, q, v, params: q, ts=TS), True),
     "noether_charge": (lambda system: lj.noether_charge(system, TURN), False),
