@@ -67,8 +67,8 @@ def full_products():
 
     By default an accelerator keeps three digits in float32: constraints and small tolerances are then out of reach.
     """
-    chosen: Any = jax.config.jax_default_matmul_precision
-    return nullcontext() if chosen else jax.default_matmul_precision("highest")
+    config: Any = jax.config
+    return nullcontext() if config.jax_default_matmul_precision else jax.default_matmul_precision("highest")
 
 
 def numpy_of(tree: PyTree):

@@ -156,7 +156,7 @@ def shot_inside(model: Model, ends: Ends, aim: Aim, response: Array, rtol) -> Sh
         return corrected(fixed, aim, response, rho), None
 
     aim, _ = lax.scan(once, aim, None, length=SHOTS_INSIDE)
-    aim = stop_gradient(aim)
+    aim, size = stop_gradient(aim), jnp.zeros((), aim.u.dtype)
     # W is that of the path: one correction has derivatives as good as the path, the second one squares their error.
     for _ in range(2):
         rho = missed(model, ends, aim, *last_of(end(model, ends, aim)))
