@@ -98,7 +98,7 @@ def rollout(
         if by_name:
             check_names(s.params, held)
         first = jtu.tree_map(lambda u: jax.ShapeDtypeStruct(u.shape[1:], u.dtype), held)
-        call = Call("with_control", with_control or _by_name, ("params", "u"))
+        call = Call("with_control", with_control or merge_by_name, ("params", "u"))
         # Checked as it is; what it returns besides arrays, as the functions in a network, is the same in all steps.
         traced_call(call, {"params": s.params, "u": first}, _is_anything, "a function of u alone")
         in_step = shape_of(call.function, s.params, first)
@@ -212,7 +212,8 @@ def _arrays_of(function: Callable, params: PyTree, u: PyTree):
     return eqx.filter(function(params, u), is_array)
 
 
-def _by_name(params: PyTree, u: PyTree):
+def merge_by_name(params: PyTree, u: PyTree):
+    """The parameters with the controls among them."""
     return {**(params or {}), **u}
 
 

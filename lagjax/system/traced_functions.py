@@ -73,14 +73,13 @@ class TracedProgram:
         arrays = _arrays(args)
         with full_products():
             closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
+            rules = rules_of(of_arrays, closed, own, arrays)
         self.value, self._structure, self.jaxpr = returned[0], structures[0], closed.jaxpr
         # A user may write to a NumPy array afterwards.
         constants = [np.array(x) if isinstance(x, np.ndarray) else x for x in closed.consts]
         self._fixed = [x if _is_small(x) else None for x in constants]
         self.arrays = (*(x for x in constants if not _is_small(x)), *jtu.tree_leaves(own))
         small = tuple((str(x.dtype), x.shape, np.asarray(x).tobytes()) for x in self._fixed if x is not None)
-        with full_products():
-            rules = rules_of(of_arrays, closed, own, arrays)
         self._meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
 
     def __hash__(self):

@@ -5,6 +5,7 @@ check the ends  ->  a path for each start (`path_mesh.py`)  ->  its motion (`sho
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -136,19 +137,11 @@ def connect(
         )
     if not found:
         solved = _solved(model, stop_gradient(ends), *_straight(model, ends, guesses[0][1], elements))
-        return _with(_connection(model, ends, solved, None, outputs, words), converged=jnp.asarray(False))
+        return replace(_connection(model, ends, solved, None, outputs, words), converged=jnp.asarray(False))
     if not _why_not_variational(model):
         found.sort(key=lambda answer: float(answer.action))
     first = found[0]
-    return _with(first, others=tuple(found[1:]), tried=words)
-
-
-def _with(connection: Connection, **changes) -> Connection:
-    return jax.tree_util.tree_map(lambda x: x, Connection(**{**_fields(connection), **changes}))
-
-
-def _fields(connection: Connection) -> dict:
-    return {name: getattr(connection, name) for name in Connection.__dataclass_fields__}
+    return replace(first, others=tuple(found[1:]), tried=words)
 
 
 # -- The problem: checked arguments. --
@@ -270,7 +263,6 @@ def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
     near = path_mesh.onto_constraints(model, t, x)
     if not is_traced((near, t)):
         off = float(jnp.max(jnp.abs(near - x))) / max(float(jnp.max(jnp.abs(x))), 1e-300)
-        g = constraints.position_residual(model, t, near)
         if not off < OFF:
             worst = model.equation_names[int(np.argmax(np.abs(constraints.position_residual(model, t, x))))]
             raise ValueError(
@@ -278,7 +270,6 @@ def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
                 "Usual cause: an end in rounded numbers, or one out of reach of the mechanism.\n"
                 f"Fix: {name}, _ = lj.consistent_state(system, t, {name}, v, params), v of zeros."
             )
-        del g
     return near
 
 
@@ -402,7 +393,7 @@ def _halved(of: path.Path, ends: Ends):
     s, n = of.y.shape[1], ends.x_a.size
     nodes, parts = np.asarray(of.nodes(ends))[..., :n], np.asarray(of.parts)
     rule = rule_of_degree(s)
-    values, _ = elements.lagrange_values(rule, np.concatenate([rule.nodes[1:] / 2, (1 + rule.nodes[1:]) / 2]))
+    values, _ = elements.lagrange(rule.nodes, np.concatenate([rule.nodes[1:] / 2, (1 + rule.nodes[1:]) / 2]))
     x = np.einsum("pj,kjn->kpn", values, nodes).reshape(-1, s, n)
     middles = (parts[:-1] + parts[1:]) / 2
     return jnp.asarray(x, of.y.dtype), jnp.asarray(np.sort(np.concatenate([parts, middles])), of.y.dtype)

@@ -66,12 +66,12 @@ def rule_of_degree(s: int) -> Rule:
     points, weights = legendre.leggauss(s)
     node_weights = 2 / (s * (s + 1) * legendre.legval(x, last) ** 2)
     nodes, points = (x + 1) / 2, (points + 1) / 2
-    at_points = _lagrange(nodes, points)
-    return Rule(nodes, node_weights / 2, points, weights / 2, *at_points, _lagrange(nodes, nodes)[1])
+    at_points = lagrange(nodes, points)
+    return Rule(nodes, node_weights / 2, points, weights / 2, *at_points, lagrange(nodes, nodes)[1])
 
 
-def _lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The values and derivatives of Lagrange's polynomials on these nodes."""
+def lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrices (k, m) from values at `nodes` (m,) to values and derivatives of their polynomial at `at` (k,)."""
     values, slopes = np.empty((len(at), len(nodes))), np.zeros((len(at), len(nodes)))
     for j, node in enumerate(nodes):
         others = np.delete(nodes, j)
@@ -80,11 +80,6 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray
         for k, other in enumerate(others):
             slopes[:, j] += np.delete(factors, k, axis=1).prod(axis=1) / (node - other)
     return values, slopes
-
-
-def lagrange_values(rule: Rule, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (k, s + 1) from values at the nodes to values and derivatives at places `at` (k,) in [0, 1]."""
-    return _lagrange(rule.nodes, np.asarray(at))
 
 
 class PointStates(NamedTuple):

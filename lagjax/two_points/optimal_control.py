@@ -20,8 +20,6 @@ from lagjax.two_points.steering import Motion, Steering, compile_ahead, failure_
 EXACT = {"tol": 1e-10, "bound_relax_factor": 0.0, "max_iter": 1000}
 # The most jumps of controls that elements are cut at.
 CUTS = 8
-# A motion that ends further from the end than this part of the way is none.
-MISSED = 1e-2
 # From a solution on another mesh, the barrier of Ipopt starts here.
 WARM = {"mu_init": 1e-6}
 

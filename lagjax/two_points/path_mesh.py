@@ -19,7 +19,7 @@ from numpy.polynomial import legendre
 from lagjax.jaxtools import once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
-from lagjax.two_points.elements import rule_of_degree
+from lagjax.two_points.elements import lagrange, rule_of_degree
 from lagjax.two_points.path import NATURAL, Ends, FoundPath, Path, extent, newton, unfound
 
 # An element is at most so many times longer than the mean would have it.
@@ -78,7 +78,7 @@ def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:
 def _continuation(s: int) -> np.ndarray:
     """The weights of all nodes but the first in the polynomial through them, at the first."""
     nodes = rule_of_degree(s).nodes
-    return np.array([np.prod([(nodes[0] - b) / (a - b) for b in nodes[1:] if b != a]) for a in nodes[1:]])
+    return lagrange(nodes[1:], nodes[:1])[0][0]
 
 
 def node_times(ends: Ends, path: Path) -> Float[Array, "K s"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.mechanics import constraint_residual, listed
-from lagjax.steps import check_names, check_read
+from lagjax.steps import check_names, check_read, merge_by_name
 from lagjax.system import (
     OF_STATE,
     Call,
@@ -143,7 +143,7 @@ def controlled(system: System, controls: PyTree, s: State, with_control: Callabl
     """The system checked and traced with its controls among the parameters."""
     if with_control is None:
         check_names(s.params, controls)
-    merge = with_control or by_name
+    merge = with_control or merge_by_name
     controls = jtu.tree_map(lambda x: np.asarray(x, s.t.dtype), controls)
     merged = s._replace(params=coordinates.given_params(merge(s.params, controls), s.t.dtype))
     found = traced_system(system, merged)
@@ -155,11 +155,6 @@ def checked_cost(cost: Callable, given: Controlled) -> Callable:
     """The cost per unit of time, traced."""
     arguments = given.state._asdict() | {"u": given.controls}
     return traced_call(Call("cost", cost, OF_COST), arguments, _check_number)
-
-
-def by_name(params: PyTree, u: PyTree):
-    """The parameters with the controls among them."""
-    return {**(params or {}), **u}
 
 
 def velocity_name(name: str) -> str:

@@ -29,7 +29,7 @@ from lagjax.two_points.elements import (
     at_points,
     constraint_impulse,
     force_and_momentum,
-    lagrange_values,
+    lagrange,
     rule_of_degree,
     velocity_constraints,
     virtual_work,
@@ -97,7 +97,7 @@ class Plant(eqx.Module):
 
 def through(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """From values at `nodes` (m,) to those of their polynomial at `at` (k,), (k, m)."""
-    return lagrange_values(rule_of_degree(1)._replace(nodes=nodes), at)[0]
+    return lagrange(nodes, at)[0]
 
 
 class Element(NamedTuple):
