@@ -122,7 +122,7 @@ lagjax.fit.uncertainty.candidates
   Candidate: name t times sd alone sigma rows known direction least
 lagjax.fit.problem.parameters
   Leaf: number places
-  FreeNumbers: params start low high mean sd names leaves
+  FreeNumbers: params start low high mean sd names leaves weak
 lagjax.fit.problem.records
   Windows: ts real sample last seam record
   Record: t measured q0 v0 hold_q hold_v params sigma
