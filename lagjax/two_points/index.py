@@ -23,6 +23,8 @@ from lagjax.two_points.path import Ends, FoundPath, Path, momentum_matrix
 from lagjax.two_points.path_mesh import states
 
 BISECTIONS = 52
+# Scalings of rows and columns; each brings their largest entries nearer to one, by a square root (Ruiz).
+SCALINGS = 4
 
 
 def index_at_nodes(model: Model, found: FoundPath) -> Int[Array, " K"]:
@@ -43,7 +45,18 @@ def index_of_free_end(model: Model, found: FoundPath) -> Int[Array, ""]:
 
 
 def _negative(matrix: Array) -> Array:
-    return jnp.sum(_eigenvalues((matrix + matrix.T) / 2) < 0)
+    return jnp.sum(_eigenvalues(_evened(matrix, jnp)) < 0)
+
+
+def _evened(matrix, xp=np):
+    """The symmetric part, with rows and columns scaled alike until their largest entries are one: the signs of its
+    eigenvalues are the same (Sylvester), and those of constraints, in other units, are no longer round-off."""
+    matrix = (matrix + matrix.T) / 2
+    for _ in range(SCALINGS):
+        scale = xp.sqrt(xp.max(xp.abs(matrix), axis=0))
+        scale = xp.where(scale > 0, scale, 1.0)
+        matrix = matrix / scale[:, None] / scale[None]
+    return matrix
 
 
 @lapack.one_by_one
@@ -65,7 +78,7 @@ def _bisected(model: Model, ends: Ends, found: FoundPath, element: int, wanted: 
     """The time inside an element at which the index reaches a number."""
     s, size = found.path.y.shape[1:]
     deltas, m = np.asarray(found.deltas), size - model.n
-    earlier = sum(int(np.sum(np.linalg.eigvalsh((d + d.T) / 2) < 0)) - s * m for d in deltas[: max(element - 1, 0)])
+    earlier = sum(int(np.sum(np.linalg.eigvalsh(_evened(d)) < 0)) - s * m for d in deltas[: max(element - 1, 0)])
     t, h = (float(x[element]) for x in found.path.times(ends))
 
     def index(part: float) -> int:
@@ -81,7 +94,7 @@ def _bisected(model: Model, ends: Ends, found: FoundPath, element: int, wanted: 
             rows = (2 * s - 1) * m
         else:
             matrix, rows = cut[size:-size, size:-size], (s - 1) * m
-        return earlier + int(np.sum(np.linalg.eigvalsh((matrix + matrix.T) / 2) < 0)) - rows
+        return earlier + int(np.sum(np.linalg.eigvalsh(_evened(matrix)) < 0)) - rows
 
     low, high = 0.0, 1.0
     for _ in range(BISECTIONS):
