@@ -14,6 +14,7 @@ from tests.mechanisms import published
 
 
 def flat(tree):
+    """All numbers of a state, in a row."""
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
 
 
@@ -126,9 +127,8 @@ def multipliers_at(angle, rate, g):
 
 @pytest.mark.exhaustive
 def test_four_bar_linkage():
-    """The start velocity is that of the energy whose motion takes the time, by quadrature, and the multipliers are those
-    of M a = F + Aᵀ λ, all to 1e-10.
-    Twin: without gravity it is another."""
+    """The start velocity is that of the energy whose motion takes the time, by quadrature, and the multipliers are
+    those of M a = F + Aᵀ λ, all to 1e-10. Twin: without gravity it is another."""
     angles, time, g = (0.5, 2.3), 0.4, 9.81
     a, b = ({"b": x[:2], "c": x[2:]} for x in map(at_angle, angles))
     found = lj.connect(linkage, a, b, 0.0, time, {"g": g}, outputs=9)
