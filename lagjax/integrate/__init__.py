@@ -5,6 +5,7 @@ from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning, crossings_of, traced_guard
+from lagjax.integrate.in_turn import in_turn
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.jumps.find import found
 from lagjax.integrate.load import check_is_system, described_system, load_trajectory, same_system, trajectory_from

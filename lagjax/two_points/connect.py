@@ -1,21 +1,19 @@
 """`connect`: the motions from one configuration to another.
 
-check the ends  ->  a path for each start (`path_mesh.py`)  ->  its motion (`shoot.py`)  ->  sort, say what was found
+check the ends  ->  starts (`starts.py`)  ->  an answer from each (`answer.py`)  ->  sort, say what was found
 """
 
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
+from lagjax.jaxtools import is_eager, is_traced
 from lagjax.mechanics import describe, listed
 from lagjax.system import (
     OF_STATE,
@@ -30,22 +28,17 @@ from lagjax.system import (
     model_of,
     traced_call,
 )
-from lagjax.two_points import elements, index, path, path_mesh, shoot
-from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath
+from lagjax.two_points import path_mesh
+from lagjax.two_points.answer import answer_from, inside, is_same, not_found, why_not_variational
+from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
+from lagjax.two_points.starts import guesses_of
 
-DEGREE, ELEMENTS, MOST_ELEMENTS = 6, 16, 128
-# Elements are doubled until the highest coefficients on them are below this.
-FINE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
-# An answer with larger ones is none.
-COARSE = 0.05
+ELEMENTS = 8
 # Ends may be off the constraints by this part of their size.
 OFF = 1e-6
-# Answers whose start velocities and times differ by less, relative, are the same.
-SAME = 1e-6
-# Random waves on a straight start, in units of its length; and starts that follow where it leads nowhere.
-WAVES, AMPLITUDES, FURTHER = 3, (1.0, 0.5, 0.25), 3
+# Starts that follow where the straight line leads nowhere.
+FURTHER = 3
 TOLERANCE = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
@@ -110,19 +103,20 @@ def connect(
     model, ends = _problem(system, q_a, q_b, t_a, t_b, params, end, free_time)
     dtype = np.dtype(ends.x_a.dtype)
     rtol = TOLERANCE.get(dtype, 1e-5) if rtol is None else rtol
-    guesses = _guesses(model, starts)
     if not is_eager() or is_traced((model, ends)):
-        return _inside(model, ends, guesses[0], elements, outputs, rtol)
-    found, tried, wanted = [], [], len(guesses)
+        return inside(model, ends, guesses_of(model, starts)[0], elements, outputs, rtol)
+    found, tried, first = [], [], None
+    guesses, wanted = guesses_of(model, starts), None
     if starts == 1:
         # A straight line may lead through a singular point, as the centre of a sphere.
-        guesses = _guesses(model, 1 + FURTHER)
-    for i, (name, guess) in enumerate(guesses):
-        if i >= wanted and found:
+        guesses, wanted = guesses_of(model, 1 + FURTHER), 1
+    for guess in guesses:
+        if found and len(tried) == wanted:
             break
-        answer, why = _answer(model, ends, guess, elements, outputs, rtol)
-        tried.append(f"{name}: {why}")
-        if answer is not None and not any(_same(answer, other) for other in found):
+        solved, answer, why = answer_from(model, ends, guess, elements, outputs, rtol)
+        first = solved if first is None else first
+        tried.append(f"{guess.name}: {why}")
+        if answer is not None and not any(is_same(answer, other) for other in found):
             found.append(answer)
     words = "; ".join(tried)
     if not found and not quiet:
@@ -136,12 +130,10 @@ def connect(
             stacklevel=2,
         )
     if not found:
-        solved = _solved(model, stop_gradient(ends), *_straight(model, ends, guesses[0][1], elements))
-        return replace(_connection(model, ends, solved, None, outputs, words), converged=jnp.asarray(False))
-    if not _why_not_variational(model):
+        return not_found(model, ends, first, outputs, words)
+    if not why_not_variational(model):
         found.sort(key=lambda answer: float(answer.action))
-    first = found[0]
-    return replace(first, others=tuple(found[1:]), tried=words)
+    return replace(found[0], others=tuple(found[1:]), tried=words)
 
 
 # -- The problem: checked arguments. --
@@ -271,183 +263,3 @@ def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
                 f"Fix: {name}, _ = lj.consistent_state(system, t, {name}, v, params), v of zeros."
             )
     return near
-
-
-# -- Starts. --
-
-
-def _guesses(model: Model, starts) -> list[tuple[str, Any]]:
-    """Each start by name: a function of the part of the way, the times and the ends."""
-    if callable(starts):
-        return [("the given path", starts)]
-    if not isinstance(starts, int):
-        return [(f"given path {i + 1}", start) for i, start in enumerate(starts)]
-    if starts < 1:
-        raise ValueError(f"starts={starts}: there must be one at least.\nFix: starts=1, the straight line.")
-    random = np.random.default_rng(0)
-    falling = 1 / np.arange(1, WAVES + 1)[:, None]
-    waves = [AMPLITUDES[i % 3] * falling * random.normal(size=(WAVES, model.n)) for i in range(starts - 1)]
-    return [("straight line", None), *((f"random start {i + 1}", wave) for i, wave in enumerate(waves))]
-
-
-def _straight(model: Model, ends: Ends, guess, count: int):
-    """The nodes (K, s, n) of a start, and where its elements meet."""
-    parts = jnp.linspace(0.0, 1.0, count + 1, dtype=ends.x_a.dtype)
-    nodes = rule_of_degree(DEGREE).nodes[1:].astype(ends.x_a.dtype)
-    at = parts[:-1, None] + jnp.diff(parts)[:, None] * nodes[None]
-    if callable(guess):
-        t = ends.t_a + ends.duration * at
-        return jax.vmap(jax.vmap(lambda t: model.vector(coordinates.as_floats(guess(t)))))(t), parts
-    x = ends.x_a[None, None] + at[..., None] * (ends.x_b - ends.x_a)[None, None]
-    if guess is None:
-        return x, parts
-    size = jnp.max(jnp.abs(ends.x_b - ends.x_a))
-    size = jnp.where(size > 0, size, jnp.maximum(jnp.max(jnp.abs(ends.x_a)), 1.0))
-    shape = jnp.sin(jnp.pi * at[..., None] * np.arange(1, WAVES + 1, dtype=x.dtype)[None, None])
-    return x + size * jnp.einsum("ksw,wn->ksn", shape, jnp.asarray(guess, x.dtype)), parts
-
-
-# -- One answer. --
-
-
-class SolvedPath(NamedTuple):
-    """A path with what is known of it."""
-
-    found: FoundPath
-    part: Array
-    attempts: Array
-    index: Array
-    errors: Array
-    action: Array
-    amplification: Array
-    aim: shoot.Aim
-    response: Array
-
-
-@compiled
-def _solved(model: Model, ends: Ends, x: Array, parts: Array) -> SolvedPath:
-    start = path_mesh.path_through(model, ends, x, parts)
-    last = path_mesh.found_path(model, ends, start)
-    found = last.found
-    at_nodes = index.index_at_nodes(model, found)
-    at_nodes = at_nodes.at[-1].set(index.index_of_free_end(model, found)) if ends.kind == NATURAL else at_nodes
-    response = shoot.response_of(model, ends, found)
-    scale = path.extent(ends, found.path)
-    sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
-    return SolvedPath(
-        found, last.part, last.attempts, at_nodes, path_mesh.errors(ends, found.path), _action(model, ends, found),
-        jnp.max(sizes), shoot.start_of(model, ends, found), response,
-    )  # fmt: skip
-
-
-def _action(model: Model, ends: Ends, found: FoundPath) -> Array:
-    """S of the path, whose inner nodes are held: the path is stationary, so S has its right first derivatives."""
-    still = lax.stop_gradient(found.path)
-    n, rule = model.n, rule_of_degree(still.y.shape[1])
-    if ends.kind == FIXED:
-        still = still._replace(y=still.y.at[-1, -1, :n].set(ends.x_b))
-    nodes, (t, h) = still.nodes(ends), still.times(ends)
-
-    def of_element(t: Array, h: Array, nodes: Array) -> Array:
-        s = elements.discrete_action(model, rule, t, h, nodes[:, :n])
-        if nodes.shape[1] == n:
-            return s
-        times = t + h * rule.nodes.astype(nodes.dtype)
-        g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times, nodes[:, :n])
-        return s + h * jnp.sum(rule.node_weights.astype(nodes.dtype)[:, None] * g * nodes[:, n:])
-
-    return jnp.sum(jax.vmap(of_element)(t, h, nodes))
-
-
-def _why_not_variational(model: Model) -> str:
-    of = [name for name in ("force", "dissipation") if getattr(model.system, name) is not None]
-    return f"there is a {' and a '.join(of)}" if of else ""
-
-
-def _answer(model: Model, ends: Ends, guess, count: int, outputs: int, rtol) -> tuple[Connection | None, str]:
-    """The answer from one start, or None, and what became of it in words."""
-    x, parts = _straight(model, ends, guess, count)
-    fine, before = FINE.get(np.dtype(x.dtype), 1e-3), np.inf
-    while True:
-        solved = _solved(model, ends, x, parts)
-        error = float(jnp.max(solved.errors))
-        # Where twice as many elements are hardly better, the path has a corner: no more of them help.
-        if float(solved.part) < 1 or error <= fine or 2 * len(x) > MOST_ELEMENTS or error > before / 2:
-            break
-        before = error
-        x, parts = _halved(solved.found.path, ends)
-    if float(solved.part) < 1 and len(x) == count:
-        return None, f"Newton's method failed beyond {float(solved.part):.2g} of the way"
-    error = error if float(solved.part) >= 1 else np.inf
-    if not error < COARSE:
-        return None, f"{len(x)} elements do not follow the path"
-    at_nodes = np.asarray(solved.index)
-    if not _why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
-        return None, "a path through a singular point"
-    shot = shoot.shot(model, ends, solved.aim, solved.response, outputs, rtol)
-    return _connection(model, ends, solved, shot, outputs, rtol=rtol), "found"
-
-
-def _halved(of: path.Path, ends: Ends):
-    """The nodes on elements of half the length."""
-    s, n = of.y.shape[1], ends.x_a.size
-    nodes, parts = np.asarray(of.nodes(ends))[..., :n], np.asarray(of.parts)
-    rule = rule_of_degree(s)
-    values, _ = elements.lagrange(rule.nodes, np.concatenate([rule.nodes[1:] / 2, (1 + rule.nodes[1:]) / 2]))
-    x = np.einsum("pj,kjn->kpn", values, nodes).reshape(-1, s, n)
-    middles = (parts[:-1] + parts[1:]) / 2
-    return jnp.asarray(x, of.y.dtype), jnp.asarray(np.sort(np.concatenate([parts, middles])), of.y.dtype)
-
-
-@compiled
-def _states(model: Model, ends: Ends, found: FoundPath, aim: shoot.Aim, t: Array):
-    """Positions, velocities and multipliers of a path."""
-    y, u = path_mesh.states(ends, found.path, t)
-    split = jax.vmap(model.split)(y[:, model.n :]) if model.m else {}
-    return model.tree(y[:, : model.n]), model.tree(u), split
-
-
-def _connection(
-    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | None, outputs: int, words: str = "", rtol=None
-) -> Connection:
-    aim = solved.aim if shot is None else shot.aim
-    trajectory = None
-    if shot is not None:
-        trajectory = shoot.motion(model, ends, aim, outputs, rtol)
-        t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
-    else:
-        t = shoot.times(ends, aim, outputs)
-        q, v, multipliers = _states(model, ends, solved.found, aim, t)
-    why = _why_not_variational(model)
-    at_nodes = np.asarray(solved.index)
-    times = None if why or ends.kind == COMPLETE else index.conjugate_times(model, ends, solved.found, at_nodes)
-    last = jax.tree.map(lambda x: x[-1], v)
-    return Connection(
-        t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
-        jnp.asarray(-1 if why else at_nodes[-1]), solved.amplification,
-        jnp.asarray(np.nan if shot is None else shot.size, aim.u.dtype), jnp.max(solved.errors),
-        solved.part >= 1, times, (), words, len(solved.found.path.y), why,
-    )  # fmt: skip
-
-
-def _inside(model: Model, ends: Ends, start, count: int, outputs: int, rtol) -> Connection:
-    """The first start in a program, with derivatives in both modes."""
-    still, fixed = stop_gradient((model, ends))
-    solved = stop_gradient(_solved(still, fixed, *_straight(still, fixed, start[1], count)))
-    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE)
-    shot = shoot.shot_inside(model, ends, solved.aim, solved.response, rtol)
-    aim = jax.tree.map(partial(jnp.where, good), shot.aim, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), shot.aim))
-    trajectory = shoot.motion(model, ends, shot.aim, outputs, rtol, throw=False, estimate_error=False)
-    why = _why_not_variational(model)
-    return Connection(
-        trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
-        jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim),
-        jnp.where(good, _action(model, ends, solved.found), jnp.nan), jnp.asarray(-1) if why else solved.index[-1],
-        solved.amplification, shot.size, jnp.max(solved.errors), good, None, (), start[0], count, why,
-    )  # fmt: skip
-
-
-def _same(a: Connection, b: Connection) -> bool:
-    """Whether two answers are the same: by start velocity and time."""
-    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves((c.start_velocity, c.duration))]) for c in (a, b)]
-    return bool(np.max(np.abs(flat[0] - flat[1])) <= SAME * np.max(np.abs(flat)))

@@ -27,21 +27,17 @@ BISECTIONS = 52
 SCALINGS = 4
 
 
-def index_at_nodes(model: Model, found: FoundPath) -> Int[Array, " K"]:
-    """The index of the path up to the end of each element, that end fixed."""
+def index_at_nodes(model: Model, found: FoundPath, free_end: bool) -> Int[Array, " K"]:
+    """The index of the path up to the end of each element, that end fixed; the last one free altogether if so."""
     count, s, size = found.path.y.shape
     m, inner = size - model.n, (s - 1) * size
-    whole = jax.vmap(_negative)(found.deltas) - s * m
-    # The last node is an end: its rows and columns are left out.
-    cut = jax.vmap(_negative)(found.deltas[:, :inner, :inner]) - (s - 1) * m if inner else 0 * whole
-    before = jnp.concatenate([jnp.zeros(1, whole.dtype), jnp.cumsum(whole)[:-1]])
-    return before + cut
-
-
-def index_of_free_end(model: Model, found: FoundPath) -> Int[Array, ""]:
-    """The index of a path whose end is free altogether."""
-    s, m = found.path.y.shape[1], found.path.y.shape[2] - model.n
-    return jnp.sum(jax.vmap(_negative)(found.deltas) - s * m)
+    # The last node is an end: a maximum in its directions would be one of others, so they have none.
+    fixed = np.arange(s * size) >= inner
+    cut = jnp.where((fixed[:, None] | fixed)[None], np.eye(s * size, dtype=found.deltas.dtype)[None], found.deltas)
+    whole, cut = jax.vmap(_negative)(jnp.concatenate([found.deltas, cut])).reshape(2, count)
+    whole, cut = whole - s * m, cut - (s - 1) * m
+    cut = cut.at[-1].set(whole[-1]) if free_end else cut
+    return jnp.concatenate([jnp.zeros(1, whole.dtype), jnp.cumsum(whole)[:-1]]) + cut
 
 
 def _negative(matrix: Array) -> Array:

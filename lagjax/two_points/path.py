@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
@@ -40,8 +40,10 @@ MOST = 30
 SMALL, SETTLED = 1e-13, 1e-9
 # A path has converged whose last step is below this.
 CONVERGED = 1e-7
+# From this size on, what the next step will be is judged from the last two.
+QUADRATIC = 1e-3
 # The shortest part of a step that is tried.
-SHORTEST = 2.0**-12
+SHORTEST = 2.0**-6
 
 
 class Ends(eqx.Module):
@@ -293,8 +295,8 @@ def solve(found: PathEquations, inverses: Float[Array, "K sN sN"], r: Float[Arra
 class FoundPath(NamedTuple):
     """A path after Newton's method.
 
-    - `size`: the largest entry of the last step in units of the path's extent; `small`: what counts as zero, 1e-7 or
-      more, where positions have fewer digits. `iterations`: the steps tried.
+    - `size`: the largest entry of the step after the last, in units of the path's extent, as far as it is known;
+      `small`: what counts as zero, 1e-7 or more, where positions have fewer digits. `iterations`: the steps tried.
     - `deltas`: the pivots of the elimination; `response`: what a unit of each equation of the end changes.
     """
 
@@ -315,6 +317,7 @@ class _Search(NamedTuple):
     solved: Solved
     deltas: Array
     size: Array
+    next_size: Array
     share: Array
     iterations: Array
     going: Array
@@ -329,13 +332,20 @@ def extent(ends: Ends, path: Path) -> Float[Array, " n"]:
     return jnp.where(moved > floor, moved, jnp.maximum(jnp.max(jnp.abs(x), axis=0), 1.0))
 
 
-def newton(model: Model, ends: Ends, start: Path) -> FoundPath:
-    """Newton's method, shortened where steps do not shrink."""
+def newton(model: Model, ends: Ends, start: Path, enough: ArrayLike = 0.0) -> FoundPath:
+    """Newton's method, shortened where steps do not shrink; until the next step is smaller than `enough`.
+
+    Its steps s shrink quadratically, s' = C s²: the one after s' is s' (s' / s)², and needs no more equations to know.
+    """
     n, scale = ends.x_a.size, extent(ends, start)
     eps = float(jnp.finfo(scale.dtype).eps)
     # Positions have round-off of their own size, which may be far above that of their differences.
     blur = 4 * eps * jnp.max(jnp.max(jnp.abs(start.nodes(ends)[..., :n]), axis=(0, 1)) / scale)
-    small = jnp.maximum(SMALL, blur)
+    small = jnp.maximum(jnp.maximum(SMALL, blur), enough)
+
+    def after(path: Path, step: Solved, share: ArrayLike) -> Path:
+        y = path.y - share * step.y[..., 0].reshape(start.y.shape)
+        return path._replace(y=y, border=path.border - share * step.border[:, 0])
 
     def amplified(solved: Solved) -> Array:
         """How much round-off becomes in a step; near a conjugate end much."""
@@ -353,8 +363,7 @@ def newton(model: Model, ends: Ends, start: Path) -> FoundPath:
 
     def iterate(search: _Search) -> _Search:
         step, share = search.solved, search.share
-        y = search.path.y - share * step.y[..., 0].reshape(start.y.shape)
-        trial = search.path._replace(y=y, border=search.path.border - share * step.border[:, 0])
+        trial = after(search.path, step, share)
         found = equations(model, ends, trial)
         pivots = eliminated(found)
         solved = solve(found, pivots.inverses, found.r, found.of_border)
@@ -364,20 +373,27 @@ def newton(model: Model, ends: Ends, start: Path) -> FoundPath:
         settled = jnp.maximum(SETTLED, 1e3 * amplified(search.solved))
         at_round_off = (search.size < settled) & jnp.isfinite(size)
         accepted = accepted | at_round_off
-        ended = accepted & (size <= small) | at_round_off & (size > 0.25 * search.size) | ~jnp.isfinite(size) & first
+        next_size = jnp.where((share == 1.0) & (size < QUADRATIC), size * (size / search.size) ** 2, size)
+        ended = (
+            accepted & (next_size <= small) | at_round_off & (size > 0.25 * search.size) | ~jnp.isfinite(size) & first
+        )
         share = jnp.where(first, 1.0, jnp.where(accepted, jnp.minimum(1.0, 4 * share), share / 4))
         iterations = search.iterations + 1
-        new = (trial, solved, pivots.deltas, size)
-        kept = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, search[:4])
+        new = (trial, solved, pivots.deltas, size, next_size)
+        kept = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, search[:5])
         return _Search(*kept, share, iterations, ~ended & (iterations < MOST) & (share > SHORTEST))
 
     nothing, zero = unfound(start), jnp.zeros((), scale.dtype)
     columns = jax.tree.map(lambda x: jnp.concatenate([x[..., :1], x], axis=-1), nothing.response)
-    search = _Search(start, columns, nothing.deltas, nothing.size, zero, jnp.zeros((), int), jnp.asarray(True))
+    sizes = nothing.size, nothing.size
+    search = _Search(start, columns, nothing.deltas, *sizes, zero, jnp.zeros((), int), jnp.asarray(True))
     ended = lax.while_loop(lambda search: search.going, iterate, search)
     response = jax.tree.map(lambda x: x[..., 1:], ended.solved)
-    zero_below = jnp.maximum(CONVERGED, 1e3 * amplified(ended.solved))
-    return FoundPath(ended.path, ended.size, zero_below, ended.iterations, ended.deltas, response)
+    zero_below = jnp.maximum(jnp.maximum(CONVERGED, 1e3 * amplified(ended.solved)), enough)
+    last = jnp.where(ended.next_size < zero_below, 1.0, 0.0)
+    return FoundPath(
+        after(ended.path, ended.solved, last), ended.next_size, zero_below, ended.iterations, ended.deltas, response
+    )
 
 
 def unfound(start: Path) -> FoundPath:

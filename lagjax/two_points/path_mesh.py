@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.polynomial import legendre
 
-from lagjax.jaxtools import once
+from lagjax.jaxtools import compiled, once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import lagrange, rule_of_degree
@@ -29,6 +29,10 @@ ONTO = 60
 # How often a path is solved for, the elements laid anew in between; how many parts of the way are tried at most, and
 # the shortest. A path that is lost on other elements ends the search as well, after some tries: it is good enough.
 ROUNDS, ATTEMPTS, SHORTEST = 3, 24, 1e-2
+# A path is followed where the highest coefficients on its elements are below this.
+FINE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+# On the way, steps of this size are small enough.
+ON_THE_WAY = 1e-4
 
 
 @once
@@ -51,15 +55,19 @@ def states(ends: Ends, path: Path, t: Float[Array, " T"]) -> tuple[Float[Array, 
     part = (t - ends.t_a) / path.duration(ends)
     i = jnp.clip(jnp.searchsorted(path.parts, part, side="right") - 1, 0, len(path.parts) - 2)
     h = jnp.diff(path.parts)[i]
-    xi = 2 * (part - path.parts[i]) / h - 1
-    c = jnp.einsum("cj,kjn->kcn", jnp.asarray(_to_coefficients(s), dtype), _with_end_multipliers(ends, path))[i]
-    values, slopes = [jnp.ones_like(xi), xi], [jnp.zeros_like(xi), jnp.ones_like(xi)]
-    for k in range(2, s + 1):
-        values.append(((2 * k - 1) * xi * values[-1] - (k - 1) * values[-2]) / k)
-        slopes.append((2 * k - 1) * values[-2] + slopes[-2])
-    y = jnp.einsum("ct,tcn->tn", jnp.stack(values[: s + 1]), c)
-    slope = jnp.einsum("ct,tcn->tn", jnp.stack(slopes[: s + 1]), c[..., :n])
-    return y, slope * (2 / (h * path.duration(ends)))[:, None]
+    basis = _basis(s, (part - path.parts[i]) / h)
+    nodes = _with_end_multipliers(ends, path)
+    slopes = jnp.einsum("kj,ejn->ekn", jnp.asarray(rule_of_degree(s).node_derivative, dtype), nodes[..., :n])
+    y, slope = (jnp.einsum("tj,tjn->tn", basis, values[i]) for values in (nodes, slopes))
+    return y, slope / (h * path.duration(ends))[:, None]
+
+
+def _basis(s: int, at: Float[Array, " T"]) -> Float[Array, "T s+1"]:
+    """Lagrange's polynomials of an element's nodes at points of it."""
+    nodes = rule_of_degree(s).nodes
+    apart = nodes[:, None] - nodes[None] + np.eye(s + 1)
+    factors = jnp.where(np.eye(s + 1, dtype=bool)[None], 1.0, (at[:, None, None] - nodes[None, None]) / apart[None])
+    return jnp.prod(factors, axis=2).astype(at.dtype)
 
 
 def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:
@@ -125,19 +133,21 @@ def path_through(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Floa
 
 
 class Attempt(NamedTuple):
-    """The last path that converged, for a part of the ends' distance and time; and the next part to try."""
+    """The last path that converged, for a part of the ends' distance and time, the errors of its elements; and the next
+    part to try."""
 
     found: FoundPath
+    errors: Float[Array, " K"]
     part: Float[Array, ""]
     step: Float[Array, ""]
     rounds: Int[Array, ""]
     attempts: Int[Array, ""]
 
 
-def found_path(model: Model, ends: Ends, start: Path, rounds: int = ROUNDS) -> Attempt:
+def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
     """Newton's method at once; where it fails, along the start from a short time to the whole one, since the shorter a
-    motion is, the straighter it is; then on elements laid anew."""
-    n = model.n
+    motion is, the straighter it is; then on elements laid anew, where they do not follow the path."""
+    n, fine = model.n, FINE.get(np.dtype(start.y.dtype), 1e-3)
 
     def attempt(last: Attempt) -> Attempt:
         there, path = last.part >= 1.0, last.found.path
@@ -155,17 +165,28 @@ def found_path(model: Model, ends: Ends, start: Path, rounds: int = ROUNDS) -> A
         trial = path_through(model, aim, x, parts)
         y = trial.y.at[..., n:].set(jnp.where(there, known, path.y)[..., n:])
         trial = Path(parts, y, jnp.where(last.part > 0, path.border, trial.border))
-        found = newton(model, aim, trial)
+        found = newton(model, aim, trial, jnp.where(part < 1.0, ON_THE_WAY, 0.0))
         well = found.converged
         kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), found, last.found)
         step = jnp.where(well, 1.5 * last.step, last.step / 3)
         return Attempt(
-            kept, jnp.where(well, part, last.part), step, last.rounds + (well & (part >= 1.0)), last.attempts + 1
-        )
+            kept, errors(ends, kept.path), jnp.where(well, part, last.part), step,
+            last.rounds + (well & (part >= 1.0)), last.attempts + 1,
+        )  # fmt: skip
 
     def unfinished(last: Attempt):
-        going = (last.rounds < rounds) & (last.attempts < ATTEMPTS)
-        return going & (last.step > SHORTEST)
+        coarse = (last.rounds == 0) | (jnp.max(last.errors) > fine)
+        return coarse & (last.rounds < ROUNDS) & (last.attempts < ATTEMPTS) & (last.step > SHORTEST)
 
     zero, none = jnp.zeros_like(ends.duration), jnp.zeros((), int)
-    return lax.while_loop(unfinished, attempt, Attempt(unfound(start), zero, zero + 1, none, none))
+    first = Attempt(unfound(start), jnp.zeros_like(start.parts[1:]), zero, zero + 1, none, none)
+    return lax.while_loop(unfinished, attempt, first)
+
+
+@compiled
+def halved(ends: Ends, path: Path) -> tuple[Float[Array, "K2 s n"], Float[Array, " K2+1"]]:
+    """The nodes on elements of half the length, and where these meet."""
+    middles = (path.parts[:-1] + path.parts[1:]) / 2
+    finer = path._replace(parts=jnp.sort(jnp.concatenate([path.parts, middles])))
+    x, _ = states(ends, path, node_times(ends, finer).ravel())
+    return x[:, : ends.x_a.size].reshape(len(middles) * 2, path.y.shape[1], -1), finer.parts

@@ -12,22 +12,26 @@ by the implicit function theorem.
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from lagjax.integrate import ENDED_WELL, Trajectory, integrate, is_among
-from lagjax.jaxtools import compiled, numpy_of, stop_gradient
+from lagjax.integrate import ENDED_WELL, Trajectory, ended_well, integrate, is_among
+from lagjax.jaxtools import compiled, numpy_of
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.path import NATURAL, Ends, FoundPath, end_rows
 
-# Corrections at most, from Python and inside a program; and how much each has to shrink.
-SHOTS, SHOTS_INSIDE = 8, 1
-SHRINKS = 0.5
+# Corrections at most, and how much each has to shrink.
+SHOTS, SHRINKS = 8, 0.5
+# A correction of this size, in units of the start velocity, is small enough for an answer.
+CLOSE = 1e-6
+# A larger one leads away: the ends are conjugate, and W is round-off.
+FAR = 1.0
 # So many round-offs of the end count as none.
 ROUND_OFF = 1e4
 
@@ -116,50 +120,97 @@ def last_of(trajectory: Trajectory):
 
 
 class Shot(NamedTuple):
-    """The unknowns, and the size of the next correction in units of the start velocity."""
+    """The unknowns, the size of the next correction in units of the start velocity, and the motion."""
 
     aim: Aim
     size: Float[Array, ""]
+    trajectory: Trajectory
 
 
 def shot(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol) -> Shot | None:
     """Correct until the motion meets the end; None where its corrections do not shrink."""
-    best, least, unit = None, np.inf, max(float(np.max(np.abs(aim.u))), float(np.finfo(np.asarray(aim.u).dtype).tiny))
+    eps = float(np.finfo(np.asarray(aim.u).dtype).eps)
+    best, least, before, response = None, np.inf, 1.0, np.asarray(response)
     for _ in range(SHOTS):
-        try:
-            trajectory = motion(model, ends, aim, outputs, rtol, throw=False, estimate_error=False)
-        except ValueError:
-            # A start at which L or its equations are singular: there is a path, and no motion.
-            return None
-        if not is_among(trajectory.result, ENDED_WELL):
-            return None
-        rho = missed(model, ends, aim, *last_of(trajectory))
-        off = float(np.max(np.abs(rho)))
+        rho = _missed_from(model, ends, aim, rtol)
+        off = np.inf if rho is None else float(np.max(np.abs(rho)))
         if not off < SHRINKS * least:
             break
-        size = float(np.max(np.abs(np.asarray(response @ rho)[: aim.u.size]))) / unit
-        best, least = Shot(aim, np.asarray(size)), off
-        if size < 1e-15:
+        size = _size(aim, response @ rho)
+        best, least = (aim, size), off
+        if not size < FAR:
             break
         aim = corrected(ends, aim, response, rho)
-    blur = ROUND_OFF * float(np.finfo(np.asarray(aim.u).dtype).eps) * max(1.0, float(np.max(np.abs(ends.x_b))))
-    return best if best is not None and (best.size < 1e-6 or least < blur) else None
+        # W is as good as the path: the next correction is smaller by as much again. Below round-off no motion says more.
+        if size * min(size / before, 1.0) < eps:
+            best = aim, size * min(size / before, 1.0)
+            break
+        before = size
+    blur = ROUND_OFF * eps * max(1.0, float(np.max(np.abs(ends.x_b))))
+    if best is None or not (best[1] < CLOSE or least < blur):
+        return None
+    aim = best[0]
+    trajectory = motion(model, ends, aim, outputs, rtol)
+    rho = np.asarray(missed(model, ends, aim, *last_of(trajectory)))
+    return Shot(aim, np.asarray(_size(aim, response @ rho)), trajectory)
 
 
-def shot_inside(model: Model, ends: Ends, aim: Aim, response: Array, rtol) -> Shot:
-    """The same in a program, with derivatives in both modes."""
-    still, fixed, aim, response = stop_gradient((model, ends, aim, response))
-    end = partial(motion, outputs=2, rtol=rtol, throw=False, estimate_error=False)
+def _missed_from(model: Model, ends: Ends, aim: Aim, rtol) -> np.ndarray | None:
+    """By how much a motion misses the end; None where there is no motion."""
+    try:
+        trajectory = motion(model, ends, aim, 2, rtol, throw=False, estimate_error=False)
+    except ValueError:
+        # A start at which L or its equations are singular: there is a path, and no motion.
+        return None
+    well = is_among(trajectory.result, ENDED_WELL)
+    return np.asarray(missed(model, ends, aim, *last_of(trajectory))) if well else None
 
-    def once(aim: Aim, _):
-        rho = missed(still, fixed, aim, *last_of(end(still, fixed, aim)))
-        return corrected(fixed, aim, response, rho), None
 
-    aim, _ = lax.scan(once, aim, None, length=SHOTS_INSIDE)
-    aim, size = stop_gradient(aim), jnp.zeros((), aim.u.dtype)
+def _size(aim: Aim, change: Array):
+    """A correction in units of the start velocity."""
+    xp = numpy_of((aim, change))
+    unit = xp.maximum(xp.max(xp.abs(aim.u)), np.finfo(aim.u.dtype).tiny)
+    return xp.max(xp.abs(change[: aim.u.size])) / unit
+
+
+class _Shots(NamedTuple):
+    aim: Aim
+    best: Shot
+    least: Array
+    count: Array
+    going: Array
+
+
+def shot_inside(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol: Array) -> Shot:
+    """The same in a program."""
+    run = partial(motion, model, ends, outputs=outputs, rtol=rtol, throw=False, estimate_error=False)
+    blank = eqx.filter_eval_shape(run, aim)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, blank)
+    start, static = eqx.partition(blank, eqx.is_array)
+
+    def once(shots: _Shots) -> _Shots:
+        trajectory = run(shots.aim)
+        rho = missed(model, ends, shots.aim, *last_of(trajectory))
+        off, size = jnp.max(jnp.abs(rho)), _size(shots.aim, response @ rho)
+        better = ended_well(trajectory.result) & (off < SHRINKS * shots.least)
+        new = Shot(shots.aim, size, eqx.filter(trajectory, eqx.is_array))
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, shots.best)
+        count, useful = shots.count + 1, (size > 16 * jnp.finfo(size.dtype).eps) & (size < FAR)
+        going = better & useful & (count < SHOTS)
+        return _Shots(
+            corrected(ends, shots.aim, response, rho), best, jnp.where(better, off, shots.least), count, going
+        )
+
+    infinite = jnp.full((), jnp.inf, aim.u.dtype)
+    shots = _Shots(aim, Shot(aim, infinite, start), infinite, jnp.zeros((), int), jnp.asarray(True))
+    best = lax.while_loop(lambda shots: shots.going, once, shots).best
+    return best._replace(trajectory=eqx.combine(best.trajectory, static))
+
+
+def implicit(model: Model, ends: Ends, aim: Aim, response: Array, rtol: Array) -> Aim:
+    """The unknowns of an answer, as the equations of the end define them: with derivatives by everything."""
     # W is that of the path: one correction has derivatives as good as the path, the second one squares their error.
     for _ in range(2):
-        rho = missed(model, ends, aim, *last_of(end(model, ends, aim)))
-        size = jnp.max(jnp.abs(response @ rho)[: aim.u.size]) / jnp.max(jnp.abs(aim.u))
-        aim = corrected(ends, aim, response, rho)
-    return Shot(aim, lax.stop_gradient(size))
+        trajectory = motion(model, ends, aim, 2, rtol, throw=False, estimate_error=False)
+        aim = corrected(ends, aim, response, missed(model, ends, aim, *last_of(trajectory)))
+    return aim

@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 import lagjax as lj
-from lagjax.fit.search.search import in_turn
+from lagjax.integrate import in_turn
 from lagjax.integrate.solve import harvest
 from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular

@@ -50,8 +50,8 @@ from lagjax.fit.problem.residuals import (
     prior_and_hold,
     window_part,
 )
-from lagjax.integrate import PATIENCE
-from lagjax.jaxtools import WATCHED, compiled, jitted
+from lagjax.integrate import in_turn
+from lagjax.jaxtools import compiled, jitted
 from lagjax.numerics import (
     ByWindows,
     Covariance,
@@ -409,22 +409,6 @@ def listening(listener: Callable[[int, float], None]):
 def _call_listeners(stage: Array, cost: Array):
     for listener in _LISTENERS:
         listener(int(stage), float(cost))
-
-
-def in_turn(function: Callable, *args):
-    """`function(*args)`; on a CPU lanes of a `vmap` run one after the other, which compiles once and wastes no steps.
-
-    Motions that a search tries do not report to a surrounding sweep.
-    """
-    live, static = eqx.partition(args, eqx.is_array)
-
-    def run(live: PyTree):
-        with WATCHED(False), PATIENCE(None):
-            return function(*eqx.combine(live, static))
-
-    if jax.default_backend() == "cpu":
-        run = jax.custom_batching.sequential_vmap(run)
-    return run(jax.tree.map(jnp.asarray, live))
 
 
 class _Best(NamedTuple):

@@ -1,0 +1,189 @@
+"""The answer from one start: its path (`path_mesh.py`), what kind it is (`index.py`), its motion (`shoot.py`)."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from lagjax.integrate import Trajectory, in_turn
+from lagjax.jaxtools import compiled, stop_gradient
+from lagjax.system import Model, constraints
+from lagjax.two_points import elements, index, path, path_mesh, shoot
+from lagjax.two_points.elements import rule_of_degree
+from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath
+from lagjax.two_points.result import Connection
+from lagjax.two_points.starts import Guess, nodes_of
+
+DEGREE, MOST_ELEMENTS = 8, 128
+# An answer with larger highest coefficients on its elements is none.
+COARSE = 0.05
+# Answers whose start velocities and times differ by less, relative, are the same.
+SAME = 1e-6
+
+
+class SolvedPath(NamedTuple):
+    """A path with what is known of it."""
+
+    found: FoundPath
+    part: Float[Array, ""]
+    index: Int[Array, " K"]
+    errors: Float[Array, " K"]
+    action: Float[Array, ""]
+    amplification: Float[Array, ""]
+    aim: shoot.Aim
+    response: Float[Array, "n+b N+b"]
+
+
+@compiled
+def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"]) -> SolvedPath:
+    start = path_mesh.path_through(model, ends, x, parts)
+    last = path_mesh.found_path(model, ends, start)
+    found = last.found
+    at_nodes = index.index_at_nodes(model, found, ends.kind == NATURAL)
+    response = shoot.response_of(model, ends, found)
+    scale = path.extent(ends, found.path)
+    sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
+    return SolvedPath(
+        found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),
+        shoot.start_of(model, ends, found), response,
+    )  # fmt: skip
+
+
+def _action(model: Model, ends: Ends, found: FoundPath) -> Float[Array, ""]:
+    """S of the path, whose inner nodes are held: the path is stationary, so S has its right first derivatives."""
+    still = lax.stop_gradient(found.path)
+    n, rule = model.n, rule_of_degree(still.y.shape[1])
+    if ends.kind == FIXED:
+        still = still._replace(y=still.y.at[-1, -1, :n].set(ends.x_b))
+    nodes, (t, h) = still.nodes(ends), still.times(ends)
+
+    def of_element(t: Array, h: Array, nodes: Array) -> Array:
+        s = elements.discrete_action(model, rule, t, h, nodes[:, :n])
+        if nodes.shape[1] == n:
+            return s
+        times = t + h * rule.nodes.astype(nodes.dtype)
+        g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times, nodes[:, :n])
+        return s + h * jnp.sum(rule.node_weights.astype(nodes.dtype)[:, None] * g * nodes[:, n:])
+
+    return jnp.sum(jax.vmap(of_element)(t, h, nodes))
+
+
+def why_not_variational(model: Model) -> str:
+    """Why there is no action principle; empty where there is one."""
+    of = [name for name in ("force", "dissipation") if getattr(model.system, name) is not None]
+    return f"there is a {' and a '.join(of)}" if of else ""
+
+
+def answer_from(
+    model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol
+) -> tuple[SolvedPath, Connection | None, str]:
+    """The path from one start, the answer if it is one, and what became of it in words."""
+    x, parts = nodes_of(model, ends, guess, count, DEGREE)
+    fine, before = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3), np.inf
+    while True:
+        solved = _solved(model, ends, x, parts)
+        part, error = float(solved.part), float(np.max(solved.errors))
+        # Where twice as many elements are hardly better, the path has a corner: no more of them help.
+        if part < 1 or error <= fine or 2 * len(x) > MOST_ELEMENTS or error > before / 2:
+            break
+        before = error
+        x, parts = path_mesh.halved(ends, solved.found.path)
+    if part < 1 and len(x) == count:
+        return solved, None, f"Newton's method failed beyond {part:.2g} of the way"
+    error = error if part >= 1 else np.inf
+    if not error < COARSE:
+        return solved, None, f"{len(x)} elements do not follow the path"
+    at_nodes = np.asarray(solved.index)
+    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
+        return solved, None, "a path through a singular point"
+    shot = shoot.shot(model, ends, solved.aim, solved.response, outputs, rtol)
+    return solved, _connection(model, ends, solved, shot, outputs), "found"
+
+
+@compiled
+def _states(model: Model, ends: Ends, found: FoundPath, t: Float[Array, " T"]):
+    """Positions, velocities and multipliers of a path."""
+    y, u = path_mesh.states(ends, found.path, t)
+    split = jax.vmap(model.split)(y[:, model.n :]) if model.m else {}
+    return model.tree(y[:, : model.n]), model.tree(u), split
+
+
+def _connection(
+    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | None, outputs: int, words: str = ""
+) -> Connection:
+    aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
+    if shot is not None:
+        aim, missed, trajectory = shot
+        t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
+    else:
+        t = shoot.times(ends, aim, outputs)
+        q, v, multipliers = _states(model, ends, solved.found, t)
+    why = why_not_variational(model)
+    at_nodes = np.asarray(solved.index)
+    times = None if why or ends.kind == COMPLETE else index.conjugate_times(model, ends, solved.found, at_nodes)
+    last = jax.tree.map(lambda x: x[-1], v)
+    return Connection(
+        t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
+        np.asarray(-1 if why else at_nodes[-1]), solved.amplification, missed, np.max(solved.errors),
+        np.asarray(solved.part >= 1), times, (), words, len(solved.found.path.y), why,
+    )  # fmt: skip
+
+
+def not_found(model: Model, ends: Ends, solved: SolvedPath, outputs: int, words: str) -> Connection:
+    """What there is where no path is an answer."""
+    nearest = _connection(model, ends, solved, None, outputs, words)
+    return eqx.tree_at(lambda c: c.converged, nearest, np.asarray(False))
+
+
+def is_same(a: Connection, b: Connection) -> bool:
+    """Whether two answers are the same: by start velocity and time."""
+    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves((c.start_velocity, c.duration))]) for c in (a, b)]
+    return bool(np.max(np.abs(flat[0] - flat[1])) <= SAME * np.max(np.abs(flat)))
+
+
+# -- In a program. --
+
+
+def inside(model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol) -> Connection:
+    """The answer from one start in a program, with derivatives in both modes."""
+    start = stop_gradient(nodes_of(*stop_gradient((model, ends)), guess, count, DEGREE))
+    solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
+    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE)
+    aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)
+    why, trajectory = why_not_variational(model), shot.trajectory
+    return Connection(
+        trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
+        jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim),
+        jnp.where(good, _action(model, ends, solved.found), jnp.nan), jnp.asarray(-1) if why else solved.index[-1],
+        solved.amplification, shot.size, jnp.max(solved.errors), good, None, (), guess.name, count, why,
+    )  # fmt: skip
+
+
+@eqx.filter_custom_jvp
+def _search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array, *, outputs: int):
+    """The path and its motion. Neither the search for it nor its steps are differentiated, but the equations of the
+    end, at the answer."""
+
+    def search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array) -> tuple[SolvedPath, shoot.Shot]:
+        solved = _solved(*problem, *start)
+        return solved, shoot.shot_inside(*problem, solved.aim, solved.response, outputs, rtol)
+
+    return in_turn(search, problem, start, rtol)
+
+
+@_search.def_jvp
+def _search_jvp(primals: tuple, tangents: tuple, *, outputs: int):
+    problem, start, rtol = primals
+    solved, shot = _search(problem, start, rtol, outputs=outputs)
+
+    def at_answer(problem: tuple[Model, Ends]) -> tuple[shoot.Aim, Trajectory]:
+        aim = shoot.implicit(*problem, shot.aim, solved.response, rtol)
+        return aim, shoot.motion(*problem, aim, outputs, rtol, throw=False, estimate_error=False)
+
+    _, (aim, trajectory) = eqx.filter_jvp(at_answer, (problem,), (tangents[0],))
+    nothing = jax.tree.map(lambda _: None, (solved, shot.size))
+    return (solved, shot), (nothing[0], shoot.Shot(aim, nothing[1], trajectory))
