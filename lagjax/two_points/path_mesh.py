@@ -20,7 +20,7 @@ from lagjax.jaxtools import compiled, once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import lagrange, rule_of_degree
-from lagjax.two_points.path import NATURAL, Ends, FoundPath, Path, extent, newton, unfound
+from lagjax.two_points.path import FIXED, NATURAL, Ends, FoundPath, Path, extent, newton, unfound
 
 # An element is at most so many times longer than the mean would have it.
 EVEN = 0.2
@@ -31,6 +31,8 @@ ONTO = 60
 ROUNDS, ATTEMPTS, SHORTEST = 3, 24, 1e-2
 # A path is followed where the highest coefficients on its elements are below this.
 FINE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+# A start ends elsewhere that misses the end by more than this part of its extent.
+ELSEWHERE = 1e-6
 # On the way, steps of this size are small enough.
 ON_THE_WAY = 1e-4
 
@@ -146,8 +148,11 @@ class Attempt(NamedTuple):
 
 def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
     """Newton's method at once; where it fails, along the start from a short time to the whole one, since the shorter a
-    motion is, the straighter it is; then on elements laid anew, where they do not follow the path."""
+    motion is, the straighter it is; for a start with another end, such as a motion, over the whole time from its own
+    end to the given one. Then on elements laid anew, where they do not follow the path."""
     n, fine = model.n, FINE.get(np.dtype(start.y.dtype), 1e-3)
+    off = ends.x_b - start.y[-1, -1, :n] if ends.kind == FIXED else jnp.zeros_like(ends.x_b)
+    elsewhere = jnp.any(jnp.abs(off) > ELSEWHERE * extent(ends, start))
 
     def attempt(last: Attempt) -> Attempt:
         there, path = last.part >= 1.0, last.found.path
@@ -156,10 +161,11 @@ def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
         source = jax.tree.map(lambda a, b: jnp.where(there, a, b), path, start)
         parts = jnp.where(there, parts_anew(ends, path), path.parts)
         shares = (node_times(ends, path._replace(parts=parts)) - ends.t_a) / path.duration(ends)
-        known, _ = states(ends, source, ends.t_a + part * source.duration(ends) * shares.ravel())
+        reached = jnp.where(elsewhere, 1.0, part)
+        known, _ = states(ends, source, ends.t_a + reached * source.duration(ends) * shares.ravel())
         known = known.reshape(path.y.shape)
-        x_b = jnp.where(part >= 1.0, ends.x_b, known[-1, -1, :n])
-        aim = eqx.tree_at(lambda ends: (ends.x_b, ends.duration), ends, (x_b, part * ends.duration))
+        x_b = jnp.where(part >= 1.0, ends.x_b, known[-1, -1, :n] + part * off)
+        aim = eqx.tree_at(lambda ends: (ends.x_b, ends.duration), ends, (x_b, reached * ends.duration))
         stretched = path.y[..., :n] + shares[..., None] * (x_b - path.y[-1, -1, :n])[None, None]
         x = jnp.where(there | (last.part == 0), known[..., :n], stretched)
         trial = path_through(model, aim, x, parts)

@@ -141,7 +141,7 @@ def shot(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol
         if not size < FAR:
             break
         aim = corrected(ends, aim, response, rho)
-        # W is as good as the path: the next correction is smaller by as much again. Below round-off no motion says more.
+        # W is as good as the path: the next correction is smaller by as much again. Below round-off it says nothing.
         if size * min(size / before, 1.0) < eps:
             best = aim, size * min(size / before, 1.0)
             break

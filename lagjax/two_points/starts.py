@@ -1,11 +1,13 @@
-"""Where the search for a path begins: the straight line, random waves on it, or paths that are given."""
+"""Where the search for a path begins: the straight line, random waves on it, or paths and motions that are given."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
+from lagjax.integrate import Trajectory
 from lagjax.jaxtools import numpy_of
 from lagjax.system import Model, coordinates
 from lagjax.two_points.elements import rule_of_degree
@@ -15,16 +17,20 @@ from lagjax.two_points.path import Ends
 WAVES, AMPLITUDES = 3, (1.0, 0.5, 0.25)
 
 
+# How many starts, or which ones.
+Starts = int | Callable | Trajectory | Sequence[Callable | Trajectory]
+
+
 class Guess(NamedTuple):
-    """A start by name: a path q(t), or the waves (w, n) on the straight line; None for the line itself."""
+    """A start by name: a path q(t), a motion, or the waves (w, n) on the straight line; None for the line itself."""
 
     name: str
     path: Any = None
 
 
-def guesses_of(model: Model, starts: int | Callable | Sequence[Callable]) -> list[Guess]:
+def guesses_of(model: Model, starts: Starts) -> list[Guess]:
     """The starts that are asked for."""
-    if callable(starts):
+    if callable(starts) or isinstance(starts, Trajectory):
         return [Guess("the given path", starts)]
     if not isinstance(starts, int):
         return [Guess(f"given path {i + 1}", start) for i, start in enumerate(starts)]
@@ -42,6 +48,10 @@ def nodes_of(model: Model, ends: Ends, guess: Guess, count: int, degree: int):
     parts = np.linspace(0.0, 1.0, count + 1)
     at = parts[:-1, None] + np.diff(parts)[:, None] * rule_of_degree(degree).nodes[1:]
     parts = parts.astype(dtype)
+    if isinstance(guess.path, Trajectory):
+        motion = guess.path
+        known = CubicHermiteSpline(motion.t, *(np.asarray(x) for x in jax.vmap(model.vectors)(motion.q, motion.v)))
+        return known(np.asarray(ends.t_a + ends.duration * at)).astype(dtype), parts
     if callable(guess.path):
         t = ends.t_a + ends.duration * at.astype(dtype)
         return jax.vmap(jax.vmap(lambda t: model.vector(coordinates.as_floats(guess.path(t)))))(t), parts
