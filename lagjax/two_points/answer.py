@@ -1,5 +1,9 @@
-"""The answer from one start: its path (`path_mesh.py`), what kind it is (`index.py`), its motion (`shoot.py`)."""
+"""The answer from one start: its path (`path_mesh.py`), what kind it is (`index.py`), its motion (`shoot.py`).
 
+With velocity constraints, and forces that depend on multipliers, there is no path: `start_velocity.py`.
+"""
+
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +20,7 @@ from lagjax.two_points import elements, index, path, path_mesh, shoot
 from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath
 from lagjax.two_points.result import Connection
+from lagjax.two_points.start_velocity import Found, found_by_shooting, shoots_alone
 from lagjax.two_points.starts import Guess, nodes_of
 
 DEGREE, MOST_ELEMENTS = 8, 128
@@ -75,14 +80,20 @@ def _action(model: Model, ends: Ends, found: FoundPath) -> Float[Array, ""]:
 def why_not_variational(model: Model) -> str:
     """Why there is no action principle; empty where there is one."""
     of = [name for name in ("force", "dissipation") if getattr(model.system, name) is not None]
+    of += [] if model.holonomic.all() else ["velocity constraint"]
     return f"there is a {' and a '.join(of)}" if of else ""
 
 
 def answer_from(
     model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol
-) -> tuple[SolvedPath, Connection | None, str]:
+) -> tuple[SolvedPath | Found, Connection | None, str]:
     """The path from one start, the answer if it is one, and what became of it in words."""
     x, parts = nodes_of(model, ends, guess, count, DEGREE)
+    if shoots_alone(model):
+        shot = found_by_shooting(model, ends, x, parts, outputs, rtol)
+        if not float(shot.part) >= 1:
+            return shot, None, f"Newton's method by integration failed beyond {float(shot.part):.2g} of the way"
+        return shot, _by_shooting(model, ends, shot, outputs, rtol), "found"
     fine, before = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3), np.inf
     while True:
         solved = _solved(model, ends, x, parts)
@@ -133,8 +144,22 @@ def _connection(
     )  # fmt: skip
 
 
-def not_found(model: Model, ends: Ends, solved: SolvedPath, outputs: int, words: str) -> Connection:
+def _by_shooting(model: Model, ends: Ends, found: Found, outputs: int, rtol=None, **options) -> Connection:
+    """The motion from a start that was found without a path, or that comes nearest."""
+    there, unknown = found.part >= 1, jnp.full((), jnp.nan, found.aim.u.dtype)
+    trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
+    aim = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), found.aim)
+    return Connection(
+        trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
+        jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim), unknown, jnp.asarray(-1), unknown,
+        found.size, unknown, there, None, (), "", 0, why_not_variational(model),
+    )  # fmt: skip
+
+
+def not_found(model: Model, ends: Ends, solved: SolvedPath | Found, outputs: int, words: str) -> Connection:
     """What there is where no path is an answer."""
+    if isinstance(solved, Found):
+        return replace(_by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False), tried=words)
     nearest = _connection(model, ends, solved, None, outputs, words)
     return eqx.tree_at(lambda c: c.converged, nearest, np.asarray(False))
 
@@ -151,6 +176,9 @@ def is_same(a: Connection, b: Connection) -> bool:
 def inside(model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol) -> Connection:
     """The answer from one start in a program, with derivatives in both modes."""
     start = stop_gradient(nodes_of(*stop_gradient((model, ends)), guess, count, DEGREE))
+    if shoots_alone(model):
+        found = found_by_shooting(model, ends, *start, 2, rtol)
+        return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
     good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE)
     aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)

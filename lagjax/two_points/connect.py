@@ -32,6 +32,7 @@ from lagjax.two_points import path_mesh
 from lagjax.two_points.answer import answer_from, inside, is_same, not_found, why_not_variational
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
+from lagjax.two_points.start_velocity import shoots_alone
 from lagjax.two_points.starts import guesses_of
 
 ELEMENTS = 8
@@ -72,7 +73,7 @@ def connect(
 
     **Main arguments:**
 
-    - `system`, `params`: a `System`, with or without holonomic constraints, forces and dissipation; its parameters.
+    - `system`, `params`: a `System`, with or without constraints, forces and dissipation; its parameters.
     - `q_a`, `q_b`: the ends, alike; `[q]`. An angle that goes round differs by its turns. They lie on the constraints.
     - `t_a`, `t_b`: the times of the ends, `[t]`, t_b > t_a.
 
@@ -80,7 +81,9 @@ def connect(
 
     - `end`: conditions `end(t, q, v, params)` -> scalar or (c,) in place of the end q_b, which is then a guess. Of
       positions (and time) alone they are at most as many as coordinates, and the rest is transversality: no momentum
-      along what they leave free. Of velocities, they are as many as the coordinates that constraints leave.
+      along what they leave free. Of velocities, they are as many as the coordinates that constraints leave; so they
+      are in any case with velocity constraints, where q_b alone is too much, and with forces that depend on
+      multipliers. Then the start velocity is sought by integrating alone, from that of the start.
     - `free_time`: whether t_b is a guess. Without a further condition among those of `end` that depend on velocities,
       the time is that of stationary action, with no energy h at the end.
     - `starts`: how many starts: the straight line, and others with random waves on it; or a function q(t), or several.
@@ -94,7 +97,7 @@ def connect(
     (first derivatives), under `jit` and `vmap` from the first start.
 
     **Raises:** `TypeError`, `ValueError` for ends of different structure, off the constraints, or at the same time; for
-    too many or too few conditions; for velocity constraints. Warns (`ConnectWarning`) where no motion was found, which
+    too many or too few conditions. Warns (`ConnectWarning`) where no motion was found, which
     `converged` says under `jit` and `vmap`.
 
     Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `index.py`.
@@ -144,19 +147,9 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     model = model_of(system, *s)
     _check_alike(q_a, q_b)
     other = coordinates.state(t_b, q_b, q_b, s.params)
-    if any(not c.of_positions for c in system.constraints.values()):
-        names = [name for name, c in system.constraints.items() if not c.of_positions]
-        raise ValueError(
-            f"constraint {listed(names)} restricts velocities, so only some ends can be reached in a given time, and "
-            "connect does not find out which.\n"
-            "Fix: lj.steer for a system with controls; a lj.Holonomic in place of a velocity constraint that can be "
-            "integrated."
-        )
-    if model.reacts:
-        raise ValueError(
-            "the force depends on multipliers, which connect does not take.\nFix: leave the friction out of the guess, "
-            "and shoot with lj.integrate."
-        )
+    alone = shoots_alone(model)
+    if alone and end is None and (free_time or not model.holonomic.all()):
+        raise ValueError(_too_many(model, free_time))
     dtype = s.t.dtype
     t_a, duration = s.t, jnp.asarray(other.t, dtype) - s.t
     (x_a, _), (x_b, _) = model.vectors(s.q, s.q), model.vectors(other.q, other.q)
@@ -205,13 +198,14 @@ def _conditions(model: Model, s: State, end: Callable, free_time: bool):
     count = jax.eval_shape(condition, s.t, x, u).shape[0]
     of_velocity = _depends_on_velocity(condition, s.t, x, u)
     left = model.n - model.m
-    if not of_velocity:
+    if not of_velocity and not shoots_alone(model):
         if count > left:
             raise ValueError(_count(count, f"at most {left}", model, "conditions of positions"))
         return condition, NATURAL, count
     wanted = left + free_time
     if count != wanted:
-        raise ValueError(_count(count, f"{wanted}", model, "conditions with velocities", free_time))
+        what = "conditions with velocities" if of_velocity else "conditions"
+        raise ValueError(_count(count, f"{wanted}", model, what, free_time))
     return condition, COMPLETE, count
 
 
@@ -248,6 +242,20 @@ def _count(count: int, wanted: str, model: Model, what: str, free_time: bool = F
     )
 
 
+def _too_many(model: Model, free_time: bool) -> str:
+    """Why all of q_b cannot be asked for."""
+    free, m = model.n - model.m, int(np.sum(~model.holonomic))
+    names = [residual.name for residual in model.form.residuals if not residual.of_positions]
+    because = f"{listed(names)} restricts velocities" if m else "the force depends on multipliers"
+    return (
+        f"q_b has {free + m} free coordinates, and the motion {free} free start velocities"
+        f"{' and a free time' if free_time else ''}: {because}, and no transversality completes what is missing.\n"
+        "Usual cause: all of q_b where only some of it can be reached in a given time.\n"
+        f"Fix: end=lambda t, q, v, params: jnp.stack([...]) of {free + free_time} conditions; or lj.steer for a system "
+        "with controls."
+    )
+
+
 def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
     """An end moved onto the constraints by round-off; raises where it is farther away."""
     if not model.m:
@@ -256,7 +264,8 @@ def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
     if not is_traced((near, t)):
         off = float(jnp.max(jnp.abs(near - x))) / max(float(jnp.max(jnp.abs(x))), 1e-300)
         if not off < OFF:
-            worst = model.equation_names[int(np.argmax(np.abs(constraints.position_residual(model, t, x))))]
+            names = np.array(model.equation_names)[model.holonomic]
+            worst = names[int(np.argmax(np.abs(constraints.position_residual(model, t, x))))]
             raise ValueError(
                 f"{name} is off the constraints by {off:.2g} of its size; worst is '{worst}'.\n"
                 "Usual cause: an end in rounded numbers, or one out of reach of the mechanism.\n"

@@ -22,13 +22,14 @@ class Connection(eqx.Module):
     - `trajectory`: the motion of `integrate` from the start with `start_velocity`, on which the end is met; None where
       there is none: L is singular at the start, or an error there grows too much on the way (`missed`).
     - `start_velocity`, `end_velocity`: in the structure of the ends; `duration`: T = t_b - t_a.
-    - `action`: S = ∫ L dt along the path.
+    - `action`: S = ∫ L dt along the path; NaN where the motion was found by shooting alone (`lj.action` has it).
     - `index`: the Morse index, the number of independent variations with fixed ends that lower the action; -1 where
       there is no action principle. `kind`: the same in words. `conjugate_times`: the times of the points conjugate to
       the start, one for each direction; None while JAX traces.
     - `amplification`: the relative change of the start velocity by one of the end; large near a conjugate end.
     - `missed`: the last correction of the start velocity, relative. `converged`: whether the path was found; its last
-      step, `mesh_error`, the highest Legendre coefficients on its elements, and the `elements`.
+      step, `mesh_error`, the highest Legendre coefficients on its elements, and the `elements`. By shooting alone
+      there are none: `amplification` and `mesh_error` are NaN.
     - `others`: further answers, by rising action. `tried`: what was tried, in words.
     """
 
@@ -82,7 +83,8 @@ class Connection(eqx.Module):
                 return f"Connection({action.size} lanes)"
         motion = f"motion misses {float(self.missed):.0e}" if self.trajectory is not None else "no motion"
         more = f"; {len(self.others)} more" if self.others else ""
-        return (
-            f"Connection({self.kind}; action {float(self.action):.9g} in a time of {float(self.duration):.6g}; "
-            f"{self.elements} elements to {float(self.mesh_error):.0e}, {motion}{more})"
-        )
+        found = f"action {float(self.action):.9g} in a time of {float(self.duration):.6g}; {self.elements} elements to "
+        found += f"{float(self.mesh_error):.0e}"
+        if not self.elements:
+            found = f"in a time of {float(self.duration):.6g}; by shooting alone"
+        return f"Connection({self.kind}; {found}, {motion}{more})"
