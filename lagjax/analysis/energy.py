@@ -25,11 +25,11 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.display import plots as plot
 from lagjax.integrate import ENDED_WELL, HybridTrajectory, Trajectory, integrate, is_among, message
 from lagjax.jaxtools import compiled, is_traced
-from lagjax.mechanics import sees_time
+from lagjax.mechanics import sees_time, with_first_order
 from lagjax.numerics import quadrature
 from lagjax.system import Hybrid, Model, System, constraints, coordinates, model_of
 
-FORCE, DISSIPATION, TIME = "force", "dissipation", "explicit time"
+FORCE, DISSIPATION, STATES, TIME = "force", "dissipation", "states", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.
 HALVINGS, MOST_INTERVALS = 12, 10_000
 # The outer nodes of an interval are two thousandths of it from its ends.
@@ -270,6 +270,7 @@ def _sources(model: Model) -> dict[str, int]:
     system, n = model.system, model.n
     found = {FORCE: n} if system.force is not None else {}
     found |= {DISSIPATION: n} if system.dissipation is not None else {}
+    found |= {STATES: n} if system.states else {}
     found |= {TIME: 1} if sees_time(system.lagrangian, model) else {}
     return found | {constraint_in_words(name): n for name in system.constraints}
 
@@ -285,6 +286,12 @@ def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree):
             powers[FORCE] = model.force(t, x, u, stacked) * u
         if system.dissipation is not None:
             powers[DISSIPATION] = -jax.grad(model.dissipation, argnums=2)(t, x, u) * u
+        if system.states:
+            # What L stores in a state is not given by a force: as for time, -∂L/∂z z'.
+            places = np.array([i for _, among in with_first_order(model).form.first_order.states for i in among])
+            powers[STATES] = (
+                jnp.zeros_like(u).at[places].set(-(jax.grad(model.lagrangian, argnums=1)(t, x, u) * u)[places])
+            )
         if timed:
             powers[TIME] = -jax.grad(model.lagrangian)(t, x, u)[None]
         rows = constraints.jacobian(model, t, x, u)
@@ -314,7 +321,8 @@ class EnergyLedger(eqx.Module):
     - `kinetic`, `potential` (T,): T₂, the part of L of second degree in v, and V = -L at v = 0, with h = T₂ + V; None
       if L has terms other than up to second degree. In coordinates that move, V contains the centrifugal part,
       and h is not the energy: on a hoop that turns at ω it is E - ω L_z.
-    - `works`: a `Work` for each source: "force", "dissipation", "explicit time", as far as the system has them.
+    - `works`: a `Work` for each source: "force", "dissipation", "states" (what changes L by those that it contains),
+      "explicit time", as far as the system has them.
     - `constraints`: by name a `Work`, of the force Aᵀ λ. Summed over all coordinates, the work of a constraint that
       neither moves nor is inhomogeneous in v is zero.
     - `impacts` (S,): the jump of h at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`: from
@@ -471,7 +479,7 @@ def _ledger(motion: Motion) -> EnergyLedger:
     names = {name: constraint_in_words(name) for system in motion.systems for name in system.constraints}
     return EnergyLedger(
         t=motion.t, jacobi_integral=h, kinetic=kinetic if split else None, potential=potential if split else None,
-        works={name: works[name] for name in (FORCE, DISSIPATION, TIME) if name in works},
+        works={name: works[name] for name in (FORCE, DISSIPATION, STATES, TIME) if name in works},
         constraints={name: works[words] for name, words in names.items()},
         impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
         closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,

@@ -30,7 +30,7 @@ from lagjax.mechanics import (
     within,
 )
 from lagjax.numerics import independent_rows
-from lagjax.system import Hybrid, Model, State, System, check_system, coordinates, model_of, traced_system
+from lagjax.system import Hybrid, Model, State, System, check_system, coordinates, model_of, traced_system, with_rates
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,7 +181,7 @@ def explain(system, t, q: PyTree, v: PyTree, params: PyTree = None):
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
     check_system(system, t, q, v, params, phases=True)
-    s = coordinates.state(t, q, v, params)
+    s = coordinates.state(t, q, with_rates(system, q, v), params)
     if system.in_phases:
         return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
     return _explain(system, s)
@@ -211,7 +211,12 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
         rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
     rows += [("dependent", _in_words(group)) for group in groups]
-    rows.append(("degrees of freedom", f"{len(names) - independent}"))
+    first = equations_of(model).model.form.first_order
+    if first is not None:
+        damped = [f"{names[i]} (its velocity by force and dissipation)" for i in first.damped]
+        rows.append(("of first order", ", ".join([*(f"{name} (state)" for name, _ in first.states), *damped])))
+    free = len(names) - independent - (0 if first is None else int(first.mask(len(names)).sum()))
+    rows.append(("degrees of freedom", f"{free}"))
     found_structure = structure(model)
     rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
     if found_structure is not None:
@@ -233,7 +238,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     return Explanation(
         coordinates=tuple(names),
         equations=tuple(equations),
-        degrees_of_freedom=len(names) - independent,
+        degrees_of_freedom=free,
         position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
         dependent=groups,
         mass_matrix=mass,

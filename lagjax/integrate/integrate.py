@@ -32,7 +32,7 @@ from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
 from lagjax.mechanics import has_networks
-from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates
+from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates, with_rates
 
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
@@ -75,7 +75,7 @@ def integrate(
 
     - `system`: the `System`; or a `Hybrid`, a motion in phases.
     - `q0`, `v0`: initial coordinates and velocities, any pytree of numbers and arrays, alike; `[q]`, `[q]/[t]`. Whole
-      numbers become floats. A list is a pytree, not a vector; angles are in radians. A start that is off the
+      numbers become floats. `v0` may leave out states. A list is a pytree, not a vector; angles are in radians. A start that is off the
       constraints by no more than about the tolerance is moved onto them.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
@@ -165,7 +165,7 @@ def integrate(
     arguments.check_controller(stepsize_controller, max_step, jump_ts)
     arguments.check_max_steps(max_steps)
     ts = arguments.vector_of_times(ts)
-    state = coordinates.prepared(ts[0], q0, v0, params)
+    state = coordinates.prepared(ts[0], q0, with_rates(system, q0, v0), params)
     dtype = state.t.dtype
     system = traced_phases(system if start is None else system.starting(start), state)
     for phase in system.phases:

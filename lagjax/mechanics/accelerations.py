@@ -15,7 +15,18 @@ from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import examined
 from lagjax.mechanics.sparse_saddle_point import Banded
-from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare, traced_system
+from lagjax.system import (
+    Model,
+    State,
+    System,
+    check_system,
+    constraints,
+    coordinates,
+    model_of,
+    prepare,
+    traced_system,
+    with_rates,
+)
 
 
 def accelerations(
@@ -48,7 +59,7 @@ def accelerations(
     Source: Goldstein, Eq. (2.24)-(2.27).
     """
     check_system(system, t, q, v, params)
-    s = coordinates.prepared(t, q, v, params)
+    s = coordinates.prepared(t, q, with_rates(system, q, v), params)
     return accelerations_at(model_of(traced_system(system, s), *s), s)
 
 

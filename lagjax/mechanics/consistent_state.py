@@ -28,6 +28,7 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_traced, stop_gradient
 from lagjax.mechanics.diagnosis import describe, listed
 from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.first_order import resolved, with_first_order
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.projection import departures, within
 from lagjax.mechanics.saddle_point import displacement_map
@@ -84,10 +85,11 @@ def consistent_state(
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Eq. (IV.4.3).
     """
     model, s = prepare(system, t, q, v, params)
+    model = with_first_order(model)
     both = free_coordinates(s.q, hold)
     free = both & free_coordinates(s.q, hold_position, "hold_position")
     free_velocity = both & free_coordinates(s.q, hold_velocity, "hold_velocity")
-    if not model.m:
+    if not model.is_returned:
         return s.q, s.v
     q, v, reached = _consistent_state(model, s, jnp.asarray(free), jnp.asarray(free_velocity))
     if is_traced((q, v)):
@@ -142,8 +144,12 @@ def _consistent_state(model: Model, s: State, free: Array, free_velocity: Array)
     x, live = x0, (model, t)
     if model.holonomic.any():
         x = _nearest(lambda problem, x: constraints.position_residual(*problem, x), live, x0, metric, free)
-    u = _nearest(lambda problem, u: constraints.velocity_residual(*problem, u), (*live, x), u0, metric, free_velocity)
-    q, v, tolerance = model.tree(x), model.tree(u), _round_off(t)
+    u = u0
+    if model.m:
+        u = _nearest(
+            lambda problem, u: constraints.velocity_residual(*problem, u), (*live, x), u, metric, free_velocity
+        )
+    q, v, tolerance = model.tree(x), model.tree(resolved(model, t, x, u)), _round_off(t)
     return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
 
 

@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import WATCHED, compiled, jitted, kept_as_call, once
+from lagjax.mechanics.first_order import completed, resolved, with_first_order
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
@@ -58,6 +59,11 @@ class Equations(eqx.Module):
     def outside(self, y: Array):
         """Convert a position, velocity or acceleration back to the user's structure."""
         return y if self.users is None else self.users.tree(jnp.stack(y))
+
+    def velocities(self, t: Array, q: PyTree, v: PyTree):
+        """The velocity v, where coordinates of first order have theirs."""
+        model = self.model
+        return v if model.form.first_order is None else model.tree(resolved(model, t, *model.vectors(q, v)))
 
     def rates(self, t: Array, q: PyTree, v: PyTree) -> tuple[PyTree[Array], dict[str, Array]]:
         """The accelerations, and the multipliers by name."""
@@ -141,6 +147,7 @@ def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> 
     (`Equations.inside`). Without `fallback` they are assumed regular; the caller deals with states where they are not.
     """
     written, users, prepared = None, None, (None, None)
+    model = with_first_order(model)
     if fast and is_small(model):
         model, users = in_numbers(model), model.form
         leaves, structure = jtu.tree_flatten(model)
@@ -167,8 +174,9 @@ def _written(structure, leaves: tuple, watched: bool) -> WrittenOut | None:
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.
 @jitted
 def _accelerations(form, model: Model, t: Array, q: PyTree, v: PyTree, baumgarte_rate: Array, independent: Array):
-    a, multipliers = form.accelerations(model, t, *model.vectors(q, v), baumgarte_rate, independent)
-    return model.tree(a), model.split(multipliers)
+    state = t, *model.vectors(q, v)
+    a, multipliers = form.accelerations(model, *state, baumgarte_rate, independent)
+    return model.tree(completed(model, *state, a)), model.split(multipliers)
 
 
 @jitted
@@ -178,13 +186,17 @@ def _independent(form, model: Model, t: Array, q: PyTree, v: PyTree, dependent_b
 
 @compiled
 def _verdict(form, model: Model, t: Array, q: PyTree, v: PyTree) -> Verdict:
-    found = form.verdict(model, t, *model.vectors(q, v))
-    return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
+    state = t, *model.vectors(q, v)
+    found = form.verdict(model, *state)
+    a = completed(model, *state, found.a)
+    finite = found.finite & jnp.all(jnp.isfinite(a))
+    return found._replace(a=model.tree(a), multipliers=model.split(found.multipliers), finite=finite)
 
 
 def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):
-    a, multipliers = form.solution_or_nan(model, t, *model.vectors(q, v))
-    return model.tree(a), model.split(multipliers)
+    state = t, *model.vectors(q, v)
+    a, multipliers = form.solution_or_nan(model, *state)
+    return model.tree(completed(model, *state, a)), model.split(multipliers)
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools import compiled
+from lagjax.mechanics.first_order import resolved
 from lagjax.mechanics.multiplier_forces import response
 from lagjax.system import Model, State, System, prepare
 
@@ -47,6 +48,7 @@ def mass_and_forcing(model: Model, t: Array, x: Array, u: Array) -> LinearEquati
 
 def forcing_and_inertia(model: Model, t: Array, x: Array, u: Array):
     """F at a state without the part of the multipliers, and the function that multiplies an acceleration by M."""
+    u = resolved(model, t, x, u)
 
     def momentum_and_gradient(t: Array, x: Array, u: Array):
         gradient, p = jax.grad(model.lagrangian, argnums=(1, 2))(t, x, u)
@@ -56,7 +58,11 @@ def forcing_and_inertia(model: Model, t: Array, x: Array, u: Array):
     zero_t, zero = jnp.zeros_like(t), jnp.zeros_like(x)
     # ∂p/∂t + (∂p/∂q) v: the part of dp/dt that does not involve the acceleration.
     forcing = gradient - push(jnp.ones_like(t), u, zero) + applied_force(model, t, x, u)
-    return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
+    first = model.form.first_order
+    if first is None:
+        return forcing.astype(x.dtype), lambda a: push(zero_t, zero, a)
+    mask = first.mask(model.n)
+    return jnp.where(mask, 0.0, forcing).astype(x.dtype), lambda a: push(zero_t, zero, a) + mask.astype(x.dtype) * a
 
 
 def applied_force(model: Model, t: Array, x: Array, u: Array, multipliers: Array | None = None) -> Float[Array, " n"]:

@@ -90,7 +90,7 @@ def noether_charge(system: System, generator) -> NoetherCharge:
 
     Source: Goldstein, §13.7; the gauge term as in Derivation 8 of its chapter 1.
     """
-    check_system(system, generator)
+    check_system(system, generator, states=False)
     return NoetherCharge(system, as_generator(generator))
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
+from lagjax.mechanics.first_order import resolved
 from lagjax.numerics import largest, last_step, newton
 from lagjax.system import Model, constraints, coordinates
 
@@ -55,6 +56,8 @@ def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Arra
     of dependent constraints; `rtol` and `atol` are one number, or one for q and one for v.
     """
     model, (x, u) = equations.model, equations.model.vectors(q, v)
+    if not model.m:
+        return Projected(q, model.tree(resolved(model, t, x, u)), jnp.asarray(True))
     # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
     frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
     displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
@@ -76,7 +79,7 @@ def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Arra
     left = jnp.concatenate([position_residual(fixed, x), velocity_residual((*fixed, x), u)])
     allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
     holds = jnp.all(jnp.abs(left) <= allowed)
-    return Projected(model.tree(x), model.tree(u), lax.stop_gradient(holds))
+    return Projected(model.tree(x), model.tree(resolved(model, t, x, u)), lax.stop_gradient(holds))
 
 
 def _newton(residual: Callable, problem: PyTree, y: Array, displacement: Callable, slope: Array):

@@ -38,6 +38,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import compiled
+from lagjax.mechanics.first_order import completed, with_first_order
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
 from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, unit_rows
@@ -287,8 +288,10 @@ class Examined(NamedTuple):
 @compiled
 def examined(model: Model, s: State) -> Examined:
     """Solve the equations at one state, and keep their matrix and which dependent constraints disagree."""
-    found = _examined(model, s.t, *model.vectors(s.q, s.v))
-    return found._replace(a=model.tree(found.a), multipliers=model.split(found.multipliers))
+    model, state = with_first_order(model), (s.t, *model.vectors(s.q, s.v))
+    found = _examined(model, *state)
+    a = completed(model, *state, found.a)
+    return found._replace(a=model.tree(a), multipliers=model.split(found.multipliers))
 
 
 def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:

@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools import TooLong, is_array, is_plain
+from lagjax.mechanics.first_order import completed, resolved
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers
@@ -75,23 +76,26 @@ def write_out(model: Model) -> WrittenOut | None:
         return None
     if equations.length > LONG:
         return None
-    return WrittenOut(equations, Numbers(_projected, model) if model.m else None, may_fail=not diagonal)
+    return WrittenOut(equations, Numbers(_projected, model) if model.is_returned else None, may_fail=not diagonal)
 
 
 def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     linear = mass_and_forcing(model, t, x, u)
     if model.n == 1 and not model.m:
-        return model.tree(linear.forcing / linear.mass[0]), jnp.zeros(0, x.dtype)
+        return model.tree(completed(model, t, x, u, linear.forcing / linear.mass[0])), jnp.zeros(0, x.dtype)
     rows = constraints.acceleration_rows(model, t, x, u)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
+    a = completed(model, t, x, u, a)
     valid = solver.valid if linear.response is None else solver.valid & unique
     return model.tree(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
 
 
 def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
+    if not model.m:
+        return q, model.tree(resolved(model, t, x, u))
     mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
     # The residual vanishes at the solution, so that the derivative of the matrix does not count.
     solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
@@ -107,7 +111,7 @@ def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
         last_u, _ = solver.solve(no_force, -constraints.velocity_residual(model, t, x, u), refine=False)
         u = u + last_u
     near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
-    return model.tree(jnp.where(near, x, jnp.nan)), model.tree(u)
+    return model.tree(jnp.where(near, x, jnp.nan)), model.tree(resolved(model, t, x, u))
 
 
 def _tiny(correction, y: Array) -> Array:

@@ -165,7 +165,7 @@ def is_diagonal(model: Model) -> bool:
 
 def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
-    return not any(phase.m or _sees_velocities(phase) for phase in model.phases)
+    return not any(phase.m or phase.system.states or _sees_velocities(phase) for phase in model.phases)
 
 
 def _sees_velocities(model: Model) -> bool:
@@ -242,8 +242,7 @@ def are_angles(model: Model) -> np.ndarray:
 def conserved_momenta(model: Model) -> list[str]:
     """The coordinates with a momentum known to be conserved: not in L or a constraint, and no force acts."""
     system, names = model.system, model.names
-    forced = system.force is not None or system.dissipation is not None
-    if forced or not system.is_holonomic or len(names) > UP_TO:
+    if system.is_forced or not system.is_holonomic or len(names) > UP_TO:
         return []
     model = in_numbers(model)
     try:
@@ -320,6 +319,8 @@ def what_changes_jacobi_integral(model: Model) -> Iterator[str]:
         yield "there is a force"
     if system.dissipation is not None:
         yield "there is dissipation"
+    if system.states:
+        yield "L may depend on a state"
     for name, c in system.constraints.items():
         if not c.of_positions:
             yield f"constraint '{name}' restricts velocities"
@@ -347,7 +348,7 @@ def functions_of(model: Model):
         system = phase.system
         forced = None if system.force is None else force_with_ones(phase)
         functions += [system.lagrangian, forced, system.dissipation]
-        functions += [c.residual for c in system.constraints.values()]
+        functions += [c.residual for c in system.constraints.values()] + [*system.states.values()]
     return [f for f in functions if f is not None]
 
 

@@ -27,7 +27,18 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_array, numpy_of, one_function_in_both_modes, shape_of, varies
 from lagjax.numerics import ExplicitRungeKutta
 from lagjax.steps.step import advanced, equations_for_steps, explicit_method, step_length
-from lagjax.system import Call, State, System, Traced, check_system, coordinates, model_of, traced_call, traced_system
+from lagjax.system import (
+    Call,
+    State,
+    System,
+    Traced,
+    check_system,
+    coordinates,
+    model_of,
+    traced_call,
+    traced_system,
+    with_rates,
+)
 
 
 def rollout(
@@ -89,7 +100,7 @@ def rollout(
     """
     check_system(system, q0, v0, params)
     method = explicit_method(method)
-    s = coordinates.prepared(t0, q0, v0, params)
+    s = coordinates.prepared(t0, q0, with_rates(system, q0, v0), params)
     dtype = s.t.dtype
     held, count = _rows(controls, dtype)
     merge, by_name = None, False

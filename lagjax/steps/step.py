@@ -20,7 +20,7 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_traced, kept_as_call, numpy_of, one_function_in_both_modes
 from lagjax.mechanics import Equations, all_finite, equations_of, to_manifold
 from lagjax.numerics import RK4, ExplicitRungeKutta, in_our_form
-from lagjax.system import Model, State, System, check_system, coordinates, model_of, traced_system
+from lagjax.system import Model, State, System, check_system, coordinates, model_of, traced_system, with_rates
 
 # A state counts as returned to the constraints within so many units of round-off; else it is NaN.
 ROUND_OFFS = 1e4
@@ -74,7 +74,7 @@ def step(
     """
     check_system(system, t, q, v, params)
     method = explicit_method(method)
-    s = coordinates.prepared(t, q, v, params)
+    s = coordinates.prepared(t, q, with_rates(system, q, v), params)
     return _stepped(traced_system(system, s), s, step_length(dt, s.t.dtype), method)
 
 
@@ -105,8 +105,8 @@ def advanced(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tupl
 
 
 def _fast(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
-    y1 = _explicit(method, lambda t, y: equations.fast(t, *y)[0], t, y, dt)
-    if equations.model.m:
+    y1 = _explicit(method, lambda t, y: (equations.velocities(t, *y), equations.fast(t, *y)[0]), t, y, dt)
+    if equations.model.is_returned:
         y1 = equations.projected(t + dt, *y1)
     if not equations.fallback:
         return y1
@@ -118,11 +118,11 @@ def _fast(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, 
 def _robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
     independent = equations.independent(t, *y)
 
-    def accelerations(t: Array, y: tuple):
-        return kept_as_call(equations.accelerations(t, *y, None, independent))[0]
+    def rates(t: Array, y: tuple):
+        return equations.velocities(t, *y), kept_as_call(equations.accelerations(t, *y, None, independent))[0]
 
-    y1 = _explicit(method, accelerations, t, y, dt)
-    if not equations.model.m:
+    y1 = _explicit(method, rates, t, y, dt)
+    if not equations.model.is_returned:
         return y1
     round_off = jnp.asarray(ROUND_OFFS * jnp.finfo(dt.dtype).eps, dt.dtype)
     found = to_manifold(equations, t + dt, *y1, round_off, round_off)
@@ -132,11 +132,11 @@ def _robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple
 class _Rate(diffrax.AbstractTerm):
     """d(q, v)/dt, for steps of the length dt: the difference of two times would be rounded."""
 
-    accelerations: Any
+    rates: Any
     dt: Array
 
     def vf(self, t: Array, y: tuple, args: Any):
-        return y[1], self.accelerations(t, y)
+        return self.rates(t, y)
 
     def contr(self, t0: Array, t1: Array, **kwargs):
         return self.dt
@@ -145,8 +145,8 @@ class _Rate(diffrax.AbstractTerm):
         return jax.tree.map(lambda k: k * control, vf)
 
 
-def _explicit(method: ExplicitRungeKutta, accelerations: Any, t: Array, y: tuple, dt: Array):
-    return method.step(_Rate(accelerations, dt), t, t + dt, y, None, None, True)[0]
+def _explicit(method: ExplicitRungeKutta, rates: Any, t: Array, y: tuple, dt: Array):
+    return method.step(_Rate(rates, dt), t, t + dt, y, None, None, True)[0]
 
 
 def explicit_method(method: Any) -> ExplicitRungeKutta:

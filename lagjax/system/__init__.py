@@ -7,9 +7,10 @@ from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.coordinates import PrecisionWarning, State, is_traced
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.system.hybrid import Hybrid, Switch, replace_fields
-from lagjax.system.model import Form, Model, model_of, unchecked
+from lagjax.system.model import FirstOrder, Form, Model, model_of, unchecked
 from lagjax.system.signature import UnknownSystem, differences, known_system, middle_state, signature
-from lagjax.system.system import System, check_functions
+from lagjax.system.states import with_rates
+from lagjax.system.system import System, check_functions, rate_of
 from lagjax.system.traced_functions import Traced
 from lagjax.system.user_errors import Call, check_arguments, in_words
 from lagjax.system.warn import warn

@@ -16,11 +16,16 @@ CONSTRAINTS = (Holonomic, Nonholonomic)
 SYSTEMS = (System, Hybrid)
 
 
-def check_system(system: Any, *others: Any, phases: bool = False) -> None:
+def check_system(system: Any, *others: Any, phases: bool = False, states: bool = True) -> None:
     """Raise if the first argument of a function is not a `System`, or with `phases` a `Hybrid`.
 
-    `others`: the following arguments, among which the system may be.
+    `others`: the following arguments, among which the system may be. `states`: whether it may have states.
     """
+    if not states and isinstance(system, System) and system.states:
+        raise ValueError(
+            f"this is not done for systems with states, as '{next(iter(system.states))}' here: only coordinates obey "
+            "Lagrange's equations.\nFix: lj.integrate for their motions; here the system without them."
+        )
     if type(system) is System or isinstance(system, SYSTEMS if phases else System):
         return
     known_system(system)

@@ -21,17 +21,19 @@ from lagjax.system.argument_checks import check_system
 from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import OF_STATE, takes_of
 from lagjax.system.model import Model, model_of
+from lagjax.system.states import check_rate, check_starts, check_use, with_rates
 from lagjax.system.system import System, unchecked
 from lagjax.system.traced_functions import Traced, TracedProgram, traced
 from lagjax.system.user_errors import Call, check_arguments, in_words
 
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
+OF_STATES = "the state as an argument of its own: it is q['z'], by its name"
 
 
 def prepare(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> tuple[Model, State]:
     """The model of a system and a state of it, all checked: what a front door does first."""
     check_system(system, t, q, v, params)
-    s = coordinates.state(t, q, v, params)
+    s = coordinates.state(t, q, with_rates(system, q, v), params)
     return model_of(traced_system(system, s), *s), s
 
 
@@ -53,6 +55,7 @@ def traced_system(system: System, s: State) -> System:
     Raises if L, R, Q or a constraint cannot be called, or returns something of the wrong kind or shape.
     """
     check_system(system)
+    check_starts(system.states, s.q)
     given = dict(zip(OF_STATE, s))
 
     def energy(role: str, f: Callable | None) -> Any:
@@ -63,14 +66,20 @@ def traced_system(system: System, s: State) -> System:
     for name, c in system.constraints.items():
         call = Call(c.role, c.function, c.takes, f" of constraint '{name}'")
         constraints[name] = type(c)(traced_call(call, given, _check_constraint))
-    found = unchecked(lagrangian, constraints, None, dissipation)
+    states = {}
+    for name, f in system.states.items():
+        call = Call("rate", f, OF_STATE, f" of state '{name}'")
+        states[name] = traced_call(call, given, partial(check_rate, of=s.q[name]), OF_STATES)
+    found = unchecked(lagrangian, constraints, None, dissipation, states)
     if system.force is None:
+        check_use(found)
         return found
     # After the constraints, which determine the multipliers.
     given["multipliers"] = model_of(found, *s).zero_multipliers()
     call = Call("force", system.force, takes_of(system.force))
     force = traced_call(call, given, partial(_check_force, q=s.q))
-    found = unchecked(lagrangian, constraints, force, dissipation)
+    found = unchecked(lagrangian, constraints, force, dissipation, states)
+    check_use(found)
     model = model_of(found, *s)
     if model.reacts:
         remembered(found, (_check_linear, kinds(s)), lambda: _check_linear(model, s))

@@ -35,13 +35,29 @@ class Residual(NamedTuple):
         return self.shape[0] if self.shape else 1
 
 
+class FirstOrder(NamedTuple):
+    """Coordinates whose velocities are determined, by their places: those of each state by name, and damped ones."""
+
+    states: tuple[tuple[str, tuple[int, ...]], ...]
+    damped: tuple[int, ...]
+
+    def mask(self, n: int) -> np.ndarray:
+        """Which of n coordinates they are, (n,) booleans."""
+        places = [*self.damped, *(i for _, places in self.states for i in places)]
+        return np.isin(np.arange(n), places)
+
+
 class Form(NamedTuple):
-    """The form of a system's states: structure and shapes of q, the dtype, and the residuals of the constraints."""
+    """The form of a system's states: structure and shapes of q, the dtype, and the residuals of the constraints.
+
+    `first_order`: the coordinates of first order, once `mechanics.first_order` has looked for them and found some.
+    """
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
     dtype: np.dtype
     residuals: tuple[Residual, ...]
+    first_order: FirstOrder | None = None
 
     @property
     def n(self) -> int:
@@ -156,6 +172,11 @@ class Model(eqx.Module):
             return force(t, q, v, self.params)
         stacked = jnp.zeros(self.m, self.form.dtype) if multipliers is None else multipliers
         return force(t, q, v, self.split(stacked), self.params)
+
+    @property
+    def is_returned(self) -> bool:
+        """Whether a step is followed by a return of the state, to constraints or to velocities that are determined."""
+        return bool(self.m) or self.form.first_order is not None
 
     @property
     def reacts(self) -> bool:

@@ -20,7 +20,7 @@ from lagjax.system.coordinates import State
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import model_of
-from lagjax.system.system import System
+from lagjax.system.system import System, rate_of
 
 # Values that differ by more than this, relative to the largest of their row, come from another function. Round-off is
 # below it also where large terms cancel, in float32 too, unless only the last digits remain.
@@ -104,6 +104,8 @@ def _signature(system, t: Array, q: PyTree, v: PyTree, params: PyTree):
     for name, c in system.constraints.items():
         words, slopes = ("", (1,)) if c.of_positions else (", of velocities,", (1, 2))
         found[f"the constraint '{name}'{words}"] = values_and_slopes(c.residual, *s, slopes=slopes)
+    for name, f in system.states.items():
+        found[f"the {rate_of(name)}"] = values_and_slopes(f, *s, slopes=(1, 2))
     if system.force is not None:
         ones = jax.tree.map(np.ones_like, model_of(system, *s).zero_multipliers())
         given = s._asdict() | {"multipliers": ones}

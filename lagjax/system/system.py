@@ -67,7 +67,7 @@ def _any_function_is_taken():
     return False
 
 
-FIELDS = "lagrangian", "constraints", "force", "dissipation"
+FIELDS = "lagrangian", "constraints", "force", "dissipation", "states"
 
 
 class System(eqx.Module):
@@ -89,7 +89,10 @@ class System(eqx.Module):
       `[L]/[q]`. It does the work `Q·v` per unit of time. A force on a contact, as Coulomb's friction, is
       `Q(t, q, v, multipliers, params)`, linear in the multipliers: it enters the equations that determine them.
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
-      `R = ½ c v²` gives `-c v`.
+      `R = ½ c v²` gives `-c v`. It may determine a velocity that L does not contain, as of a massless point on a damper.
+    - `states`: by name, `f(t, q, v, params)` -> like `q[name]`, the rate of something without inertia: a bristle, an
+      actuator, a thermostat, a running cost, the memory of a controller. `q` is then a dict, and every function reads
+      the state as `q[name]`; the force and events also its rate, as `v[name]`. Its `v0` may be left out.
 
     Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
     functions can, that is if these are defined with `def` in a module.
@@ -103,6 +106,7 @@ class System(eqx.Module):
     constraints: dict[str, Holonomic | Nonholonomic]
     force: Callable | None
     dissipation: Callable | None
+    states: dict[str, Callable]
 
     def __init__(
         self,
@@ -110,6 +114,7 @@ class System(eqx.Module):
         constraints: Mapping[str, Holonomic | Nonholonomic] | None = None,
         force: Callable | None = None,
         dissipation: Callable | None = None,
+        states: Mapping[str, Callable] | None = None,
     ):
         if isinstance(lagrangian, System):
             raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
@@ -143,16 +148,25 @@ class System(eqx.Module):
                     f'Fix: "{name}": lj.Holonomic(g) for g(t, q, params) = 0, or '
                     f"lj.Nonholonomic(phi) for phi(t, q, v, params) = 0."
                 )
+        for name, f in states.items() if isinstance(states, Mapping) else [("", states)]:
+            if states is not None and not (isinstance(name, str) and name and callable(f)):
+                given = type(states).__name__ if not isinstance(states, Mapping) else f"{{{name!r}: {f!r:.40}}}"
+                raise TypeError(
+                    f"states must be functions by name, not {given}.\n"
+                    "Usual cause: a start value in the place of the function that is its rate.\n"
+                    'Fix: states={"z": lambda t, q, v, params: ...}; its start value is q0["z"].'
+                )
         self.lagrangian = lagrangian
         # JAX sorts a dict whenever it passes through a transformation; the order of equations must not depend on that.
         self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
+        self.states = dict(sorted((states or {}).items()))
 
     def map(self, change: Callable[[Callable, str], Callable]) -> "System":
         """The system with `change(function, role)` in place of each of its functions, unchecked.
 
-        Roles: "lagrangian", "force", "dissipation", and those of constraints, "g" and "phi".
+        Roles: "lagrangian", "force", "dissipation", `rate_of` a state, and those of constraints, "g" and "phi".
         """
 
         def change_if(function: Callable | None, role: str) -> Any:
@@ -163,6 +177,7 @@ class System(eqx.Module):
             {name: type(c)(change(c.function, c.role)) for name, c in self.constraints.items()},
             change_if(self.force, "force"),
             change_if(self.dissipation, "dissipation"),
+            {name: change(f, rate_of(name)) for name, f in self.states.items()},
         )
 
     in_phases: ClassVar[bool] = False
@@ -186,6 +201,11 @@ class System(eqx.Module):
         return self
 
     @property
+    def is_forced(self) -> bool:
+        """Whether the motion is that of more than L and the constraints."""
+        return self.force is not None or self.dissipation is not None or bool(self.states)
+
+    @property
     def is_holonomic(self) -> bool:
         """Whether no constraint restricts velocities alone."""
         return all(c.of_positions for c in self.constraints.values())
@@ -194,7 +214,8 @@ class System(eqx.Module):
         """The user's functions by role."""
         of_constraints = {f"{c.role} of constraint '{name}'": c.function for name, c in self.constraints.items()}
         others = {"the force": self.force, "the dissipation": self.dissipation}
-        return {"the Lagrangian": self.lagrangian, **of_constraints, **others}
+        of_states = {f"the {rate_of(name)}": f for name, f in self.states.items()}
+        return {"the Lagrangian": self.lagrangian, **of_constraints, **others, **of_states}
 
     def __hash__(self):
         return hash(kinds(untraced(self)))
@@ -215,7 +236,14 @@ class System(eqx.Module):
             parts.append(f"force: {_name(self.force)}")
         if self.dissipation is not None:
             parts.append(f"dissipation: {_name(self.dissipation)}")
+        if self.states:
+            parts.append("states: " + ", ".join(self.states))
         return by_line(f"System({'; '.join(parts)})")
+
+
+def rate_of(state: str) -> str:
+    """The role of the function that is the rate of a state."""
+    return f"rate of state '{state}'"
 
 
 def untraced(tree: PyTree):
@@ -227,9 +255,9 @@ def untraced(tree: PyTree):
     return jax.tree.map(lambda x: x.function if traced(x) else x, tree, is_leaf=traced)
 
 
-def unchecked(lagrangian: Callable, constraints: dict, force: Callable, dissipation) -> System:
+def unchecked(lagrangian: Callable, constraints: dict, force: Callable, dissipation, states: dict) -> System:
     """A system of these functions, which have been checked: to make a module the usual way takes long."""
-    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation))))
+    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation, states))))
 
 
 def _name(function: Callable):

@@ -102,7 +102,7 @@ def connect(
 
     Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `index.py`.
     """
-    check_system(system, q_a, q_b, params)
+    check_system(system, q_a, q_b, params, states=False)
     model, ends = _problem(system, q_a, q_b, t_a, t_b, params, end, free_time)
     dtype = np.dtype(ends.x_a.dtype)
     rtol = TOLERANCE.get(dtype, 1e-5) if rtol is None else rtol

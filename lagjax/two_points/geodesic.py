@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import listed
-from lagjax.system import System, coordinates, model_of, prepare
+from lagjax.system import System, check_system, coordinates, model_of, prepare
 from lagjax.two_points.connect import ELEMENTS, connect
 from lagjax.two_points.result import Connection
 
@@ -116,6 +116,7 @@ def geodesic(
     Source: do Carmo, *Riemannian Geometry*, §9.2.
     """
     system = metric if isinstance(metric, System) else System(LineElement(metric))
+    check_system(system, a, b, params, states=False)
     model, s = prepare(system, 0.0, a, a, params)
     one = prepare(system, 0.0, b, b, params)[1] if jax.tree.structure(a) == jax.tree.structure(b) else s
     eager = is_eager() and not is_traced((s, one, eqx.filter(system, eqx.is_array)))

@@ -81,7 +81,7 @@ def asked(
     counts: tuple[tuple[str, Any, int], ...],
 ) -> Question:  # fmt: skip
     """The question, after all that can be wrong with it was looked for."""
-    check_system(system)
+    check_system(system, states=False)
     if is_traced((controls, start, end, params, times)):
         raise TypeError(
             "lj.steer is called from Python alone: its solver is not a JAX program.\n"

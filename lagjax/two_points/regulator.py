@@ -109,7 +109,7 @@ def lqr(
 
     Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.4.
     """
-    check_system(system)
+    check_system(system, states=False)
     q, v = state
     if any(not c.of_positions for c in system.constraints.values()):
         raise ValueError(

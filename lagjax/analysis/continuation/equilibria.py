@@ -90,7 +90,7 @@ def continue_equilibria(
     Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Govaerts, *Numerical Methods for Bifurcations of
     Dynamical Equilibria*, ch. 2-4.
     """
-    check_system(system, params, start)
+    check_system(system, params, start, states=False)
     q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))

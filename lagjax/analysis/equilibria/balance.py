@@ -83,7 +83,7 @@ class Steady(eqx.Module):
     @property
     def conservative(self) -> bool:
         """Whether there is neither a force nor dissipation."""
-        return self.system.force is None and self.system.dissipation is None
+        return not self.system.is_forced
 
     def parts(self, y):
         """Split a vector of unknowns into positions, rates and multipliers."""

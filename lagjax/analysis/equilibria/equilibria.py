@@ -211,7 +211,7 @@ def equilibria(
     Source: Marsden & Ratiu, *Introduction to Mechanics and Symmetry*, §8.9; Goldstein, Eq. (6.1); Nocedal & Wright,
     *Numerical Optimization*, §10.3.
     """
-    check_system(system, params, starts)
+    check_system(system, params, starts, states=False)
     q = stacked(starts)
     count = jax.tree.leaves(q)[0].shape[0]
     v = _at_rest(q) if velocities is None else _velocities(velocities, q, count)

@@ -61,7 +61,7 @@ def action(
 
     Source: Goldstein, Eq. (2.1).
     """
-    check_system(system, path, params)
+    check_system(system, path, params, states=False)
     if isinstance(path, Trajectory):
         found = _action_of_trajectory(system, path, params, t0, t1, pieces)
         return found if error else found[0]

@@ -154,7 +154,7 @@ def hamiltonian(system: System) -> Hamiltonian:
 
     Source: Goldstein, Eq. (8.15), (8.18).
     """
-    check_system(system)
+    check_system(system, states=False)
     return Hamiltonian(system)
 
 

@@ -96,7 +96,7 @@ def latex(system, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> Equa
 
     Source: Goldstein, *Classical Mechanics*, Eq. (1.57), (2.26).
     """
-    check_system(system, q, v, params)
+    check_system(system, q, v, params, states=False)
     sympy_itself("lj.latex")
     system, s = checked(system, coordinates.State(t, q, v, params))
     model = model_of(system, *s)

@@ -141,7 +141,7 @@ def routhian(system: System, cyclic: str | Iterable[str]) -> System:
 
     Source: Goldstein, §8.3, with the opposite sign; Landau & Lifshitz, *Mechanics*, §41.
     """
-    check_system(system, cyclic)
+    check_system(system, cyclic, states=False)
     names = (cyclic,) if isinstance(cyclic, str) else tuple(cyclic)
     if not names or len(set(names)) < len(names):
         raise ValueError('cyclic must name at least one coordinate, and each only once.\nFix: cyclic=["phi", "psi"].')

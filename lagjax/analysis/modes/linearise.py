@@ -21,7 +21,7 @@ from lagjax.analysis.modes.reduced_matrices import LinearisationKind, LinearPart
 from lagjax.jaxtools import compiled, is_eager, is_traced, remembered
 from lagjax.mechanics import explain_failure, invariance, where
 from lagjax.numerics import DEPENDENT_BELOW, dense, lapack
-from lagjax.system import Model, State, constraints, coordinates, prepare
+from lagjax.system import Model, State, check_system, constraints, coordinates, prepare
 
 # A state given with seven digits is accepted; frequencies are then accurate to about as many.
 STEADY_BELOW = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
@@ -283,6 +283,7 @@ def linearise(system, t, q: PyTree, v: PyTree, params: PyTree) -> Linearisation:
 
     Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Meijaard et al., *Proc. R. Soc. A* 463 (2007) 1955, Appendix B.
     """
+    check_system(system, t, q, v, params, states=False)
     model, s = prepare(system, t, q, v, params)
     traced = not is_eager() or is_traced((s, eqx.filter(model, eqx.is_array)))
     kind = _kind(model, s)
@@ -313,7 +314,7 @@ def _kind(model: Model, s: State) -> LinearisationKind:
     system, holonomic = model.system, tuple(model.holonomic.tolist())
     known = remembered(model, invariance, lambda: invariance(model))
     at_rest = not is_traced(s.v) and not any(np.any(x) for x in jax.tree.leaves(s.v))
-    conservative = system.force is None and system.dissipation is None and all(holonomic)
+    conservative = not system.is_forced and all(holonomic)
     at_rest = conservative and at_rest and known.even
     return LinearisationKind(known.unseen, holonomic, (True,) * len(holonomic), conservative, at_rest, known.timeless)
 

@@ -148,7 +148,7 @@ class OrbitProblem(NamedTuple):
 
 def problem_of(system: System, given: State) -> OrbitProblem:
     """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
-    check_system(system, *given[1:])
+    check_system(system, *given[1:], states=False)
     s = coordinates.prepared(*given)
     system = traced_system(system, s)
     state = coordinates.state(*s)
@@ -156,7 +156,7 @@ def problem_of(system: System, given: State) -> OrbitProblem:
     rows = independent_rows_of(model, state)
     _check_freedom(model.n, len(all_rows(model) if rows is None else rows), rows is not None)
     known = invariance(model)
-    conserves = system.force is None and system.dissipation is None and system.is_holonomic
+    conserves = not system.is_forced and system.is_holonomic
     reasons = Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
     return OrbitProblem(system, s, reasons, rows, tuple(are_angles(model).tolist()))
 

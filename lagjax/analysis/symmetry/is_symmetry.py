@@ -118,7 +118,7 @@ def is_symmetry(system, generator, q: PyTree, v: PyTree, params: PyTree = None, 
 
     Source: Goldstein, *Classical Mechanics*, §13.7; Neĭmark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.6.
     """
-    check_system(system, generator, q, v, params)
+    check_system(system, generator, q, v, params, states=False)
     generator = as_generator(generator)
     s = coordinates.state(t, q, v, params)
     model = model_of(traced_system(system, s), *s)
@@ -150,7 +150,7 @@ def is_symmetry(system, generator, q: PyTree, v: PyTree, params: PyTree = None, 
         generator.name,
         xp.where(count < AT_LEAST, xp.full_like(residual, xp.nan), residual),
         largest(found.charge), largest(found.lagrangian), largest(found.force),
-        system.force is not None or system.dissipation is not None,
+        system.is_forced,
         displacement, {name: invariance[name] for name in sorted(of_velocities)},
         found.charges[0, 0], rate, count,
         "" if xp is not np else f"t = {float(s.t):.6g}, q = {describe(at.q)}, v = {describe(at.v)}",

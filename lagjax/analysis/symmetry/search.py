@@ -140,7 +140,7 @@ def _cleaned(row, zero_below):
 
 def scalings_of(model: Model, tried: Basis, sampled: Rates, precision: Precision) -> tuple[Scaling, ...]:
     """The scalings that multiply L by a factor."""
-    if model.system.force is not None or model.system.dissipation is not None:
+    if model.system.is_forced:
         return ()
     chosen = np.flatnonzero(np.array(tried.kinds) == "scaling")
     columns = [np.append(tried.affine.matrix[i].ravel(), tried.affine.clock_rate[i]) for i in chosen]
@@ -220,7 +220,7 @@ def symmetries(
 
     Source: Olver, *Applications of Lie Groups to Differential Equations*, §4.4.
     """
-    check_system(system, q, v, params)
+    check_system(system, q, v, params, states=False)
     s = coordinates.state(t, q, v, params)
     if is_traced(s):
         raise TypeError(

@@ -24,9 +24,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from lagjax.fit.problem.records import Record, Windows, spread
 from lagjax.integrate import integrate
 from lagjax.jaxtools import compiled, is_traced, kinds, numpy_of, once, stop_gradient
-from lagjax.mechanics import departures, equations_of, free_coordinates, listed, within
+from lagjax.mechanics import departures, equations_of, free_coordinates, listed, with_first_order, within
 from lagjax.numerics import last_step, newton, null_space
-from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system
+from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system, with_rates
 
 # Position and velocity are read off a parabola through this many samples.
 SAMPLES = 7
@@ -100,7 +100,12 @@ def starts(
     system, charts = traced_system(system, guesses[0]), []
     for w, (r, guess) in enumerate(zip(windows.record, guesses)):
         held = (records[r].hold_q, records[r].hold_v) if w in windows.first else (False, False)
-        charts.append(_charts(system, guess, *(_free(guess.q, hold) for hold in held), r))
+        free_q, free_v = (_free(guess.q, hold) for hold in held)
+        if w in windows.first:
+            # No motion depends on the given velocity of a coordinate of first order; at later windows it must agree.
+            first = with_first_order(model_of(system, *guess)).form.first_order
+            free_v = free_v if first is None else free_v & ~first.mask(len(free_v))
+        charts.append(_charts(system, guess, free_q, free_v, r))
     q, v = zip(*charts)
     k = max(chart.along.shape[1] for chart in q), max(chart.along.shape[1] for chart in v)
     return Starts(_stacked(q, 0, sum(k)), _stacked(v, k[0], sum(k))), unflatten_of(kinds(guesses[0].q)), guesses[0]
@@ -152,6 +157,7 @@ def _guess(system: System, record: Record, r: int, params: PyTree) -> State:
             )
         if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
             v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
+    v = with_rates(system, q, v)
     if is_traced((q, v, params)):
         if system.constraints:
             raise TypeError(

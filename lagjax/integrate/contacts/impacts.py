@@ -101,7 +101,9 @@ class _Rebound(eqx.Module):
         """Return the least change of the velocities that changes the residual of the last entry of `contact` by one,
         but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
         before = self.before
-        system = System(before.lagrangian, before.constraints | contact, before.force, before.dissipation)
+        system = System(
+            before.lagrangian, before.constraints | contact, before.force, before.dissipation, before.states
+        )  # fmt: skip
         model = model_of(system, t, q, v, params)
         change = model.belongs_to(list(contact)[-1]).astype(model.form.dtype)
         found = velocity_change(model, t, q, v, jnp.asarray(change))

@@ -1,6 +1,6 @@
-"""The jumps of a system, found in the programs of L, the force and the dissipation.
+"""The jumps of a system, found in the programs of L, the force, the dissipation and the rates of states.
 
-In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all three are smooth. `found` traces them once,
+In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all of them are smooth. `found` traces them once,
 on shapes, and gives the smooth system, the guard of each mode, and what is known of jumps that depend on t alone: a
 pulse, a relay, a square wave.
 
@@ -23,12 +23,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps, outputs_of, run
-from lagjax.system import OF_STATE, Model, State, System, takes_of
+from lagjax.system import OF_STATE, Model, State, System, rate_of, takes_of
 
 # More modes than this are not followed: each adds to the program that watches the motion.
 MOST = 24
 NAMES = {"lagrangian": "Lagrangian", "force": "force", "dissipation": "dissipation"}
-ROLES = tuple(NAMES)
 
 
 class Given(NamedTuple):
@@ -126,10 +125,10 @@ class Jumps:
         of_state = [
             f"{'a comparison' if slot.kind in COMPARISONS else slot.kind} of "
             f"{', '.join(x for x in 'tqv' if x in slot.depends)} "
-            f"in the {' and the '.join(NAMES[role] for role in ROLES if role in slot.roles)}"
+            f"in the {' and the '.join(NAMES.get(role, role) for role in self.traced if role in slot.roles)}"
             for slot in self.slots
         ]
-        of_time = [f"t in the {NAMES[role]}" for role, traced in self.traced.items() for _ in traced.of_time]
+        of_time = [f"t in the {NAMES.get(role, role)}" for role, traced in self.traced.items() for _ in traced.of_time]
         counts = Counter(of_state + of_time)
         return [text if n == 1 else f"{text} ({n} times)" for text, n in counts.items()]
 
@@ -155,7 +154,7 @@ class Jumps:
             for k, place in enumerate(traced.places):
                 output = traced.shape.num_leaves + 4 * k + which
                 program = outputs_of(traced.program, [output])
-                function, one = getattr(system, role), jtu.tree_structure(0)
+                function, one = _functions(system)[role], jtu.tree_structure(0)
                 found[place] = Smooth(function, program, one, OF_STATE, traced.multipliers)
         return found
 
@@ -169,7 +168,7 @@ class Jumps:
 
 def found(model: Model, state: State) -> Jumps | None:
     """The jumps and kinks of a system; None if there are none. Only shapes of the state count."""
-    functions = {role: getattr(model.system, role) for role in ROLES}
+    functions = _functions(model.system)
     given = state._asdict() | {"multipliers": model.zero_multipliers() if model.reacts else {}}
     programs = {role: _traced(function, given) for role, function in functions.items() if function is not None}
     programs = {role: traced for role, traced in programs.items() if has_jumps(traced.program.jaxpr)}
@@ -190,6 +189,11 @@ def found(model: Model, state: State) -> Jumps | None:
         opened[role] = _with_modes(traced, role, table, starts, count, defined)
     known = Jumps(tuple(slots.values()), opened, tuple(missed))
     return known if known.count or known.in_time or known.missed else None
+
+
+def _functions(system: System) -> dict[str, Callable | None]:
+    """What may jump, by role."""
+    return {role: getattr(system, role) for role in NAMES} | {rate_of(z): f for z, f in system.states.items()}
 
 
 class _Program(NamedTuple):
@@ -301,7 +305,7 @@ def with_jumps_in_time(jumps: Jumps, jump_ts, system: System, q: PyTree, v: PyTr
     found, sought, too_many = [] if jump_ts is None else [jump_ts], [], jnp.asarray(False)
     for role, traced in jumps.traced.items():
         arguments = {"q": q, "v": v, "params": params, "multipliers": traced.zeros(ts.dtype)}
-        of_role = traced, getattr(system, role), arguments
+        of_role = traced, _functions(system)[role], arguments
         found += [jnp.ravel(x) for x in _at(ts[0], [place for place, timed in traced.of_time if timed.at], *of_role)]
         sought += [of_role] if any(not timed.at for _, timed in traced.of_time) else []
     if sought:

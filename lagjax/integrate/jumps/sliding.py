@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.jumps.find import Given, Jumps, Smooth
-from lagjax.mechanics import applied_force, mass_and_forcing
+from lagjax.mechanics import applied_force, completed, mass_and_forcing, with_first_order
 from lagjax.numerics import dense
 from lagjax.system import OF_STATE, WITH_MULTIPLIERS, Model, System, constraints, coordinates, model_of, takes_of
 
@@ -64,7 +64,7 @@ class Sliding(eqx.Module):
 
     def mixture(self, t: Array, q: PyTree, v: PyTree, given: Given) -> Mixture:
         """Solve for the shares."""
-        model = model_of(self.system, t, q, v, given)
+        model = with_first_order(model_of(self.system, t, q, v, given))
         x, u = model.vectors(q, v)
         a, solve = self._accelerations(model, t, x, u)
         changes = [solve(self._change(i, t, q, v, given)) for i in self.which]
@@ -93,7 +93,8 @@ class Sliding(eqx.Module):
         rows = constraints.acceleration_rows(model, t, x, u)
         solver = dense.Saddle(linear.mass, rows.jacobian)
         still = jnp.zeros_like(rows.gamma)
-        return solver.solve(linear.forcing, rows.gamma)[0], lambda force: solver.solve(force, still)[0]
+        a = completed(model, t, x, u, solver.solve(linear.forcing, rows.gamma)[0])
+        return a, lambda force: solver.solve(force, still)[0]
 
     def _change(self, i, t: Array, q: PyTree, v: PyTree, given):
         """How the generalized force changes on the other side of jump i, as a vector."""

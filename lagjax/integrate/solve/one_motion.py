@@ -95,6 +95,10 @@ def solved(
     # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
     fast = ours and settings.event is None
     equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
+    first_order = equations.model.form.first_order
+    if first_order is not None and settings.drift == "none":
+        # Velocities that are determined are returned to their values whatever becomes of constraints.
+        settings = replace(settings, drift="project")
     if guards is not None and equations.users is not None:
         guards = guards.in_numbers(equations.users.tree)
     start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings, sizes_so_far)
@@ -148,7 +152,10 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
         if settings.drift == "project" and not equations.are_taken_for_regular:
             off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
-    scales = scales_of(mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))) if settings.by_size else None
+    first_order = equations.model.form.first_order
+    without_mass = np.zeros(equations.model.n, bool) if first_order is None else first_order.mask(equations.model.n)
+    at_start = mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))
+    scales = scales_of(*at_start, without_mass & ~without_mass.all()) if settings.by_size else None
     if scales is not None and sizes_so_far is not None:
         scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps

@@ -47,7 +47,8 @@ class Field(eqx.Module):
 
     def __call__(self, t: Array, y: PyTree, args: PyTree):
         independent = args.independent if isinstance(args, StageConstraints) else None
-        return y[1], kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))[0]
+        a, _ = kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))
+        return self.equations.velocities(t, *y), a
 
 
 class FastField(eqx.Module):
@@ -56,7 +57,7 @@ class FastField(eqx.Module):
     equations: Equations
 
     def __call__(self, t: Array, y: PyTree, args: PyTree):
-        return y[1], self.equations.fast(t, *y)[0]
+        return self.equations.velocities(t, *y), self.equations.fast(t, *y)[0]
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):

@@ -86,14 +86,20 @@ def span_of(ts: Array):
     return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
-def scales_of(mass, q: PyTree, v: PyTree, a, span) -> Scales:
-    """The scales of a motion, from its first state and the accelerations there, which need not be finite."""
+def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np.bool = np.False_) -> Scales:
+    """The scales of a motion, from its first state and the accelerations there, which need not be finite.
+
+    `without_mass` (n,): the coordinates of first order, in units of their own: they set no scale for others, and the
+    round-off in them is that of the largest mass.
+    """
     root_mass, sizes = (
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
         jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
     )
+    root_mass = jnp.where(without_mass, 0.0, root_mass)
     heaviest = jnp.max(root_mass)
     over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
+    over_root_mass = jnp.where(without_mass, jnp.min(over_root_mass), over_root_mass)
     of_q, of_v, of_a = jnp.max(root_mass * sizes, axis=1)
     nothing = (of_q == 0) & (of_v == 0)
     # Zero sizes follow from the others: a velocity from extent and acceleration, otherwise from the time scale.
@@ -105,7 +111,7 @@ def scales_of(mass, q: PyTree, v: PyTree, a, span) -> Scales:
     of_q = jnp.maximum(of_q, of_v * time)
     reach = jnp.stack([of_q, of_v])[:, None]
     least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
-    first = jnp.where(nothing, least, sizes[:2])
+    first = jnp.where(nothing & ~without_mass, least, sizes[:2])
     return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
 
 
