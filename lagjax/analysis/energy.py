@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.display import plots as plot
 from lagjax.integrate import ENDED_WELL, HybridTrajectory, Trajectory, integrate, is_among, message
 from lagjax.jaxtools import compiled, is_traced
-from lagjax.mechanics import sees_time, with_first_order
+from lagjax.mechanics import of_states, sees_time
 from lagjax.numerics import quadrature
 from lagjax.system import Hybrid, Model, System, constraints, coordinates, model_of
 
@@ -288,10 +288,8 @@ def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree):
             powers[DISSIPATION] = -jax.grad(model.dissipation, argnums=2)(t, x, u) * u
         if system.states:
             # What L stores in a state is not given by a force: as for time, -∂L/∂z z'.
-            places = np.array([i for _, among in with_first_order(model).form.first_order.states for i in among])
-            powers[STATES] = (
-                jnp.zeros_like(u).at[places].set(-(jax.grad(model.lagrangian, argnums=1)(t, x, u) * u)[places])
-            )
+            power = -jax.grad(model.lagrangian, argnums=1)(t, x, u) * u
+            powers[STATES] = jnp.where(of_states(model), power, 0.0)
         if timed:
             powers[TIME] = -jax.grad(model.lagrangian)(t, x, u)[None]
         rows = constraints.jacobian(model, t, x, u)

@@ -75,8 +75,9 @@ def integrate(
 
     - `system`: the `System`; or a `Hybrid`, a motion in phases.
     - `q0`, `v0`: initial coordinates and velocities, any pytree of numbers and arrays, alike; `[q]`, `[q]/[t]`. Whole
-      numbers become floats. `v0` may leave out states. A list is a pytree, not a vector; angles are in radians. A start that is off the
-      constraints by no more than about the tolerance is moved onto them.
+      numbers become floats. A list is a pytree, not a vector; angles are in radians. A start that is off the
+      constraints by no more than about the tolerance is moved onto them. The velocities of states, which `v0` may leave
+      out, and of massless coordinates on dampers are what they are determined to be.
     - `params`: what the Lagrangian takes; gradients flow to its floating arrays.
     - `ts` (T,): output times, `[t]`, increasing or, to run backward, decreasing. Each is the end of a step of the
       method, except as `outputs` says. (Decreasing times have to be known while JAX is tracing: a NumPy array.)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.first_order import of_states, with_first_order
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 from lagjax.system import Model, State, constraints, coordinates
 
@@ -30,6 +31,22 @@ def explain_failure(model: Model, s: coordinates.State) -> str | None:
             "Usual cause: a division by zero, a root or logarithm of a negative number, or NaN in params.\n"
             "Fix: evaluate lagrangian(t, q, v, params) there, term by term."
         )
+    first = with_first_order(model).form.first_order
+    undetermined = np.flatnonzero(~np.isfinite(coordinates.flatten(found.a)[0])) if first is not None else ()
+    for i in undetermined:
+        if first is not None and i in first.damped:
+            return (
+                f"the velocity of '{names[i]}' is not determined {place}: L does not contain it, and neither force nor "
+                "dissipation depends on it there.\n"
+                "Usual cause: a damping of zero in params.\n"
+                f"Fix: a damping above zero, a mass of '{names[i]}' in L, or the system without it."
+            )
+        if of_states(model)[i]:
+            return (
+                f"the rate of state '{names[i]}', or its change with time, is not finite {place}.\n"
+                "Usual cause: a division by zero in its function, or sqrt at 0.\n"
+                "Fix: evaluate the function there."
+            )
     for what, values in (("mass matrix", linear.mass), ("force", linear.forcing)):
         if not np.all(np.isfinite(values)):
             bad = np.argwhere(~np.isfinite(np.asarray(values)))[0]

@@ -43,6 +43,12 @@ def with_first_order(model: Model) -> Model:
     return _with(model, found) if found.states or found.damped else model
 
 
+def of_states(model: Model) -> np.ndarray:
+    """Which coordinates are states, (n,) booleans."""
+    first = with_first_order(model).form.first_order
+    return np.zeros(model.n, bool) if first is None else first._replace(damped=()).mask(model.n)
+
+
 def _with(model: Model, found: FirstOrder) -> Model:
     return unchecked(model.system, model.params, model.form._replace(first_order=found))
 
@@ -65,13 +71,13 @@ def _damped(model: Model, states: list[int]) -> tuple[int, ...]:
     if n > UP_TO or model.reacts or not (system.force or system.dissipation):
         return ()
 
+    def lagrangian(model: Model, *state):
+        return model.system.lagrangian(*state, model.params)
+
     def residuals(model: Model, *state):
         return [c.residual(*state, model.params) for c in model.system.constraints.values()]
 
-    in_lagrangian = Numbers(
-        lambda model, *state: model.system.lagrangian(*state, model.params), in_numbers(model), WRITTEN
-    )
-    in_constraints = Numbers(residuals, in_numbers(model), WRITTEN)
+    in_lagrangian, in_constraints = (Numbers(f, in_numbers(model), WRITTEN) for f in (lagrangian, residuals))
 
     def free(i: int) -> bool:
         _, *y = in_constraints.state_variables
@@ -141,7 +147,8 @@ def _solved(matrix: Array, known: Array):
     if known.size > ONE_BY_ONE:
         return dense.solve(matrix, known)
     x, pivots = solve_without_exchanges([list(row) for row in matrix], list(known))
-    return jnp.where(jnp.stack(pivots) != 0, jnp.stack(x), jnp.nan)
+    # A product, so that derivatives are not numbers either.
+    return jnp.stack(x) * jnp.where(jnp.stack(pivots) != 0, 1.0, jnp.nan)
 
 
 def completed(model: Model, t: Array, x: Array, u: Array, a: Array) -> Float[Array, " n"]:

@@ -18,7 +18,7 @@ def with_rates(system: Any, q: PyTree, v: PyTree) -> PyTree:
     if not (isinstance(q, Mapping) and isinstance(v, Mapping)):
         return v
     left_out = {name for phase in system.phases for name in phase.states if name in q and name not in v}
-    return {**v, **{name: _zeros_like(q[name]) for name in sorted(left_out)}} if left_out else v
+    return {**v, **{name: jtu.tree_map(_zeros_like, q[name]) for name in sorted(left_out)}} if left_out else v
 
 
 def _zeros_like(x: Any):

@@ -89,10 +89,12 @@ class System(eqx.Module):
       `[L]/[q]`. It does the work `Q·v` per unit of time. A force on a contact, as Coulomb's friction, is
       `Q(t, q, v, multipliers, params)`, linear in the multipliers: it enters the equations that determine them.
     - `dissipation`: Rayleigh's function `R(t, q, v, params)` -> scalar; its force is `-∂R/∂v`, so
-      `R = ½ c v²` gives `-c v`. It may determine a velocity that L does not contain, as of a massless point on a damper.
+      `R = ½ c v²` gives `-c v`. A velocity that L does not contain, as of a massless point on a damper, is what makes
+      the forces on its coordinate zero, if they are linear in it.
     - `states`: by name, `f(t, q, v, params)` -> like `q[name]`, the rate of something without inertia: a bristle, an
       actuator, a thermostat, a running cost, the memory of a controller. `q` is then a dict, and every function reads
-      the state as `q[name]`; the force and events also its rate, as `v[name]`. Its `v0` may be left out.
+      the state as `q[name]`; the force and events also its rate, as `v[name]`. No force acts on it. See
+      `docs/states.md`.
 
     Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
     functions can, that is if these are defined with `def` in a module.
@@ -148,20 +150,20 @@ class System(eqx.Module):
                     f'Fix: "{name}": lj.Holonomic(g) for g(t, q, params) = 0, or '
                     f"lj.Nonholonomic(phi) for phi(t, q, v, params) = 0."
                 )
-        for name, f in states.items() if isinstance(states, Mapping) else [("", states)]:
-            if states is not None and not (isinstance(name, str) and name and callable(f)):
-                given = type(states).__name__ if not isinstance(states, Mapping) else f"{{{name!r}: {f!r:.40}}}"
-                raise TypeError(
-                    f"states must be functions by name, not {given}.\n"
-                    "Usual cause: a start value in the place of the function that is its rate.\n"
-                    'Fix: states={"z": lambda t, q, v, params: ...}; its start value is q0["z"].'
-                )
+        states = {} if states is None else states
+        by_name = isinstance(states, Mapping) and all(isinstance(name, str) for name in states)
+        if not by_name or not all(map(callable, states.values())):
+            raise TypeError(
+                f"states must be functions by name, not {states!r:.60}.\n"
+                "Usual cause: a start value in the place of the function that is its rate.\n"
+                'Fix: states={"z": lambda t, q, v, params: ...}; its start value is q0["z"].'
+            )
         self.lagrangian = lagrangian
         # JAX sorts a dict whenever it passes through a transformation; the order of equations must not depend on that.
         self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
-        self.states = dict(sorted((states or {}).items()))
+        self.states = dict(sorted(states.items()))
 
     def map(self, change: Callable[[Callable, str], Callable]) -> "System":
         """The system with `change(function, role)` in place of each of its functions, unchecked.

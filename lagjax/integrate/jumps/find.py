@@ -1,8 +1,8 @@
 """The jumps of a system, found in the programs of L, the force, the dissipation and the rates of states.
 
-In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all of them are smooth. `found` traces them once,
-on shapes, and gives the smooth system, the guard of each mode, and what is known of jumps that depend on t alone: a
-pulse, a relay, a square wave.
+In a given *mode* (the outcome of each comparison, see `open_jumps.py`) all of them are smooth. `found` traces them
+once, on shapes, and gives the smooth system, the guard of each mode, and what is known of jumps that depend on t alone:
+a pulse, a relay, a square wave.
 
 The times of these become ends of steps (`with_jumps_in_time`). Where the program compares t itself with a number
 (`t < off`), that number is the time. All other comparisons of functions of t are evaluated on a fine grid, and each

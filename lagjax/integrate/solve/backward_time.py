@@ -93,11 +93,11 @@ def runs_backward(ts) -> bool:
 
 def reflect_system(system: System) -> System:
     """Return the system whose forward motion is the backward motion of `system`."""
-    return system.map(
-        lambda f, role: Reflected(
-            f, of_velocities=role != "g", odd=role in ("phi", "dissipation") or role.startswith("rate")
-        )
-    )
+
+    def odd(role: str) -> bool:
+        return role in ("phi", "dissipation") or role.startswith("rate")
+
+    return system.map(lambda f, role: Reflected(f, of_velocities=role != "g", odd=odd(role)))
 
 
 def reflect_snapshot(snapshot: Snapshot) -> Snapshot:

@@ -1,0 +1,264 @@
+"""Coordinates of first order: states and damped coordinates against closed forms, SciPy and eigenvalues."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+import lagjax as lj
+
+ONE = np.array([0.0, 1.0])
+
+
+def oscillator(t, q, v, params):
+    return 0.5 * v["x"] ** 2 - 0.5 * q["x"] ** 2
+
+
+def cost(t, q, v, params):
+    return v["x"] ** 2
+
+
+SWING = {"x": 1.0, "c": 0.0}, {"x": 0.0}
+costly = lj.System(oscillator, states={"c": cost})
+
+
+def spent(t):
+    """The integral of sin² until t."""
+    return 0.5 * (t - 0.5 * np.sin(2.0 * t))
+
+
+def test_a_running_cost():
+    """c' = v² of cos t, to 1e-12; twin: half of it is another number. The rate is the velocity of c, at every output."""
+    ts = np.linspace(0.0, 20.0, 9)
+    motion = lj.integrate(costly, *SWING, ts=ts, rtol=1e-12)
+    np.testing.assert_allclose(motion.q["c"], spent(ts), atol=1e-12)
+    np.testing.assert_allclose(motion.v["c"], motion.v["x"] ** 2, atol=0.0, rtol=1e-15)
+    np.testing.assert_allclose(motion.at(1.3).q["c"], spent(1.3), rtol=1e-9)
+    assert spent(20.0) / 2 < motion.q["c"][-1] - 1.0
+
+
+def test_its_acceleration_at_one_state():
+    """dv²/dt = 2 v a. Twin: the velocity given for the state does not count."""
+    q, v = {"x": 0.5, "c": 7.0}, {"x": 3.0}
+    for given in (v, v | {"c": 100.0}):
+        a, multipliers = lj.accelerations(costly, 0.0, q, given, None)
+        np.testing.assert_allclose([a["x"], a["c"]], [-0.5, -3.0], rtol=1e-15)
+        assert not multipliers
+    np.testing.assert_allclose(lj.consistent_state(costly, 0.0, q, v, None)[1]["c"], 9.0)
+
+
+@pytest.mark.slow
+def test_backward_and_in_steps():
+    """The same cost backward in time, and by steps of a fixed length. Twin: with its sign."""
+    backward = lj.integrate(costly, *SWING, ts=np.array([3.0, 0.0]))
+    np.testing.assert_allclose([backward.q["c"][-1], backward.v["c"][0]], [-spent(3.0), 0.0], atol=1e-9)
+    _, q, v = lj.rollout(costly, *SWING, None, 300, 0.01)
+    np.testing.assert_allclose(q["c"][-1], spent(3.0), rtol=1e-8)
+    np.testing.assert_allclose(v["c"], v["x"] ** 2, rtol=1e-15)
+
+
+@pytest.mark.slow
+def test_in_lanes_and_in_float32():
+    """Lanes of different starts, and single precision in and out."""
+    ts = np.linspace(0.0, 3.0, 4)
+    ends = jax.vmap(lambda x: lj.integrate(costly, {"x": x, "c": 0.0}, {"x": 0.0}, ts=ts).q["c"][-1])(
+        jnp.arange(1.0, 4)
+    )
+    np.testing.assert_allclose(ends, spent(3.0) * np.arange(1.0, 4.0) ** 2, rtol=1e-9)
+    single = jax.tree.map(np.float32, SWING)
+    motion = lj.integrate(costly, *single, ts=ts)
+    assert motion.q["c"].dtype == motion.v["c"].dtype == np.float32
+    np.testing.assert_allclose(motion.q["c"], spent(ts), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_an_event_that_reads_a_state():
+    """c reaches 1 at spent(t) = 1; its derivative by the amplitude, forward and in reverse, is that of the formula."""
+    spends = {"spent": lj.Crossing(lambda t, q, v, p: q["c"] - 1.0, terminal=True)}
+
+    def when(x):
+        return lj.integrate(costly, {"x": x, "c": 0.0}, {"x": 0.0}, ts=np.array([0.0, 9.0]), events=spends).end.t
+
+    t = when(1.0)
+    assert abs(spent(t) - 1.0) < 1e-9
+    # x² spent(t) = 1: dt/dx = -2 spent / sin² t at x = 1.
+    right = -2.0 / np.sin(t) ** 2
+    np.testing.assert_allclose([jax.grad(when)(1.0), jax.jacfwd(when)(1.0)], right, rtol=1e-7)
+
+
+def thermostat_rate(t, y, params, xp=np):
+    """Nosé and Hoover's oscillator: x' = v, v' = -x - z v, z' = (v² - T) / Q."""
+    x, v, z = y
+    return xp.stack([v, -x - z * v, (v**2 - params["T"]) / params["Q"]])
+
+
+hoover = lj.System(
+    oscillator,
+    force=lambda t, q, v, p: {"x": -q["z"] * v["x"], "z": 0.0},
+    states={"z": lambda t, q, v, p: (v["x"] ** 2 - p["T"]) / p["Q"]},
+)
+BATH = {"T": 1.0, "Q": 0.5}
+
+
+@pytest.mark.slow
+def test_a_thermostat():
+    """Nosé-Hoover against SciPy, and its conserved ½ (v² + x² + Q z²) + T ∫ z. Twin: another Q."""
+    ts = np.linspace(0.0, 10.0, 6)
+    right = solve_ivp(thermostat_rate, (0, 10), [1.0, 0.0, 0.2], "DOP853", ts, args=(BATH,), rtol=1e-12, atol=1e-13).y
+    start = {"x": 1.0, "z": 0.2}, {"x": 0.0}
+    motion = lj.integrate(hoover, *start, BATH, ts=ts, rtol=1e-11)
+    np.testing.assert_allclose([motion.q["x"], motion.v["x"], motion.q["z"]], right, atol=1e-9)
+    other = lj.integrate(hoover, *start, BATH | {"Q": 0.6}, ts=ts)
+    assert np.max(np.abs(other.q["x"] - right[0])) > 0.1
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_thermostat():
+    """By T and Q, forward, in reverse and by many parameters, as differences of SciPy's solution."""
+    start = {"x": 1.0, "z": 0.2}, {"x": 0.0}
+
+    def end(params):
+        motion = lj.integrate(hoover, *start, params, ts=np.array([0.0, 3.0]), rtol=1e-11)
+        return motion.q["x"][-1] + motion.v["z"][-1]
+
+    def scipys(params):
+        y = solve_ivp(thermostat_rate, (0, 3), [1.0, 0.0, 0.2], "DOP853", args=(params,), rtol=1e-13, atol=1e-13).y
+        return y[0, -1] + thermostat_rate(3.0, y[:, -1], params)[2]
+
+    h, right = 1e-4, {}
+    for name in BATH:
+        apart = [scipys(BATH | {name: BATH[name] + s * h}) for s in (1, -1)]
+        right[name] = (apart[0] - apart[1]) / (2 * h)
+    for found in (jax.grad(end)(BATH), jax.jacfwd(end)(BATH), jax.grad(partial(replayed, end))(BATH)):
+        for name in BATH:
+            np.testing.assert_allclose(found[name], right[name], rtol=1e-6)
+
+
+def replayed(end, params):
+    """The same function of 32 numbers, which reverse mode replays."""
+    return end(jax.tree.map(lambda x: jnp.sum(jnp.full(32, x / 32)), params))
+
+
+def test_a_relay_is_followed():
+    """A rate that jumps: z' = 1 until t = ½, then -2; found in its program, exact. Twin: ignored, it is not."""
+    relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
+
+    def end(p):
+        return lj.integrate(relay, *SWING, p, ts=ONE).q["c"][-1]
+
+    np.testing.assert_allclose(end(0.55), 0.55 - 0.9, rtol=1e-13)
+    np.testing.assert_allclose(jax.grad(end)(0.55), 3.0, rtol=1e-12)
+
+
+def test_a_jump_that_is_not_followed_is_in_the_error():
+    """With jumps="ignored" the step control sees it; twin: the accelerations alone, which do not jump, would not."""
+    relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
+    motion = lj.integrate(relay, *SWING, 0.55, ts=ONE, jumps="ignored")
+    np.testing.assert_allclose(motion.q["c"][-1], 0.55 - 0.9, rtol=1e-7)
+    assert motion.stats["num_rejected_steps"] > 5
+
+
+def spring(t, q, v, k):
+    return -0.5 * k * q**2
+
+
+def test_a_massless_point_between_spring_and_damper():
+    """c s' = -k s: an exponential, in all derivatives. Twin: with a mass it is another motion."""
+    alone = lj.System(spring, dissipation=lambda t, q, v, k: 0.5 * 3.0 * v**2)
+    motion = lj.integrate(alone, 2.0, 50.0, 6.0, ts=ONE)
+    np.testing.assert_allclose([motion.q[-1], motion.v[-1]], 2 * np.exp(-2.0) * np.array([1, -2.0]), rtol=1e-9)
+    np.testing.assert_allclose(motion.v[0], -4.0)
+    end = lambda k: lj.integrate(alone, 2.0, 0.0, k, ts=ONE).q[-1]
+    np.testing.assert_allclose([jax.grad(end)(6.0), jax.jacfwd(end)(6.0)], -2 / 3 * np.exp(-2.0), rtol=1e-8)
+    heavy = lj.System(lambda t, q, v, k: 0.5 * v**2 + spring(t, q, v, k), dissipation=alone.dissipation)
+    assert abs(lj.integrate(heavy, 2.0, -4.0, 6.0, ts=ONE).q[-1] - motion.q[-1]) > 0.1
+
+
+def maxwell(t, q, v, params):
+    """A mass on a spring, one end of which, q[1], is held by a damper alone; and one of which, q[2], by another."""
+    return 0.5 * v[0] ** 2 - 0.5 * params["k"] * ((q[0] - q[1]) ** 2 + (q[1] - q[2]) ** 2)
+
+
+def dampers(t, q, v, params):
+    return 0.5 * params["c"] * (v[1] ** 2 + (v[1] - v[2]) ** 2)
+
+
+chain = lj.System(maxwell, dissipation=dampers)
+CHAIN = {"k": 4.0, "c": 1.5}
+
+
+def chain_matrix(k, c):
+    """(x, v, s, r)' by hand: the damping matrix c [[2, -1], [-1, 1]] has the inverse [[1, 1], [1, 2]] / c."""
+    push = k * np.array([[1.0, -2.0, 1.0], [0.0, 1.0, -1.0]])
+    slow = np.array([[1.0, 1.0], [1.0, 2.0]]) @ push / c
+    x = [0.0, 1.0, 0.0, 0.0], [-k, 0.0, k, 0.0]
+    return np.array([*x, *([row[0], 0.0, row[1], row[2]] for row in slow)])
+
+
+def test_maxwells_element():
+    """Two damped points of one vector, which move each other, and a mass: the matrix exponential."""
+    start = np.array([1.0, 0.5, -0.3])
+    motion = lj.integrate(chain, start, np.zeros(3), CHAIN, ts=ONE)
+    right = expm(chain_matrix(**CHAIN)) @ [1.0, 0.0, 0.5, -0.3]
+    np.testing.assert_allclose([*motion.q[-1], motion.v[-1, 0]], right[[0, 2, 3, 1]], rtol=1e-9)
+    twin = expm(chain_matrix(k=4.0, c=3.0)) @ [1.0, 0.0, 0.5, -0.3]
+    assert np.max(np.abs(twin - right)) > 0.1
+
+
+@pytest.mark.slow
+def test_energy_of_a_damped_chain():
+    """What the dampers take away is what the chain loses; a state in L gives and takes energy too."""
+    ledger = lj.energy_ledger(lj.integrate(chain, np.array([1.0, 0.5, -0.3]), np.zeros(3), CHAIN, ts=ONE))
+    assert abs(ledger.closure[-1]) < 1e-9 and ledger.works["dissipation"].total[-1] < -0.1
+    stiffening = lj.System(
+        lambda t, q, v, p: 0.5 * v["x"] ** 2 - 0.5 * q["k"] * q["x"] ** 2,
+        states={"k": lambda t, q, v, p: -q["k"] * v["x"]},
+    )
+    motion = lj.integrate(stiffening, {"x": 1.0, "k": 2.0}, {"x": 0.0}, ts=np.linspace(0.0, 3.0, 4))
+    # k x-dot = -dk/dt: k = 2 exp(1 - x).
+    np.testing.assert_allclose(motion.q["k"], 2 * np.exp(1 - motion.q["x"]), rtol=1e-9)
+    ledger = lj.energy_ledger(motion)
+    assert abs(ledger.closure[-1]) < 1e-8 < 0.1 < abs(ledger.works["states"].total[-1])
+
+
+def test_it_is_said():
+    """What `explain` says of both kinds."""
+    assert "c (state)" in str(lj.explain(costly, 0.0, *SWING, None))
+    words = str(lj.explain(chain, 0.0, np.zeros(3), np.zeros(3), CHAIN))
+    assert "q[1] (its velocity by force and dissipation), q[2] (its" in words and "degrees of freedom  1" in words
+
+
+def test_no_damping_at_all():
+    """A damping of zero leaves the velocity undetermined; a damper that is not linear is not taken for one."""
+    with pytest.raises(ValueError, match=r"(?s)velocity of 'q\[1\]' is not determined.*damping above zero"):
+        lj.integrate(chain, np.ones(3), np.zeros(3), CHAIN | {"c": 0.0}, ts=ONE)
+    cubic = lj.System(spring, dissipation=lambda t, q, v, k: v**4)
+    with pytest.raises(ValueError, match="singular"):
+        lj.accelerations(cubic, 0.0, 1.0, 1.0, 1.0)
+
+
+@pytest.mark.slow
+def test_a_fit_of_a_damper():
+    """The damping of a massless point from the motion of the mass beside it."""
+    ts = np.linspace(0.0, 3.0, 20)
+    start = np.array([1.0, 0.5, -0.3])
+    seen = lj.integrate(chain, start, np.zeros(3), CHAIN, ts=ts).q
+    record = lj.Record(ts, q=seen, q0=start, v0=np.zeros(3), hold_q=True, hold_v=True, sigma=1e-3)
+    found = lj.fit(chain, [record], CHAIN | {"c": 1.0}, free=["c"])
+    np.testing.assert_allclose(found.params["c"], 1.5, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_bounce_keeps_the_cost():
+    """A ball that bounces, with the way that it went: in phases, through the impact."""
+    ball = lj.System(lambda t, q, v, p: 0.5 * v["y"] ** 2 - q["y"], states={"way": lambda t, q, v, p: jnp.abs(v["y"])})
+    bounce = lj.Switch("flies", to="flies", when=lambda t, q, v, p: q["y"], reset=lambda t, q, v, p: v | {"y": -v["y"]})
+    motion = lj.integrate(
+        lj.Hybrid({"flies": ball}, [bounce]), {"y": 0.5, "way": 0.0}, {"y": 0.0}, ts=np.array([0.0, 3.0])
+    )
+    # It falls for a second, rises for one, and falls again.
+    np.testing.assert_allclose(motion.q["way"][-1], 1.5, rtol=1e-8)
