@@ -15,10 +15,12 @@ ONE = np.array([0.0, 1.0])
 
 
 def oscillator(t, q, v, params):
+    """A mass on a spring."""
     return 0.5 * v["x"] ** 2 - 0.5 * q["x"] ** 2
 
 
 def cost(t, q, v, params):
+    """The square of the speed."""
     return v["x"] ** 2
 
 
@@ -32,13 +34,12 @@ def spent(t):
 
 
 def test_a_running_cost():
-    """c' = v² of cos t, to 1e-12; twin: half of it is another number. The rate is the velocity of c, at every output."""
+    """c' = v² of cos t, to 1e-12; its rate is the velocity of c, at every output. Twin: the cost of another speed."""
     ts = np.linspace(0.0, 20.0, 9)
     motion = lj.integrate(costly, *SWING, ts=ts, rtol=1e-12)
     np.testing.assert_allclose(motion.q["c"], spent(ts), atol=1e-12)
     np.testing.assert_allclose(motion.v["c"], motion.v["x"] ** 2, atol=0.0, rtol=1e-15)
-    np.testing.assert_allclose(motion.at(1.3).q["c"], spent(1.3), rtol=1e-9)
-    assert spent(20.0) / 2 < motion.q["c"][-1] - 1.0
+    assert np.max(np.abs(motion.q["c"] - 0.5 * (ts - 0.5 * np.sin(2.1 * ts)))) > 0.1
 
 
 def test_its_acceleration_at_one_state():
@@ -53,9 +54,10 @@ def test_its_acceleration_at_one_state():
 
 @pytest.mark.slow
 def test_backward_and_in_steps():
-    """The same cost backward in time, and by steps of a fixed length. Twin: with its sign."""
+    """The same cost backward in time, between outputs, and by steps of a fixed length."""
     backward = lj.integrate(costly, *SWING, ts=np.array([3.0, 0.0]))
     np.testing.assert_allclose([backward.q["c"][-1], backward.v["c"][0]], [-spent(3.0), 0.0], atol=1e-9)
+    np.testing.assert_allclose(backward.at(1.3).q["c"], spent(1.3) - spent(3.0), rtol=1e-8)
     _, q, v = lj.rollout(costly, *SWING, None, 300, 0.01)
     np.testing.assert_allclose(q["c"][-1], spent(3.0), rtol=1e-8)
     np.testing.assert_allclose(v["c"], v["x"] ** 2, rtol=1e-15)
@@ -65,9 +67,11 @@ def test_backward_and_in_steps():
 def test_in_lanes_and_in_float32():
     """Lanes of different starts, and single precision in and out."""
     ts = np.linspace(0.0, 3.0, 4)
-    ends = jax.vmap(lambda x: lj.integrate(costly, {"x": x, "c": 0.0}, {"x": 0.0}, ts=ts).q["c"][-1])(
-        jnp.arange(1.0, 4)
-    )
+
+    def end(x):
+        return lj.integrate(costly, {"x": x, "c": 0.0}, {"x": 0.0}, ts=ts).q["c"][-1]
+
+    ends = jax.vmap(end)(jnp.arange(1.0, 4.0))
     np.testing.assert_allclose(ends, spent(3.0) * np.arange(1.0, 4.0) ** 2, rtol=1e-9)
     single = jax.tree.map(np.float32, SWING)
     motion = lj.integrate(costly, *single, ts=ts)
@@ -83,11 +87,10 @@ def test_an_event_that_reads_a_state():
     def when(x):
         return lj.integrate(costly, {"x": x, "c": 0.0}, {"x": 0.0}, ts=np.array([0.0, 9.0]), events=spends).end.t
 
-    t = when(1.0)
+    t, reverse = jax.value_and_grad(when)(1.0)
     assert abs(spent(t) - 1.0) < 1e-9
     # x² spent(t) = 1: dt/dx = -2 spent / sin² t at x = 1.
-    right = -2.0 / np.sin(t) ** 2
-    np.testing.assert_allclose([jax.grad(when)(1.0), jax.jacfwd(when)(1.0)], right, rtol=1e-7)
+    np.testing.assert_allclose([reverse, jax.jacfwd(when)(1.0)], -2.0 / np.sin(t) ** 2, rtol=1e-7)
 
 
 def thermostat_rate(t, y, params, xp=np):
@@ -143,37 +146,52 @@ def replayed(end, params):
     return end(jax.tree.map(lambda x: jnp.sum(jnp.full(32, x / 32)), params))
 
 
+# c' = 1, and from p on -2.
+relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
+
+
+@pytest.mark.slow
 def test_a_relay_is_followed():
-    """A rate that jumps: z' = 1 until t = ½, then -2; found in its program, exact. Twin: ignored, it is not."""
-    relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
+    """A rate that jumps, found in its program: exact, with its derivative."""
 
     def end(p):
         return lj.integrate(relay, *SWING, p, ts=ONE).q["c"][-1]
 
-    np.testing.assert_allclose(end(0.55), 0.55 - 0.9, rtol=1e-13)
-    np.testing.assert_allclose(jax.grad(end)(0.55), 3.0, rtol=1e-12)
+    np.testing.assert_allclose(jax.value_and_grad(end)(0.55), [0.55 - 0.9, 3.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_jump_that_is_not_followed_is_in_the_error():
     """With jumps="ignored" the step control sees it; twin: the accelerations alone, which do not jump, would not."""
-    relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
     motion = lj.integrate(relay, *SWING, 0.55, ts=ONE, jumps="ignored")
     np.testing.assert_allclose(motion.q["c"][-1], 0.55 - 0.9, rtol=1e-7)
     assert motion.stats["num_rejected_steps"] > 5
 
 
 def spring(t, q, v, k):
+    """A spring alone."""
     return -0.5 * k * q**2
 
 
+alone = lj.System(spring, dissipation=lambda t, q, v, k: 0.5 * 3.0 * v**2)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_massless_point():
+    """d/dk of 2 exp(-k t / c), forward and in reverse."""
+
+    def end(k):
+        return lj.integrate(alone, 2.0, 0.0, k, ts=ONE).q[-1]
+
+    np.testing.assert_allclose([jax.grad(end)(6.0), jax.jacfwd(end)(6.0)], -2 / 3 * np.exp(-2.0), rtol=1e-8)
+
+
+@pytest.mark.slow
 def test_a_massless_point_between_spring_and_damper():
-    """c s' = -k s: an exponential, in all derivatives. Twin: with a mass it is another motion."""
-    alone = lj.System(spring, dissipation=lambda t, q, v, k: 0.5 * 3.0 * v**2)
+    """c s' = -k s: an exponential, whatever velocity is given. Twin: with a mass it is another motion."""
     motion = lj.integrate(alone, 2.0, 50.0, 6.0, ts=ONE)
     np.testing.assert_allclose([motion.q[-1], motion.v[-1]], 2 * np.exp(-2.0) * np.array([1, -2.0]), rtol=1e-9)
     np.testing.assert_allclose(motion.v[0], -4.0)
-    end = lambda k: lj.integrate(alone, 2.0, 0.0, k, ts=ONE).q[-1]
-    np.testing.assert_allclose([jax.grad(end)(6.0), jax.jacfwd(end)(6.0)], -2 / 3 * np.exp(-2.0), rtol=1e-8)
     heavy = lj.System(lambda t, q, v, k: 0.5 * v**2 + spring(t, q, v, k), dissipation=alone.dissipation)
     assert abs(lj.integrate(heavy, 2.0, -4.0, 6.0, ts=ONE).q[-1] - motion.q[-1]) > 0.1
 
@@ -184,6 +202,7 @@ def maxwell(t, q, v, params):
 
 
 def dampers(t, q, v, params):
+    """One to the wall at q[1], and one between the two massless points."""
     return 0.5 * params["c"] * (v[1] ** 2 + (v[1] - v[2]) ** 2)
 
 
@@ -219,10 +238,10 @@ def test_energy_of_a_damped_chain():
         states={"k": lambda t, q, v, p: -q["k"] * v["x"]},
     )
     motion = lj.integrate(stiffening, {"x": 1.0, "k": 2.0}, {"x": 0.0}, ts=np.linspace(0.0, 3.0, 4))
-    # k x-dot = -dk/dt: k = 2 exp(1 - x).
+    # k' = -k x': k = 2 exp(1 - x).
     np.testing.assert_allclose(motion.q["k"], 2 * np.exp(1 - motion.q["x"]), rtol=1e-9)
     ledger = lj.energy_ledger(motion)
-    assert abs(ledger.closure[-1]) < 1e-8 < 0.1 < abs(ledger.works["states"].total[-1])
+    assert abs(ledger.closure[-1]) < 1e-8 and np.max(np.abs(ledger.works["states"].total)) > 0.1
 
 
 def test_it_is_said():
@@ -254,11 +273,13 @@ def test_a_fit_of_a_damper():
 
 @pytest.mark.slow
 def test_a_bounce_keeps_the_cost():
-    """A ball that bounces, with the way that it went: in phases, through the impact."""
-    ball = lj.System(lambda t, q, v, p: 0.5 * v["y"] ** 2 - q["y"], states={"way": lambda t, q, v, p: jnp.abs(v["y"])})
-    bounce = lj.Switch("flies", to="flies", when=lambda t, q, v, p: q["y"], reset=lambda t, q, v, p: v | {"y": -v["y"]})
-    motion = lj.integrate(
-        lj.Hybrid({"flies": ball}, [bounce]), {"y": 0.5, "way": 0.0}, {"y": 0.0}, ts=np.array([0.0, 3.0])
+    """A ball that bounces with half its speed, and the integral of its v²: in phases, through the impact."""
+    ball = lj.System(lambda t, q, v, p: 0.5 * v["y"] ** 2 - q["y"], states={"cost": lambda t, q, v, p: v["y"] ** 2})
+    bounce = lj.Switch(
+        "flies", to="flies", when=lambda t, q, v, p: q["y"], reset=lambda t, q, v, p: v | {"y": -0.5 * v["y"]}
     )
-    # It falls for a second, rises for one, and falls again.
-    np.testing.assert_allclose(motion.q["way"][-1], 1.5, rtol=1e-8)
+    start = {"y": 0.5, "cost": 0.0}, {"y": 0.0}
+    motion = lj.integrate(lj.Hybrid({"flies": ball}, [bounce]), *start, ts=np.array([0.0, 1.5]))
+    # It falls for a second, and then rises for half of one.
+    np.testing.assert_allclose(motion.q["cost"][-1], 1 / 3 + 0.5**3 / 3, rtol=1e-9)
+    np.testing.assert_allclose(motion.v["cost"][-1], 0.0, atol=1e-9)
