@@ -138,10 +138,12 @@ if TYPE_CHECKING:
         ConnectWarning,
         Geodesic,
         Steering,
+        TrackingLQR,
         connect,
         exponential_map,
         geodesic,
         lqr,
+        parallel_transport,
         steer,
     )
 
@@ -162,7 +164,10 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
-    "lagjax.two_points": ("Connection ConnectWarning Geodesic LQR Steering connect exponential_map geodesic lqr steer"),
+    "lagjax.two_points": (
+        "Connection ConnectWarning Geodesic LQR Steering TrackingLQR connect exponential_map geodesic lqr "
+        "parallel_transport steer"
+    ),
 }
 
 
@@ -271,6 +276,7 @@ __all__ = [
     "geodesic",
     "Geodesic",
     "exponential_map",
+    "parallel_transport",
     "sweep",
     "Sweep",
     "Status",
@@ -293,6 +299,7 @@ __all__ = [
     "Steering",
     "lqr",
     "LQR",
+    "TrackingLQR",
     "WorkPrecision",
     "work_precision",
     "export",

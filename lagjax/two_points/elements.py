@@ -82,6 +82,20 @@ def lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return values, slopes
 
 
+def integrals(points: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Matrix (k, m) from values at `points` (k = m) to the integrals of their polynomial from `start` to each of them.
+
+    >>> print(integrals(np.array([0.0, 1.0]), np.zeros(2)))
+    [[0.  0. ]
+     [0.5 0.5]]
+    """
+    x, weights = legendre.leggauss(len(points))
+    lengths = points - start
+    at = start[:, None] + lengths[:, None] * (x + 1) / 2
+    values = lagrange(points, at.ravel())[0].reshape(len(points), len(points), -1)
+    return np.einsum("i,k,ikj->ij", lengths, weights / 2, values)
+
+
 class PointStates(NamedTuple):
     """Times, positions and velocities at the points of an element."""
 

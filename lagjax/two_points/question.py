@@ -121,7 +121,7 @@ def asked(
     of_path = None if cost is None else checked_cost(cost, given)
     of_end, state = None, s._asdict()
     if end_cost is not None:
-        of_end = traced_call(Call("end_cost", end_cost, OF_STATE), state, _check_number)
+        of_end = traced_call(Call("end_cost", end_cost, OF_STATE), state, check_number)
     condition = None
     if end_function is not None:
         condition = traced_call(Call("end", end_function, OF_STATE), state, _check_conditions)
@@ -154,7 +154,7 @@ def controlled(system: System, controls: PyTree, s: State, with_control: Callabl
 def checked_cost(cost: Callable, given: Controlled) -> Callable:
     """The cost per unit of time, traced."""
     arguments = given.state._asdict() | {"u": given.controls}
-    return traced_call(Call("cost", cost, OF_COST), arguments, _check_number)
+    return traced_call(Call("cost", cost, OF_COST), arguments, check_number)
 
 
 def velocity_name(name: str) -> str:
@@ -219,7 +219,8 @@ def _end(pair: tuple, like: PyTree, which: str) -> End:
     return End(*found)
 
 
-def _check_number(call: Call, value: Any):
+def check_number(call: Call, value: Any):
+    """Raise where a function of the user's does not return one number."""
     if np.shape(value) != () or not np.issubdtype(getattr(value, "dtype", type(value)), np.number):
         raise ValueError(
             f"{call} must return one number, and returned shape {np.shape(value)}.\n"

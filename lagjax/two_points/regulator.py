@@ -25,11 +25,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 from scipy.linalg import solve_continuous_are
 
-from lagjax.jaxtools import compiled
-from lagjax.mechanics import accelerations_at
+from lagjax.integrate import ENDED_WELL, Trajectory, is_among
 from lagjax.numerics import null_space
-from lagjax.system import Form, State, System, check_system, constraints, coordinates, unchecked
-from lagjax.two_points.question import Controlled, checked_cost, controlled, velocity_name
+from lagjax.system import System, check_system, constraints, coordinates, unchecked
+from lagjax.two_points.linear_quadratic import check_weights, linear
+from lagjax.two_points.question import checked_cost, controlled, velocity_name
+from lagjax.two_points.tracking import TrackingLQR, about_trajectory
 
 # Accelerations, in units of what a displacement of one brings about, below which a state is an equilibrium.
 STEADY_BELOW = 1e-6
@@ -73,15 +74,16 @@ class LQR(eqx.Module):
 
 def lqr(
     system: System,
-    controls: Mapping[str, ArrayLike],
-    state: tuple[PyTree, PyTree],
+    controls: Mapping[str, ArrayLike] | Callable,
+    state: tuple[PyTree, PyTree] | Trajectory,
     cost: Callable,
     params: PyTree = None,
     *,
     t: ArrayLike = 0.0,
+    end_cost: Callable | None = None,
     with_control: Callable[[PyTree, PyTree], PyTree] | None = None,
-) -> LQR:
-    """Return the feedback about an equilibrium that costs least: the linear-quadratic regulator.
+) -> LQR | TrackingLQR:
+    """Return the feedback about an equilibrium or a trajectory that costs least: the linear-quadratic regulator.
 
     >>> import lagjax as lj
     >>> cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
@@ -92,24 +94,33 @@ def lqr(
     **Arguments:**
 
     - `system`, `params`: as in `lj.steer`; holonomic constraints are kept.
-    - `controls`: by name, the controls that hold the system in the equilibrium.
-    - `state`: the equilibrium (q, v), at rest.
-    - `cost(t, q, v, u, params)` -> scalar, per unit of time: least at the equilibrium. Its second derivatives there are
-      the weights.
-    - `t`: the time at which everything is taken. `with_control`: as in `lj.rollout`.
+    - `controls`: by name, the controls that hold the system in the equilibrium; or `controls(t)` -> dict, those that
+      cause the trajectory, as `lj.steer(...).controls`. Where they jump, at their `knots` if they have any, gains begin
+      anew.
+    - `state`: the equilibrium (q, v), at rest; or a `Trajectory`, as `lj.steer(...).trajectory`.
+    - `cost(t, q, v, u, params)` -> scalar, per unit of time: least at the equilibrium. Its second derivatives there, or
+      along the trajectory, are the weights.
+    - `t`: the time at which everything is taken; a trajectory has its own.
+    - `end_cost(t, q, v, params)` -> scalar: its second derivatives are the weights of the trajectory's end.
+    - `with_control`: as in `lj.rollout`.
 
-    **Returns:** an `LQR`: gains, cost to go, eigenvalues and `control(q, v)`.
+    **Returns:** an `LQR`: gains, cost to go, eigenvalues and `control(q, v)`. For a trajectory a `TrackingLQR`, whose
+    gains depend on time: `control(t, q, v)`; where the controls jump, so does the force (`jump_ts=controls.knots`).
 
     **Raises:**
 
-    - `TypeError`, `ValueError` for arguments of the wrong kind or shape; velocity constraints; a state that
-      accelerates, or at which the cost is not least.
+    - `TypeError`, `ValueError` for arguments of the wrong kind or shape; velocity constraints at an equilibrium; a
+      state that accelerates, or at which the cost is not least; a trajectory that failed.
     - `ValueError` where no feedback is stable, with the coordinate that the controls do not reach, or where a control
       costs nothing.
 
     Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.4.
     """
     check_system(system, states=False)
+    if isinstance(state, Trajectory):
+        return _along(system, controls, state, cost, params, end_cost, with_control)
+    if end_cost is not None:
+        raise ValueError("end_cost belongs to a trajectory, and an equilibrium has no end.\nFix: leave it out.")
     q, v = state
     if any(not c.of_positions for c in system.constraints.values()):
         raise ValueError(
@@ -126,7 +137,7 @@ def lqr(
     if given.form.m:
         model = unchecked(given.system, given.merge(given.state.params, given.controls), given.form)
         tangent = null_space(np.asarray(constraints.jacobian(model, given.state.t, x, u)))
-    still, (by_q, by_v, by_w), slope, weights = _linear(given, cost, x, u, w)
+    still, (by_q, by_v, by_w), slope, weights = linear(given, cost, x, u, w)
     size = max(1.0, float(jnp.max(jnp.abs(by_q))))
     worst = int(np.argmax(np.abs(still)))
     if not abs(still[worst]) <= STEADY_BELOW * size or np.any(np.asarray(u)):
@@ -149,7 +160,7 @@ def lqr(
     weights = lift.T @ weights @ lift / 2
     k = a.shape[0]
     q_weight, cross, r_weight = weights[:k, :k], weights[:k, k:], weights[k:, k:]
-    _check_weights(r_weight, coordinates.names(given.controls))
+    check_weights(r_weight, coordinates.names(given.controls))
     try:
         s = solve_continuous_are(a, b, q_weight, r_weight, s=cross)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -162,39 +173,27 @@ def lqr(
     return LQR(jnp.asarray(gain @ both.T), jnp.asarray(both @ s @ both.T), values, at, given.controls, names)
 
 
-@compiled
-def _linear(given: Controlled, cost: Callable, x: Array, u: Array, w: Array):
-    """The accelerations with their derivatives, and the first and second derivatives of the cost."""
-    form: Form = given.form
-
-    def a(x: Array, u: Array, w: Array):
-        model = unchecked(given.system, given.merge(given.state.params, coordinates.like(given.controls, w)), form)
-        s = State(given.state.t, form.tree(x), form.tree(u), model.params)
-        return coordinates.flatten(accelerations_at(model, s)[0])[0]
-
-    def of_all(y: Array):
-        x, u, w = jnp.split(y, (form.n, 2 * form.n))
-        s = given.state
-        return cost(s.t, form.tree(x), form.tree(u), coordinates.like(given.controls, w), s.params)
-
-    y = jnp.concatenate([x, u, w])
-    return a(x, u, w), jax.jacfwd(a, argnums=(0, 1, 2))(x, u, w), jax.grad(of_all)(y), jax.hessian(of_all)(y)
+def _along(system, controls, trajectory, cost, params, end_cost, with_control) -> TrackingLQR:
+    """The regulator about a trajectory."""
+    if not callable(controls):
+        raise TypeError(
+            f"about a trajectory controls are a function of time, not {type(controls).__name__}.\n"
+            'Fix: controls=found.controls of lj.steer, or lambda t: {"push": ...}.'
+        )
+    if jnp.ndim(trajectory.end.t) or not is_among(trajectory.result, ENDED_WELL):
+        raise ValueError(
+            "the trajectory failed, or is a batch: there is no motion to keep to.\n"
+            "Fix: one motion that reaches its end."
+        )
+    t, q, v = trajectory.t[0], *jax.tree.map(lambda x: x[0], (trajectory.q, trajectory.v))
+    given = controlled(system, controls(t), coordinates.prepared(t, q, v, params), with_control)
+    return about_trajectory(given, controls, trajectory, checked_cost(cost, given), end_cost)
 
 
 def _first_order(tangent: np.ndarray, by_q: Array, by_v: Array, by_w: Array) -> tuple[np.ndarray, np.ndarray]:
     f, t = tangent.shape[1], tangent
     a = np.block([[np.zeros((f, f)), np.eye(f)], [t.T @ by_q @ t, t.T @ by_v @ t]])
     return a, np.concatenate([np.zeros((f, by_w.shape[1])), t.T @ by_w])
-
-
-def _check_weights(weights: np.ndarray, names: list[str]):
-    values, vectors = np.linalg.eigh(weights)
-    if values[0] <= 1e-12 * max(values[-1], 0.0):
-        name = names[int(np.argmax(np.abs(vectors[:, 0])))]
-        raise ValueError(
-            f"the control '{name}' costs nothing, and the least cost would take it without limit.\n"
-            f'Fix: + 1e-3 * u["{name}"] ** 2 in the cost.'
-        )
 
 
 def _unreached(a: np.ndarray, b: np.ndarray, both: np.ndarray, names: tuple[str, ...]) -> str:

@@ -1,0 +1,60 @@
+"""Parallel transport: round a circle of latitude, in a chart and in space, and along a geodesic."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+ball = lj.System(lambda t, q, v, params: 0.5 * v @ v, {"ball": lj.Holonomic(lambda t, q, params: q @ q - 1.0)})
+
+
+def sphere(q, v, params):
+    """The line element of the unit sphere."""
+    return v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2
+
+
+def carried(psi, share=1.0):
+    """South, carried round a circle of latitude in the chart."""
+    latitude = {"psi": lambda t: psi + 0.0 * t, "theta": lambda t: 2 * jnp.pi * share * t}
+    return lj.parallel_transport(
+        sphere, lambda t: {name: f(t) for name, f in latitude.items()}, {"psi": 1.0, "theta": 0.0}
+    )
+
+
+@pytest.mark.slow
+def test_round_a_latitude():
+    """Once round it turns by 2π (1 - cos ψ), to 1e-13, with the derivative in both modes. Twin: half way by half."""
+    for psi in (0.4, 1.1):
+        angle = 2 * np.pi * np.cos(psi)
+        w = carried(psi)
+        assert abs(w["psi"] - np.cos(angle)) < 1e-13 and abs(np.sin(psi) * w["theta"] + np.sin(angle)) < 1e-13
+    assert abs(carried(1.1, 0.5)["psi"] - np.cos(angle / 2)) < 1e-13
+    exact = 2 * np.pi * np.sin(1.1) * np.sin(angle)
+    for mode in (jax.jacfwd, jax.jacrev):
+        assert abs(mode(lambda psi: carried(psi)["psi"])(1.1) - exact) < 1e-11
+
+
+@pytest.mark.slow
+def test_in_space():
+    """On |r| = 1 the same turn; along a geodesic the angle with it is kept, and the vector stays tangent."""
+    psi = 1.1
+    south, east, angle = np.array([np.cos(psi), 0.0, -np.sin(psi)]), np.array([0.0, 1.0, 0.0]), 2 * np.pi * np.cos(psi)
+
+    def latitude(t):
+        round_it = jnp.stack([jnp.cos(2 * jnp.pi * t), jnp.sin(2 * jnp.pi * t)])
+        return jnp.concatenate([jnp.sin(psi) * round_it, jnp.cos(psi)[None]])
+
+    w = lj.parallel_transport(ball, latitude, south)
+    assert np.max(np.abs(w - (np.cos(angle) * south - np.sin(angle) * east))) < 1e-13
+    path = lj.geodesic(ball, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.6, 0.8]), outputs=2)
+    across = np.array([0.0, -0.8, 0.6])
+    w = lj.parallel_transport(ball, path, 0.3 * across + 0.5 * np.asarray(path.start_direction))
+    assert np.max(np.abs(w - (0.3 * across + 0.5 * np.asarray(path.end_direction)))) < 1e-12
+
+
+def test_a_path_that_is_none():
+    """A path must be a function or a geodesic."""
+    with pytest.raises(TypeError, match="a path is a function of t or a lj.Geodesic, not dict"):
+        lj.parallel_transport(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 1.0, "theta": 0.0})
