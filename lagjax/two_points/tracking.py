@@ -172,11 +172,9 @@ def _together(function: Callable, *arrays: np.ndarray):
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
 
 
-def _states(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _states(trajectory: Trajectory, t: np.ndarray) -> list[np.ndarray]:
     now = trajectory.at(t)
-    return tuple(
-        np.concatenate([np.reshape(y, (len(t), -1)) for y in jax.tree.leaves(x)], axis=1) for x in (now.q, now.v)
-    )
+    return [np.concatenate([np.reshape(y, (len(t), -1)) for y in jax.tree.leaves(x)], axis=1) for x in (now.q, now.v)]
 
 
 def _along(given: Controlled, cost: Callable, *states: np.ndarray):
