@@ -22,7 +22,7 @@ from lagjax.integrate import integrate
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import accelerations_at
 from lagjax.numerics import dense
-from lagjax.system import Model, State, System, coordinates, prepare
+from lagjax.system import Model, State, System, check_system, coordinates, prepare
 from lagjax.two_points.elements import integrals, rule_of_degree
 from lagjax.two_points.geodesic import Geodesic, LineElement
 
@@ -65,6 +65,7 @@ def parallel_transport(
     Source: do Carmo, *Riemannian Geometry*, §2.2.
     """
     system = metric if isinstance(metric, System) else System(LineElement(metric))
+    check_system(system, w, params, states=False)
     if not isinstance(path, Geodesic) and not callable(path):
         raise TypeError(
             f"a path is a function of t or a lj.Geodesic, not {type(path).__name__}.\n"
