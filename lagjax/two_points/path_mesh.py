@@ -31,6 +31,8 @@ ONTO = 60
 ROUNDS, ATTEMPTS, SHORTEST = 3, 24, 1e-2
 # A path is followed where the highest coefficients on its elements are below this.
 FINE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+# Elements of the same number are laid anew for this part of it: a conjugate point is as good as the path.
+LAID = 0.01
 # A start ends elsewhere that misses the end by more than this part of its extent.
 ELSEWHERE = 1e-6
 # On the way, steps of this size are small enough.
@@ -181,7 +183,7 @@ def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
         )  # fmt: skip
 
     def unfinished(last: Attempt):
-        coarse = (last.rounds == 0) | (jnp.max(last.errors) > fine)
+        coarse = (last.rounds == 0) | (jnp.max(last.errors) > LAID * fine)
         return coarse & (last.rounds < ROUNDS) & (last.attempts < ATTEMPTS) & (last.step > SHORTEST)
 
     zero, none = jnp.zeros_like(ends.duration), jnp.zeros((), int)
