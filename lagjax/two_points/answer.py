@@ -16,9 +16,10 @@ from jaxtyping import Array, Float, Int
 from lagjax.integrate import Trajectory, in_turn
 from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.system import Model, constraints
-from lagjax.two_points import elements, index, path, path_mesh, shoot
+from lagjax.two_points import elements, index, path_mesh, shoot
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath
+from lagjax.two_points.newton import FoundPath, extent
+from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
 from lagjax.two_points.start_velocity import Found, found_by_shooting, shoots_alone
 from lagjax.two_points.starts import Guess, nodes_of
@@ -50,7 +51,7 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
     found = last.found
     at_nodes = index.index_at_nodes(model, found, ends.kind == NATURAL)
     response = shoot.response_of(model, ends, found)
-    scale = path.extent(ends, found.path)
+    scale = extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
     return SolvedPath(
         found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),

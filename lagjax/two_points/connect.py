@@ -4,7 +4,7 @@ check the ends  ->  starts (`starts.py`)  ->  an answer from each (`answer.py`) 
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jaxtools import is_eager, is_traced
+from lagjax.jaxtools import depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
 from lagjax.system import (
     OF_STATE,
@@ -33,7 +33,7 @@ from lagjax.two_points.answer import answer_from, inside, is_same, not_found, wh
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
 from lagjax.two_points.start_velocity import shoots_alone
-from lagjax.two_points.starts import guesses_of
+from lagjax.two_points.starts import Starts, guesses_of
 
 ELEMENTS = 8
 # Ends may be off the constraints by this part of their size.
@@ -57,7 +57,7 @@ def connect(
     *,
     end: Callable | None = None,
     free_time: bool = False,
-    starts: int | Callable | Sequence[Callable] = 1,
+    starts: Starts = 1,
     elements: int = ELEMENTS,
     outputs: int = 33,
     rtol: ArrayLike | None = None,
@@ -86,8 +86,9 @@ def connect(
       multipliers. Then the start velocity is sought by integrating alone, from that of the start.
     - `free_time`: whether t_b is a guess. Without a further condition among those of `end` that depend on velocities,
       the time is that of stationary action, with no energy h at the end.
-    - `starts`: how many starts: the straight line, and others with random waves on it; or a function q(t), or several.
-      Where the straight line alone leads to no answer, three random starts follow.
+    - `starts`: how many starts: the straight line, and others with random waves on it; or a function q(t), or a motion
+      of `integrate` with its outputs close together, or several. A start need not end at q_b: a fan of launches finds
+      answers far from the straight line. Where this alone leads to no answer, three random starts follow.
     - `elements`: of the path, at first. They are laid anew where the path needs them, and outside of `jit` and `vmap`
       doubled until it is followed.
     - `outputs`: the number of output times, equally spaced. `rtol`: the tolerance of the motion, 1e-13 in float64.
@@ -128,7 +129,8 @@ def connect(
             f"of {float(ends.duration):.6g}. Tried: {words}.\n"
             "Usual cause: no such motion (an end out of reach), a path through a singularity of L, or a start too far "
             "away.\n"
-            "Fix: starts=8 for more starts; starts=lambda t: ... for a path that you know; a shorter time.",
+            "Fix: starts=8 for more starts; starts=lambda t: ... for a path that you know, or motions of lj.integrate; "
+            "a shorter time.",
             ConnectWarning,
             stacklevel=2,
         )
@@ -210,12 +212,8 @@ def _conditions(model: Model, s: State, end: Callable, free_time: bool):
 
 
 def _depends_on_velocity(condition: Callable, t: Array, x: Array, u: Array) -> bool:
-    program = jax.make_jaxpr(lambda u: condition(t, x, u))(u)
-    from_u = set(program.jaxpr.invars)
-    for equation in program.jaxpr.eqns:
-        if any(not hasattr(x, "val") and x in from_u for x in equation.invars):
-            from_u.update(equation.outvars)
-    return any(not hasattr(x, "val") and x in from_u for x in program.jaxpr.outvars)
+    program = jax.make_jaxpr(lambda u: condition(t, x, u))(u).jaxpr
+    return depends(program, program.invars)
 
 
 def _check_condition(call: Call, value):

@@ -24,10 +24,11 @@ from lagjax.mechanics import listed
 from lagjax.system import System, check_system, coordinates, model_of, prepare
 from lagjax.two_points.connect import ELEMENTS, connect
 from lagjax.two_points.result import Connection
+from lagjax.two_points.starts import Starts, guesses_of
 
 TURN = 2 * np.pi
-# Starts, the straight line among them, where that one leads to a path that is not the shortest.
-STARTS = 8
+# Random starts where the straight line leads to a path that is not the shortest.
+FURTHER = 7
 
 
 class Geodesic(eqx.Module):
@@ -82,7 +83,7 @@ def geodesic(
     b: PyTree[ArrayLike],
     params: PyTree = None,
     *,
-    starts=1,
+    starts: Starts = 1,
     angles: str | Iterable[str] = (),
     elements: int = ELEMENTS,
     outputs: int = 33,
@@ -129,7 +130,7 @@ def geodesic(
     found = _different([], system, s, ends, options)
     # The shortest path is no saddle: the straight line was a start on a ridge.
     if eager and starts == 1 and found and all(answer.kind.startswith("saddle") for answer in found):
-        found = _different(found, system, s, ends, {**options, "starts": STARTS})
+        found = _different(found, system, s, ends, {**options, "starts": guesses_of(model, 1 + FURTHER)[1:]})
     if not found:
         return _of(system, s, connect(system, s.q, b, 0.0, 1.0, s.params, **options))
     if eager:

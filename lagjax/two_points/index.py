@@ -19,7 +19,8 @@ from lagjax.jaxtools import compiled
 from lagjax.numerics import lapack
 from lagjax.system import Model
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import Ends, FoundPath, Path, momentum_matrix
+from lagjax.two_points.newton import FoundPath
+from lagjax.two_points.path import Ends, Path, momentum_matrix
 from lagjax.two_points.path_mesh import states
 
 BISECTIONS = 52

@@ -20,7 +20,8 @@ from lagjax.jaxtools import compiled, once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import lagrange, rule_of_degree
-from lagjax.two_points.path import FIXED, NATURAL, Ends, FoundPath, Path, extent, newton, unfound
+from lagjax.two_points.newton import FoundPath, extent, newton, unfound
+from lagjax.two_points.path import FIXED, NATURAL, Ends, Path
 
 # An element is at most so many times longer than the mean would have it.
 EVEN = 0.2

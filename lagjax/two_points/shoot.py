@@ -24,7 +24,8 @@ from lagjax.jaxtools import compiled, numpy_of
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import NATURAL, Ends, FoundPath, end_rows
+from lagjax.two_points.newton import FoundPath
+from lagjax.two_points.path import NATURAL, Ends, end_rows
 
 # Corrections at most, and how much each has to shrink.
 SHOTS, SHRINKS = 8, 0.5
@@ -130,13 +131,12 @@ class Shot(NamedTuple):
 def shot(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol) -> Shot | None:
     """Correct until the motion meets the end; None where its corrections do not shrink."""
     eps = float(np.finfo(np.asarray(aim.u).dtype).eps)
-    best, least, before, response = None, np.inf, 1.0, np.asarray(response)
+    best, least, before = None, np.inf, 1.0
     for _ in range(SHOTS):
         rho = _missed_from(model, ends, aim, rtol)
-        off = np.inf if rho is None else float(np.max(np.abs(rho)))
-        if not off < SHRINKS * least:
+        if rho is None or not (off := float(np.max(np.abs(rho)))) < SHRINKS * least:
             break
-        size = _size(aim, response @ rho)
+        size = _size(aim, np.asarray(response) @ rho)
         best, least = (aim, size), off
         if not size < FAR:
             break
@@ -152,7 +152,7 @@ def shot(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol
     aim = best[0]
     trajectory = motion(model, ends, aim, outputs, rtol)
     rho = np.asarray(missed(model, ends, aim, *last_of(trajectory)))
-    return Shot(aim, np.asarray(_size(aim, response @ rho)), trajectory)
+    return Shot(aim, np.asarray(_size(aim, np.asarray(response) @ rho)), trajectory)
 
 
 def _missed_from(model: Model, ends: Ends, aim: Aim, rtol) -> np.ndarray | None:
@@ -166,7 +166,7 @@ def _missed_from(model: Model, ends: Ends, aim: Aim, rtol) -> np.ndarray | None:
     return np.asarray(missed(model, ends, aim, *last_of(trajectory))) if well else None
 
 
-def _size(aim: Aim, change: Array):
+def _size(aim: Aim, change: Array | np.ndarray):
     """A correction in units of the start velocity."""
     xp = numpy_of((aim, change))
     unit = xp.maximum(xp.max(xp.abs(aim.u)), np.finfo(aim.u.dtype).tiny)

@@ -28,7 +28,8 @@ from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points import path_mesh, shoot
-from lagjax.two_points.path import Ends, unfound
+from lagjax.two_points.newton import unfound
+from lagjax.two_points.path import Ends
 from lagjax.two_points.shoot import Aim
 
 # A step of this size, relative, ends the search, the second one a part of the way; one below the third that no longer

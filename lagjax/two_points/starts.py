@@ -17,10 +17,6 @@ from lagjax.two_points.path import Ends
 WAVES, AMPLITUDES = 3, (1.0, 0.5, 0.25)
 
 
-# How many starts, or which ones.
-Starts = int | Callable | Trajectory | Sequence[Callable | Trajectory]
-
-
 class Guess(NamedTuple):
     """A start by name: a path q(t), a motion, or the waves (w, n) on the straight line; None for the line itself."""
 
@@ -28,12 +24,17 @@ class Guess(NamedTuple):
     path: Any = None
 
 
+# How many starts, or which ones.
+Starts = int | Callable | Trajectory | Sequence[Callable | Trajectory | Guess]
+
+
 def guesses_of(model: Model, starts: Starts) -> list[Guess]:
     """The starts that are asked for."""
     if callable(starts) or isinstance(starts, Trajectory):
         return [Guess("the given path", starts)]
     if not isinstance(starts, int):
-        return [Guess(f"given path {i + 1}", start) for i, start in enumerate(starts)]
+        named = enumerate(starts, start=1)
+        return [start if isinstance(start, Guess) else Guess(f"given path {i}", start) for i, start in named]
     if starts < 1:
         raise ValueError(f"starts={starts}: there must be one at least.\nFix: starts=1, the straight line.")
     random = np.random.default_rng(0)
