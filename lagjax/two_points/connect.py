@@ -110,12 +110,10 @@ def connect(
     if not is_eager() or is_traced((model, ends)):
         return inside(model, ends, guesses_of(model, starts)[0], elements, outputs, rtol)
     found, tried, first = [], [], None
-    guesses, wanted = guesses_of(model, starts), None
-    if starts == 1:
-        # A straight line may lead through a singular point, as the centre of a sphere.
-        guesses, wanted = guesses_of(model, 1 + FURTHER), 1
+    # A straight line may lead through a singular point, as the centre of a sphere: others follow.
+    guesses = guesses_of(model, 1 + FURTHER if starts == 1 else starts)
     for guess in guesses:
-        if found and len(tried) == wanted:
+        if starts == 1 and found:
             break
         solved, answer, why = answer_from(model, ends, guess, elements, outputs, rtol)
         first = solved if first is None else first

@@ -21,7 +21,7 @@ MOST = 30
 SMALL, SETTLED = 1e-13, 1e-9
 # A path has converged whose last step is below this.
 CONVERGED = 1e-7
-# From this size on, what the next step will be is judged from the last two.
+# From this size on, in units of what the end changes, the next step is judged from the last two.
 QUADRATIC = 1e-3
 # The shortest part of a step that is tried.
 SHORTEST = 2.0**-6
@@ -80,13 +80,17 @@ def newton(model: Model, ends: Ends, start: Path, enough: ArrayLike = 0.0) -> Fo
         y = path.y - share * step.y[..., 0].reshape(start.y.shape)
         return path._replace(y=y, border=path.border - share * step.border[:, 0])
 
-    def amplified(solved: Solved) -> Array:
-        """How much round-off becomes in a step; near a conjugate end much."""
+    def amplification(solved: Solved) -> Array:
+        """What a change of the end becomes on the path; near a conjugate end much."""
         if ends.kind != FIXED:
-            return blur
+            return jnp.ones_like(blur)
         units = solved.y[..., 1 : 1 + n].reshape(*start.y.shape, n)[:, :, :n]
         most = jnp.max(jnp.abs(units) * scale[None, None, None] / scale[None, None, :, None])
-        return jnp.minimum(blur * jnp.where(most > 1.0, most, 1.0), 1e-5)
+        return jnp.where(most > 1.0, most, 1.0)
+
+    def amplified(solved: Solved) -> Array:
+        """How much round-off becomes in a step."""
+        return jnp.minimum(blur * amplification(solved), 1e-5)
 
     def size_of(solved: Solved) -> Array:
         x = solved.y[..., 0].reshape(start.y.shape)[..., :n]
@@ -106,7 +110,9 @@ def newton(model: Model, ends: Ends, start: Path, enough: ArrayLike = 0.0) -> Fo
         settled = jnp.maximum(SETTLED, 1e3 * amplified(search.solved))
         at_round_off = (search.size < settled) & jnp.isfinite(size)
         accepted = accepted | at_round_off
-        next_size = jnp.where((share == 1.0) & (size < QUADRATIC), size * (size / search.size) ** 2, size)
+        # Near a conjugate end the matrix itself is not known well enough before.
+        quadratic = (share == 1.0) & (size * amplification(solved) < QUADRATIC)
+        next_size = jnp.where(quadratic, size * (size / search.size) ** 2, size)
         ended = (
             accepted & (next_size <= small) | at_round_off & (size > 0.25 * search.size) | ~jnp.isfinite(size) & first
         )
