@@ -115,12 +115,13 @@ def judging(function: Callable) -> Callable:
 class Slot(NamedTuple):
     """A mode, or an array of `shape` of them: what compares, and on what its numbers depend ("t", "q", "v").
 
-    `jumps`: not only a kink. `levels`: whether the mode is a whole number. `roles`: the programs in which it occurs.
+    `levels`: whether the mode is a whole number. `roles`: the programs in which it occurs; `jumps`: those of them in
+    which it is not only a kink.
     """
 
     kind: str
     depends: frozenset
-    jumps: bool
+    jumps: frozenset
     levels: bool
     roles: frozenset
     shape: tuple[int, ...]
@@ -341,7 +342,7 @@ class JumpOpening:
         # A time that stands in the program: `t > start`.
         time = [x.value for x, y in ((a, b), (b, a)) if y.number == self.table.number("t") and not x.depends]
         timed = Timed(actual, raw, jnp.broadcast_to(time[0], raw.shape) if time else None, "above", None)
-        mode = self._mode(key, Slot(kind, depends, jumps, False, frozenset({self.role}), raw.shape), timed)
+        mode = self._mode(key, self._slot(kind, depends, jumps, False, raw.shape), timed)
         if mode is None:
             return None
         self.inside.setdefault(key, Inside((2 * mode - 1) * raw, 1 - mode, actual, raw))
@@ -358,7 +359,7 @@ class JumpOpening:
         """The whole number that belongs to x, by the mode."""
         key = ("level", rule, *(k.number for k in operands))
         actual = {"floor": jnp.floor, "ceil": jnp.ceil, "round": jnp.round, "trunc": jnp.trunc}[rule](x)
-        slot = Slot(kind, depends, True, True, frozenset({self.role}), x.shape)
+        slot = self._slot(kind, depends, True, True, x.shape)
         mode = self._mode(key, slot, Timed(actual, x, None, rule, None))
         if mode is None:
             return None
@@ -387,7 +388,7 @@ class JumpOpening:
         n = table.shape[0]
         key = ("place", arrays[0].number, numbers[0].number)
         actual = jnp.sum(table <= x).astype(x.dtype)
-        slot = Slot("a table", depends, False, True, frozenset({self.role}), ())
+        slot = self._slot("a table", depends, False, True, ())
         mode = self._mode(key, slot, Timed(actual, x, None, "place", table))
         if mode is None:
             return None
@@ -403,14 +404,17 @@ class JumpOpening:
         dtype = equation.outvars[0].aval.dtype
         return [KnownValue(i.astype(dtype), self.table.number("place", *key), frozenset({OUTCOME}))]
 
+    def _slot(self, kind: str, depends: frozenset, jumps: bool, levels: bool, shape: tuple[int, ...]) -> Slot:
+        role = frozenset({self.role})
+        return Slot(kind, depends, role if jumps else frozenset(), levels, role, shape)
+
     def _mode(self, key, slot: Slot, timed: Timed):
         """The mode; None for a jump in time alone, which stays as it is."""
         if slot.depends <= {"t", IN_TIME}:
             self.timed.setdefault(key, timed)
             return None
         known = self.table.slots.get(key, slot)
-        # A jump and a kink at one place are a jump.
-        self.table.slots[key] = known._replace(jumps=known.jumps or slot.jumps, roles=known.roles | slot.roles)
+        self.table.slots[key] = known._replace(jumps=known.jumps | slot.jumps, roles=known.roles | slot.roles)
         return self.mode(key, timed.actual)
 
 

@@ -1,7 +1,5 @@
 """Coordinates of first order: states and damped coordinates against closed forms, SciPy and eigenvalues."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,7 +119,7 @@ def test_a_thermostat():
 
 @pytest.mark.slow
 def test_derivatives_of_a_thermostat():
-    """By T and Q, forward, in reverse and by many parameters, as differences of SciPy's solution."""
+    """By T and Q, forward, in reverse, and by forty numbers: as differences of SciPy's solution."""
     start = {"x": 1.0, "z": 0.2}, {"x": 0.0}
 
     def end(params):
@@ -136,14 +134,12 @@ def test_derivatives_of_a_thermostat():
     for name in BATH:
         apart = [scipys(BATH | {name: BATH[name] + s * h}) for s in (1, -1)]
         right[name] = (apart[0] - apart[1]) / (2 * h)
-    for found in (jax.grad(end)(BATH), jax.jacfwd(end)(BATH), jax.grad(partial(replayed, end))(BATH)):
+    for found in (jax.grad(end)(BATH), jax.jacfwd(end)(BATH)):
         for name in BATH:
             np.testing.assert_allclose(found[name], right[name], rtol=1e-6)
-
-
-def replayed(end, params):
-    """The same function of 32 numbers, which reverse mode replays."""
-    return end(jax.tree.map(lambda x: jnp.sum(jnp.full(32, x / 32)), params))
+    # Of so many numbers reverse mode replays the steps.
+    many = jax.grad(lambda shares: end(BATH | {"T": jnp.sum(shares * np.arange(40.0))}))(jnp.full(40, 1 / 780))
+    np.testing.assert_allclose(many, right["T"] * np.arange(40.0), rtol=1e-6)
 
 
 # c' = 1, and from p on -2.
@@ -283,3 +279,44 @@ def test_a_bounce_keeps_the_cost():
     # It falls for a second, and then rises for half of one.
     np.testing.assert_allclose(motion.q["cost"][-1], 1 / 3 + 0.5**3 / 3, rtol=1e-9)
     np.testing.assert_allclose(motion.v["cost"][-1], 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_heat_of_dry_friction():
+    """The heat of a block that slides and comes to rest for good, μ m g |v|, is what the spring has lost."""
+    rubbed = lj.System(
+        lambda t, q, v, p: 0.5 * v["x"] ** 2 - 50.0 * q["x"] ** 2,
+        force=lambda t, q, v, p: {"x": -p * jnp.sign(v["x"]), "heat": 0.0},
+        states={"heat": lambda t, q, v, p: p * jnp.abs(v["x"])},
+    )
+    motion = lj.integrate(rubbed, {"x": 0.5, "heat": 0.0}, {"x": 0.0}, 0.3 * 9.81, ts=np.array([0.0, 2.6, 4.0]))
+    np.testing.assert_allclose(motion.q["x"][1:], 0.5 - 16 * 0.02943, atol=1e-9)
+    np.testing.assert_allclose(motion.q["heat"][1:], 50 * (0.25 - motion.q["x"][1:] ** 2), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_vector_of_states_beside_a_constraint():
+    """A pendulum by a rod, with a filtered velocity fed back, against the angle's equation by SciPy. Twin: no filter."""
+    rod = lj.Holonomic(lambda t, q, p: q["r"] @ q["r"] - 1.0)
+    fed_back = lj.System(
+        lambda t, q, v, p: 0.5 * v["r"] @ v["r"] - 9.81 * q["r"][1],
+        {"rod": rod},
+        force=lambda t, q, v, p: {"r": -0.5 * q["w"] - 0.1 * v["w"], "w": jnp.zeros(2)},
+        states={"w": lambda t, q, v, lag: (v["r"] - q["w"]) / lag},
+    )
+
+    def rate(t, y, lag=0.3):
+        angle, turning, *w = y
+        along = np.array([np.cos(angle), np.sin(angle)])
+        filtered = (turning * along - w) / lag
+        return [turning, along @ (-0.5 * np.array(w) - 0.1 * filtered) - 9.81 * np.sin(angle), *filtered]
+
+    start = [np.arctan2(0.6, 0.8), 0.0, 0.0, 0.0]
+    right, twin = (
+        solve_ivp(rate, (0, 3), start, "DOP853", args=a, rtol=1e-12, atol=1e-13).y[:, -1] for a in ((), (1.0,))
+    )
+    q0, v0 = {"r": np.array([0.6, -0.8]), "w": np.zeros(2)}, {"r": np.zeros(2)}
+    motion = lj.integrate(fed_back, q0, v0, 0.3, ts=np.array([0.0, 3.0]))
+    found = [*motion.q["r"][-1], *motion.q["w"][-1]]
+    np.testing.assert_allclose(found, [np.sin(right[0]), -np.cos(right[0]), *right[2:]], atol=1e-9)
+    assert abs(np.sin(twin[0]) - np.sin(right[0])) > 1e-2 and set(motion.multipliers) == {"rod"}

@@ -24,7 +24,17 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.integrate.jumps.find import Given, Jumps, Smooth
 from lagjax.mechanics import applied_force, completed, mass_and_forcing, with_first_order
 from lagjax.numerics import dense
-from lagjax.system import OF_STATE, WITH_MULTIPLIERS, Model, System, constraints, coordinates, model_of, takes_of
+from lagjax.system import (
+    OF_STATE,
+    WITH_MULTIPLIERS,
+    Model,
+    System,
+    constraints,
+    coordinates,
+    model_of,
+    rate_of,
+    takes_of,
+)
 
 # A force is evaluated once more for each jump along which a motion could slide.
 MOST_SLIDING = 8
@@ -34,13 +44,15 @@ def slidable(jumps: Jumps, system: System) -> tuple[int, ...]:
     """The numbers of the modes along whose jumps a motion could slide: comparisons of velocities, in forces."""
     if system.force is not None and takes_of(system.force) == WITH_MULTIPLIERS:
         return ()
-    of_forces = frozenset({"force", "dissipation"})
+    of_forces, rates = frozenset({"force", "dissipation"}), frozenset(map(rate_of, system.states))
     found = tuple(
         i
         for i, slot in enumerate(jumps.each())
         if "v" in slot.depends
         and not slot.levels
-        and slot.roles <= of_forces
+        # The rate of a state may have a kink there; for one that jumps, no side is right while the motion slides.
+        and slot.roles - rates <= of_forces
+        and not slot.jumps & rates
         # A kink of Rayleigh's function is a jump of its force.
         and (slot.jumps or "dissipation" in slot.roles)
     )
