@@ -296,7 +296,7 @@ def test_heat_of_dry_friction():
 
 @pytest.mark.slow
 def test_a_vector_of_states_beside_a_constraint():
-    """A pendulum by a rod, with a filtered velocity fed back, against the angle's equation by SciPy. Twin: no filter."""
+    """A pendulum by a rod, with a filtered velocity fed back, against the angle's equation by SciPy. Twin: a lag."""
     rod = lj.Holonomic(lambda t, q, p: q["r"] @ q["r"] - 1.0)
     fed_back = lj.System(
         lambda t, q, v, p: 0.5 * v["r"] @ v["r"] - 9.81 * q["r"][1],
