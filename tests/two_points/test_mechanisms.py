@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import lagjax as lj
@@ -140,3 +140,28 @@ def test_four_bar_linkage():
     known = multipliers_at(angles[0], rate, g)
     assert all(abs(found.multipliers[name][0] / known[name] - 1) < 1e-10 for name in known)
     assert np.max(np.abs(jax.jvp(at_angle, (angles[0],), (start_rate(angles, time, 0.0),))[1] - exact)) > 0.1
+
+
+@pytest.mark.exhaustive
+def test_derivatives_on_a_constraint():
+    """By a parameter and an end on the constraint, in both modes: those of the angle by SciPy, by differences."""
+    rod = lj.System(
+        lambda t, q, v, params: 0.5 * v @ v - params["g"] * q[1],
+        {"rod": lj.Holonomic(lambda t, q, params: q @ q - 1.0)},
+    )
+
+    def start_speed(g, angle):
+        end = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return lj.connect(rod, jnp.array([1.0, 0.0]), end, 0.0, 0.5, {"g": g}, outputs=2).start_velocity[1]
+
+    def by_angle(g, angle):
+        def off(speed):
+            options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
+            return solve_ivp(lambda t, y: [y[1], -g * np.cos(y[0])], (0, 0.5), [0.0, speed], **options).y[0, -1] - angle
+
+        return brentq(off, 0.0, 10.0, xtol=1e-13)
+
+    at, step = (3.0, 0.7), 1e-3
+    exact = [(by_angle(*(np.array(at) + d)) - by_angle(*(np.array(at) - d))) / (2 * step) for d in step * np.eye(2)]
+    for mode in (jax.jacfwd, jax.jacrev):
+        assert np.allclose(jax.jit(mode(start_speed, (0, 1)))(*at), exact, rtol=1e-6)
