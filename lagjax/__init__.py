@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 # isort: split
 # A system: its Lagrangian and its constraints.
 from lagjax.mechanics import Generator, NoetherCharge, noether_charge
-from lagjax.system import Holonomic, Hybrid, Nonholonomic, Switch, System
+from lagjax.system import Contact, Elements, Friction, Holonomic, Hybrid, Nonholonomic, Stop, Switch, System
 
 # isort: split
 # One state: quantities from the Lagrangian and the constraints.
@@ -192,6 +192,10 @@ __all__ = [
     "Nonholonomic",
     "Hybrid",
     "Switch",
+    "Contact",
+    "Friction",
+    "Stop",
+    "Elements",
     "touches",
     "releases",
     "slips",

@@ -161,7 +161,7 @@ def integrate(
 
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """
-    check_system(system, q0, v0, params, phases=True)
+    check_system(system, q0, v0, params, phases=True, elements=True)
     arguments.check_method(method)
     arguments.check_controller(stepsize_controller, max_step, jump_ts)
     arguments.check_max_steps(max_steps)

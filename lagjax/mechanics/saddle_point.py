@@ -116,20 +116,20 @@ class Dense(NamedTuple):
         jacobian, gamma = constraints.acceleration_rows(model, t, x, u)
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
-        independent = independent_rows(jacobian) if independent is None else independent
+        independent = chosen(model, jacobian) if independent is None else independent
         return _solved(linear, jacobian, gamma, independent)[:2]
 
     def independent(
         self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
     ) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
-        return independent_rows(constraints.jacobian(model, t, x, u), dependent_below)
+        return chosen(model, constraints.jacobian(model, t, x, u), dependent_below)
 
     def displacement(self, *state) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         jacobian = constraints.jacobian(*state)
         # The rows are chosen here and not at the step's start, as the step may have come near a singular position.
-        matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, independent_rows(jacobian))
+        matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, chosen(state[0], jacobian))
         return lambda which, r: matrix[:, which] @ r
 
     def row_sizes(self, *state) -> Float[Array, " m"]:
@@ -156,6 +156,12 @@ class Dense(NamedTuple):
         return f"{self.unknowns} equations by {by}"
 
 
+def chosen(model: Model, jacobian: Array, dependent_below: float | None = None) -> Bool[Array, " m"]:
+    """Which constraint equations to solve with: independent ones, of those that are not off."""
+    independent = independent_rows(jacobian, dependent_below)
+    return independent if model.off is None else independent & ~model.off
+
+
 def saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array):
     """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
     n = mass.shape[0]
@@ -179,7 +185,7 @@ def saddle_point_matrix(mass: Array, jacobian: Array, independent: Array):
     """`[[M, Aᵀ], [A, 0]]` with the independent rows of A, and rows of the unit matrix in place of the others."""
     m, n = jacobian.shape
     rows = _pick(jacobian, independent, n)
-    filled = _pick(jnp.ones_like(jacobian[:, 0]), independent, n) if m > 1 else jnp.ones(m, mass.dtype)
+    filled = _pick(jnp.ones_like(jacobian[:, 0]), independent, n) if m > 1 else independent.astype(mass.dtype)
     return jnp.block([[mass, rows.T], [rows, jnp.diag(1 - filled)]])
 
 
@@ -256,10 +262,11 @@ def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
     """
     linear, rows = mass_and_forcing(*state), _without_vanishing(*state)
     mass, jacobian = linear.mass, rows.jacobian
-    independent = independent_rows(jacobian)
+    independent = chosen(state[0], jacobian)
     unique = linear.response is None or _solved(linear, jacobian, rows.gamma, independent).unique
     matrix = _scaled_matrix(mass, jacobian, independent)
-    regular = jnp.all(independent) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
+    known = independent if state[0].off is None else independent | state[0].off
+    regular = jnp.all(known) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
     return regular & unique, _largest_of_rows(mass)
 
 
@@ -298,7 +305,7 @@ def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:
     """The same in vector form."""
     linear = mass_and_forcing(model, t, x, u)
     rows = _without_vanishing(model, t, x, u)
-    independent = independent_rows(rows.jacobian)
+    independent = chosen(model, rows.jacobian)
     a, multipliers, unique = _solved(linear, rows.jacobian, rows.gamma, independent)
     return Examined(
         a=a,

@@ -85,7 +85,7 @@ def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     if model.n == 1 and not model.m:
         return model.tree(completed(model, t, x, u, linear.forcing / linear.mass[0])), jnp.zeros(0, x.dtype)
     rows = constraints.acceleration_rows(model, t, x, u)
-    solver = dense.Saddle(linear.mass, rows.jacobian, diagonal)
+    solver = dense.Saddle(linear.mass, rows.jacobian, diagonal, model.off)
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
     a = completed(model, t, x, u, a)
     valid = solver.valid if linear.response is None else solver.valid & unique
@@ -98,7 +98,7 @@ def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
         return q, model.tree(resolved(model, t, x, u))
     mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
     # The residual vanishes at the solution, so that the derivative of the matrix does not count.
-    solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)))
+    solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)), off=model.off)
     no_force = jnp.zeros_like(x)
     last_x = last_u = no_force
     if model.holonomic.any():

@@ -76,7 +76,7 @@ class Plan:
 
 def plan(model: Model) -> Plan | None:
     """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
-    if model.reacts or model.n + model.m < UNKNOWNS_AT_LEAST:
+    if model.reacts or model.off is not None or model.n + model.m < UNKNOWNS_AT_LEAST:
         return None
     leaves, structure = jtu.tree_flatten(model)
     leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)

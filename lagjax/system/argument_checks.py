@@ -16,10 +16,12 @@ CONSTRAINTS = (Holonomic, Nonholonomic)
 SYSTEMS = (System, Hybrid)
 
 
-def check_system(system: Any, *others: Any, phases: bool = False, states: bool = True) -> None:
+def check_system(
+    system: Any, *others: Any, phases: bool = False, states: bool = True, elements: bool = False
+) -> None:
     """Raise if the first argument of a function is not a `System`, or with `phases` a `Hybrid`.
 
-    `others`: the following arguments, among which the system may be. `states`: whether it may have states.
+    `others`: the following arguments, among which the system may be. `states`, `elements`: whether it may have them.
     """
     if not states and isinstance(system, System) and system.states:
         raise ValueError(
@@ -27,6 +29,13 @@ def check_system(system: Any, *others: Any, phases: bool = False, states: bool =
             "Lagrange's equations.\nFix: lj.integrate for their motions; here the system without them."
         )
     if type(system) is System or isinstance(system, SYSTEMS if phases else System):
+        if not elements and getattr(system, "elements", None) is not None:
+            raise TypeError(
+                f"this takes a system with one form of equations, and the elements of this one "
+                f"({', '.join(map(repr, system.elements))}) change them.\n"
+                "Fix: lj.System(...) without elements=, with a lj.Holonomic for a contact that is closed; "
+                "lj.integrate takes elements."
+            )
         return
     known_system(system)
     if isinstance(system, Hybrid):

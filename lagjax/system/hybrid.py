@@ -197,6 +197,10 @@ class Hybrid(eqx.Module):
         """The systems of all phases."""
         return self.systems
 
+    def given(self, params: PyTree) -> PyTree:
+        """What the functions of the phases take as `params`."""
+        return params
+
     @property
     def first_phase(self) -> System:
         """The system of the phase in which motions start. Not while JAX is tracing."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jaxtools import shape_of, without_init
 from lagjax.system import coordinates
@@ -85,6 +85,20 @@ class Form(NamedTuple):
         return jtu.tree_unflatten(self.structure, leaves)
 
 
+class InModes(NamedTuple):
+    """The parameters of a system some of whose constraints hold only in some of its `modes`.
+
+    - `modes` (k,): of each element's law, as in `integrate/elements/laws.py`.
+    - `off` (m,): which of the stacked constraint equations do not hold now; their multipliers are zero.
+    - `slack` (k,): how far the guard of each mode may be below zero by round-off.
+    """
+
+    params: PyTree
+    modes: Int[Array, " k"]
+    off: Bool[Array, " m"]
+    slack: Float[Array, " k"]
+
+
 class Model(eqx.Module):
     """A system, or hybrid, with its parameters, for states of one form. n coordinates, m constraint equations."""
 
@@ -114,11 +128,18 @@ class Model(eqx.Module):
         return np.array([residual.of_positions for residual in self.form.residuals for _ in range(residual.size)], bool)
 
     @property
+    def off(self) -> Bool[Array, " m"] | None:
+        """Which of the stacked constraint equations do not hold in the present mode; None where all always hold."""
+        return self.params.off if isinstance(self.params, InModes) else None
+
+    @property
     def phases(self) -> "tuple[Model, ...]":
         """The model of each phase; the model itself where the system is no hybrid."""
         if not self.system.in_phases:
             return (self,)
-        return tuple(model_of(phase, *self.form.example, self.params) for phase in self.system.phases)
+        return tuple(
+            model_of(phase, *self.form.example, self.system.given(self.params)) for phase in self.system.phases
+        )
 
     def tree(self, x: Array):
         """A vector (..., n) in the user's structure."""

@@ -20,6 +20,7 @@ from jaxtyping import PyTree
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
 from lagjax.system.constraints import Holonomic, Nonholonomic
+from lagjax.system.elements import Contact, Elements, Friction
 from lagjax.system.traced_functions import Traced
 
 # Packages that pickle any function, whatever its name: they write down what it does.
@@ -67,7 +68,7 @@ def _any_function_is_taken():
     return False
 
 
-FIELDS = "lagrangian", "constraints", "force", "dissipation", "states"
+FIELDS = "lagrangian", "constraints", "force", "dissipation", "states", "elements"
 
 
 class System(eqx.Module):
@@ -96,6 +97,8 @@ class System(eqx.Module):
       the state as `q[name]`; the force and events also its rate, as `v[name]`. No force acts on it. See
       `docs/states.md`.
 
+    - `elements`: by name, contacts and friction (`lj.Contact`, `lj.Friction`, `lj.Stop`); or `lj.Elements` of them.
+
     Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
     functions can, that is if these are defined with `def` in a module.
 
@@ -109,6 +112,7 @@ class System(eqx.Module):
     force: Callable | None
     dissipation: Callable | None
     states: dict[str, Callable]
+    elements: Elements | None
 
     def __init__(
         self,
@@ -117,6 +121,7 @@ class System(eqx.Module):
         force: Callable | None = None,
         dissipation: Callable | None = None,
         states: Mapping[str, Callable] | None = None,
+        elements: Elements | Mapping[str, Contact | Friction] | None = None,
     ):
         if isinstance(lagrangian, System):
             raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
@@ -164,6 +169,8 @@ class System(eqx.Module):
         self.force = force
         self.dissipation = dissipation
         self.states = dict(sorted(states.items()))
+        # None where there are none, so that nothing else has to ask.
+        self.elements = (elements if isinstance(elements, Elements) else Elements(elements)) if elements else None
 
     def map(self, change: Callable[[Callable, str], Callable]) -> "System":
         """The system with `change(function, role)` in place of each of its functions, unchecked.
@@ -180,6 +187,7 @@ class System(eqx.Module):
             change_if(self.force, "force"),
             change_if(self.dissipation, "dissipation"),
             {name: change(f, rate_of(name)) for name, f in self.states.items()},
+            self.elements,
         )
 
     in_phases: ClassVar[bool] = False
@@ -240,6 +248,8 @@ class System(eqx.Module):
             parts.append(f"dissipation: {_name(self.dissipation)}")
         if self.states:
             parts.append("states: " + ", ".join(self.states))
+        if self.elements is not None:
+            parts.append("elements: " + ", ".join(f"{k} ({type(x).__name__})" for k, x in self.elements.items()))
         return by_line(f"System({'; '.join(parts)})")
 
 
@@ -257,9 +267,16 @@ def untraced(tree: PyTree):
     return jax.tree.map(lambda x: x.function if traced(x) else x, tree, is_leaf=traced)
 
 
-def unchecked(lagrangian: Callable, constraints: dict, force: Callable, dissipation, states: dict) -> System:
+def unchecked(
+    lagrangian: Callable,
+    constraints: dict,
+    force: Callable | None,
+    dissipation,
+    states: dict,
+    elements: Elements | None = None,
+) -> System:
     """A system of these functions, which have been checked: to make a module the usual way takes long."""
-    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation, states))))
+    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation, states, elements))))
 
 
 def _name(function: Callable):

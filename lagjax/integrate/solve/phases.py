@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from lagjax.integrate.elements.assembly import InElements, assembled, only_phase
 from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.segments import Phase
@@ -70,7 +71,7 @@ class Reset(eqx.Module):
 def traced_phases(system: System | Hybrid, start: State) -> Any:
     """The system, or hybrid with its switches, with all its functions checked and traced for such states."""
     if not system.in_phases:
-        return traced_system(system, start)
+        return traced_system(system, start) if system.elements is None else assembled(system, start)
     hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))
     return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
 
@@ -119,6 +120,8 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
         raise ValueError(
             f"an event in events= is named '{SWITCHES}', the name of the switches in traj.events.\nFix: another name."
         )
+    if isinstance(hybrid, InElements):
+        return (only_phase(hybrid, start, events),)
     return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
 

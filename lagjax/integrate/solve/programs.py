@@ -192,7 +192,8 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
 
 def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
     """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
-    found = [jumps for phase in model.phases if (jumps := jumps_found(phase, start)) is not None]
+    starts = [(phase, start._replace(params=phase.params)) for phase in model.phases]
+    found = [jumps for phase, s in starts if (jumps := jumps_found(phase, s)) is not None]
     if model.system.in_phases:
         why = "in the phases of a lj.Hybrid"
     elif settings.controller is not None or settings.event is not None:

@@ -83,7 +83,8 @@ class Phase(NamedTuple):
 
     `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
     `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
-    the recorded events, whose guards come after those of switches.
+    the recorded events, whose guards come after those of switches. `meeting`: in place of resets, where a switch
+    changes the modes of elements (`elements/meeting.py`).
     """
 
     guards: Guards | None
@@ -91,6 +92,18 @@ class Phase(NamedTuple):
     targets: np.ndarray
     resets: tuple
     events: tuple[str, ...]
+    meeting: Any = None
+
+    def given(self, params: PyTree, modes: "Modes | None") -> PyTree:
+        """What the functions of the phase take as `params`."""
+        return params if modes is None else self.meeting.laws.given(params, *modes)
+
+
+class Modes(NamedTuple):
+    """The modes of elements, and how far below zero round-off may take their guards."""
+
+    modes: Int[Array, " k"]
+    slack: Float[Array, " k"]
 
 
 class OutputRows(NamedTuple):
@@ -100,13 +113,14 @@ class OutputRows(NamedTuple):
     v: PyTree[Float[Array, "T ..."]]
     multipliers: dict[str, Array]
     phase: Int[Array, " T"]
+    modes: Int[Array, "T k"] | None
 
 
 class PhaseWay(NamedTuple):
     """How far the legs have come: the state from which the next one starts, and the results of all before.
 
     `continues`: whether there is a next one. `events`: the recorded crossings. `sizes_so_far`: the largest coordinates
-    and velocities, (2, n); `least`: the sizes below which numbers counted as zero.
+    and velocities, (2, n); `least`: the sizes below which numbers counted as zero. `modes`: None without elements.
     """
 
     t: Float[Array, ""]
@@ -124,6 +138,7 @@ class PhaseWay(NamedTuple):
     scaled_error: Float[Array, ""]
     settled: Bool[Array, ""]
     result: Any
+    modes: Modes | None
 
 
 def solved_in_legs(
@@ -159,6 +174,7 @@ def solved_in_legs(
         "settled": way.settled,
         "events": way.events | ({SWITCHES: way.switches.as_crossings()} if hybrid.switches else {}),
         "phase": rows.phase,
+        "modes": rows.modes,
         "switches": way.switches,
     }
 
@@ -172,16 +188,24 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
-    rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32))
+    met, modes = None, None
+    if phase.meeting is not None:
+        met = phase.meeting.first(ts[0], q0, v0, params)
+        v0, modes = met.v, Modes(met.modes, met.slack)
+    of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
+    rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
     none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q0, v0), room)
     switches = Switches(
         t=unknown(ts[0], room), way=none, to=none, q=of_q, v=of_v, q_after=of_q, v_after=of_v, impulse=of_v,
         count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
-        ways=tuple(s.phase for s in hybrid.switches),
+        ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
+        modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
-    exists = (first >= 0) & (first < phases)
+    exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
+    if met is not None:
+        exists, refused = met.found, RESULTS.no_contact_forces
     known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
     start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
@@ -191,7 +215,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
         stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
         scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
-        result=RESULTS.where(exists, RESULTS.successful, RESULTS.no_such_phase),
+        result=RESULTS.where(exists, RESULTS.successful, refused), modes=modes,
     )  # fmt: skip
 
 
@@ -200,7 +224,7 @@ def _leg(
     adjoint: Any,
 ) -> PhaseWay:  # fmt: skip
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
-    system = hybrid.systems[i]
+    system, params = hybrid.systems[i], phase.given(params, way.modes)
     # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
     # still.
     place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
@@ -209,7 +233,7 @@ def _leg(
     settings = settings if system.constraints else replace(settings, drift="none")
     found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
     result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
-    after, target, switches = After(way.q, way.v, jnp.asarray(False)), way.phase, way.switches
+    after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
     if phase.guards is not None and phase.switches:
         crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
         when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
@@ -222,6 +246,8 @@ def _leg(
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
         end = where(invalid, Snapshot(way.t, way.q, way.v, unknown(end.multipliers)), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
+        unsolved = onward & ~after.found
+        result, onward = RESULTS.where(unsolved, RESULTS.no_contact_forces, result), onward & ~unsolved
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
@@ -232,22 +258,24 @@ def _leg(
     further = PhaseWay(
         t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
-        rows=_filled(way.rows, in_phase & known, rows, i), switches=switches,
+        rows=_filled(way.rows, in_phase & known, rows, i, way.modes), switches=switches,
         events=with_those_of(events, way.events),
         end=where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
         sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
         scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
-        settled=way.settled & found["settled"], result=result,
+        settled=way.settled & found["settled"], result=result, modes=where(onward, after.modes, way.modes),
     )  # fmt: skip
     return where(in_phase, further, way)
 
 
 class PhaseEnding(NamedTuple):
-    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
+    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches, and which of
+    them cross at that time; the result."""
 
     onward: Bool[Array, ""]
     first: Int[Array, ""]
+    crossed: Bool[Array, " k"]
     end: Snapshot
     result: Any
 
@@ -275,8 +303,8 @@ def _ending(
     missed = (result == RESULTS.successful) & is_below
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
-    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-    return PhaseEnding(onward, first, end, result)
+    crossed = when <= jnp.min(when) + at_one_time
+    return PhaseEnding(onward, jnp.argmax(crossed), crossed, end, result)
 
 
 def _is_below(end: Snapshot, params: PyTree, guards: Guards, count: int, rtol: Array):
@@ -291,29 +319,38 @@ def reached(q: PyTree):
     return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
 
 
-def _filled(rows: OutputRows, known: Array, found, i: int) -> OutputRows:
+def _filled(rows: OutputRows, known: Array, found, i: int, modes: Modes | None) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
 
     def put(all, new):
         return jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
 
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
-    return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, jnp.where(known, i, rows.phase))
+    of_modes = None if modes is None else jnp.where(known[:, None], modes.modes[None], rows.modes)
+    phase = jnp.where(known, i, rows.phase)
+    return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, phase, of_modes)
 
 
 class After(NamedTuple):
-    """The state after a switch."""
+    """The state after a switch; `found`: whether there is one."""
 
     q: PyTree
     v: PyTree
     rests: Bool[Array, ""]
+    modes: Modes | None = None
+    found: Bool[Array, ""] | bool = True
 
 
 def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay):
     """Return the state after the phase's first switch, the next phase, and the record with that switch."""
-    onward, first, end, _ = ending
-    states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
-    after = jax.tree.map(lambda *x: _one_of(first, x), *states)
+    onward, first, crossed, end, _ = ending
+    if phase.meeting is None:
+        states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
+        after = jax.tree.map(lambda *x: _one_of(first, x), *states)
+    else:
+        sizes = jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v))
+        met = phase.meeting(end.t, end.q, end.v, params, crossed, sizes)
+        after = After(end.q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
@@ -327,6 +364,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
+        modes=None if s.modes is None else put(s.modes, after.modes.modes),
     )  # fmt: skip
     return after, to, record
 

@@ -18,7 +18,7 @@ from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
-from lagjax.system import Hybrid, Model, UnknownSystem, known_system
+from lagjax.system import Hybrid, Model, UnknownSystem, known_system, model_of
 
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
@@ -32,6 +32,7 @@ class Switches(eqx.Module):
       last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
+    - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names.
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -51,6 +52,7 @@ class Switches(eqx.Module):
     uncertain: Bool[Array, ""]
     names: tuple[str, ...] = eqx.field(static=True)
     ways: tuple[str, ...] = eqx.field(static=True)
+    modes: Int[Array, "S k"] | None = None
 
     def as_crossings(self) -> Crossings:
         """Return the switches as crossings of one guard, with the states before them."""
@@ -73,6 +75,8 @@ class Switches(eqx.Module):
 
     def _rows(self):
         times, ways, to = map(np.asarray, (self.t, self.way, self.to))
+        if self.modes is not None:
+            return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]}" for k in range(int(self.count))]
         return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} -> {self.names[to[k]]}" for k in range(int(self.count))]
 
 
@@ -82,6 +86,9 @@ class HybridTrajectory(Trajectory):
     - `phase` (T,): the number of the phase at each output, in the order of `system.names`; -1 where none was reached.
       An output at the very time of a switch has the state and the phase before it.
     - `switches`: the `Switches`.
+    - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
+      `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
+      gap is open).
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
     - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces
@@ -90,11 +97,17 @@ class HybridTrajectory(Trajectory):
 
     phase: Int[Array, " T"] = eqx.field(kw_only=True)
     switches: Switches = eqx.field(kw_only=True)
+    modes: Int[Array, "T k"] | None = eqx.field(kw_only=True, default=None)
     in_phases: ClassVar[bool] = True
 
     @property
     def system(self) -> Hybrid:  # pyright: ignore[reportIncompatibleVariableOverride]
         return known_system(self.any_system)
+
+    @property
+    def model(self) -> Model:
+        first = jax.tree.map(lambda x: x[0], (self.t, self.q, self.v))
+        return model_of(self.system, *first, self.system.given(self.params))
 
     def named_phases(self) -> np.ndarray:
         """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
@@ -132,7 +145,7 @@ class HybridTrajectory(Trajectory):
         return fig
 
     def rows(self) -> dict:
-        return super().rows() | {"phase": self.phase}
+        return super().rows() | {"phase": self.phase, "modes": self.modes}
 
     def _of_system(self):
         if isinstance(self.any_system, UnknownSystem):

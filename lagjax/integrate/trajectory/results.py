@@ -43,6 +43,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     guard_not_seen = "A guard is below zero, and was not seen to cross it: the phase began on it, and hardly left it."
     guard_below_zero = "A guard of the first phase is below zero at the start."
     reset_not_finite = "The state after a switch is NaN or infinite."
+    no_contact_forces = "No forces, or impulses, obey the laws of contact and friction together (Painlevé's paradox)."
     no_such_phase = "start= is not the number of a phase."
     raised = "A function that is called in Python, by a callback, raised an exception."
     no_progress = (

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lagjax.jaxtools import one_by_one, primitive
 
@@ -177,16 +177,25 @@ class Saddle:
     For programs of single numbers (`scalarize.py`), in which the zeros of M and A cost nothing. `valid` says whether
     the solution is as accurate as with pivoting: M is definite (or every pivot the largest of its column), and no row
     of A depends on those before it. For a `diagonal` M without A the pivots are divided by unchecked: a singular one
-    gives NaN or infinity.
+    gives NaN or infinity. Equations that are `off`, whose rows of A are zero, have the multiplier zero.
 
     Source: Golub & Van Loan, *Matrix Computations*, §4.1.2.
     """
 
-    def __init__(self, mass: Float[Array, "n n"], jacobian: Float[Array, "m n"], diagonal: bool = False):
+    def __init__(
+        self,
+        mass: Float[Array, "n n"],
+        jacobian: Float[Array, "m n"],
+        diagonal: bool = False,
+        off: Bool[Array, " m"] | None = None,
+    ):
         self.n, self.m = n, m = mass.shape[0], jacobian.shape[0]
+        zero = jnp.zeros_like(mass[0, 0])
 
         def entry(i: int, j: int) -> Array:
-            return mass[i, j] if i < n else jacobian[i - n, j] if j < n else jnp.zeros_like(mass[0, 0])
+            if i < n or j < n:
+                return mass[i, j] if i < n else jacobian[i - n, j]
+            return zero if off is None or i != j else jnp.where(off[i - n], -1.0, zero)
 
         self.matrix = matrix = [[entry(max(i, j), min(i, j)) for j in range(n + m)] for i in range(n + m)]
         work = [row[: i + 1] for i, row in enumerate(matrix)]

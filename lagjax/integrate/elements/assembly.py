@@ -1,0 +1,55 @@
+"""A system with elements as `integrate` solves it: a motion in one phase, whose modes change at switches."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.integrate.elements.laws import Laws, in_modes
+from lagjax.integrate.elements.meeting import Meeting
+from lagjax.integrate.events.event import Crossing, Guards, guards_of
+from lagjax.integrate.jumps.find import OfParams
+from lagjax.integrate.solve.segments import Phase
+from lagjax.jaxtools import without_init
+from lagjax.system import Hybrid, InModes, State, System
+
+MOTION = "motion"
+
+
+class InElements(Hybrid):
+    """A system with elements, `user`, as a hybrid of one phase whose functions take modes."""
+
+    laws: Laws
+    user: System
+
+    def given(self, params: PyTree) -> Any:
+        """The parameters with all gaps open."""
+        if isinstance(params, InModes):
+            return params
+        return self.laws.given(params, jnp.zeros(len(self.laws.rows), int))
+
+    def __repr__(self):
+        return repr(self.user)
+
+
+def assembled(system: System, start: State) -> InElements:
+    """The assembly, with all functions checked and traced."""
+    assert system.elements is not None
+    masked, laws = in_modes(system, start)
+    hybrid = Hybrid({MOTION: masked}, most_switches=system.elements.most_switches)
+    return without_init(InElements, vars(hybrid) | {"laws": laws, "user": system})
+
+
+def only_phase(assembly: InElements, start: State, events: Mapping[str, Crossing]) -> Phase:
+    """The guards of all modes, and of the recorded events; what happens where modes change."""
+    laws = assembly.laws
+    modes, count = laws.guards(), len(laws.rows)
+    recorded = guards_of(events, assembly.user, start) if events else Guards((), ())
+    functions = (*modes.functions, *(OfParams(guard) for guard in recorded.functions))
+    guards = Guards(functions, modes.kinds + recorded.kinds)
+    meeting = Meeting(assembly.systems[0], laws)
+    return Phase(guards, tuple(range(count)), np.zeros((count, 2), np.int32), (), tuple(events), meeting)
+
+

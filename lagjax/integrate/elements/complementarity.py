@@ -1,0 +1,103 @@
+"""The forces, or impulses, of contacts that are solved together: a complementarity problem with Coulomb's law.
+
+With the forces λ of all contacts, normal ones and tangential ones, their accelerations are W λ + b. For each contact
+
+    0 ≤ λ_N ⊥ a_N ≥ 0,        |λ_T| ≤ μ N,  against a_T:  a_T > 0 only where λ_T = -μ N, and < 0 only where it is μ N
+
+which is the root of λ - proj(λ - r (W λ + b)), with the projection onto λ_N ≥ 0 and onto |λ_T| ≤ μ N, for any r > 0.
+It is found by Gauss-Seidel's relaxation and Newton's method on this piecewise smooth equation; each linear system is
+solved in the sense of least squares, since contacts may depend on each other (a table on four legs).
+
+Source: Alart & Curnier, Comput. Methods Appl. Mech. Eng. 92 (1991) 353; Acary & Brogliato, *Numerical Methods for
+Nonsmooth Dynamical Systems*, §12.6, §13.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from lagjax.jaxtools import stop_gradient
+
+SWEEPS, STEPS = 30, 30
+# A root is found where the residual is below this part of the forces.
+SMALL = 1e-11
+# Singular values below this part of the largest count as zero.
+DEPENDENT = 1e-10
+
+
+class ContactProblem(NamedTuple):
+    """The problem of k_N normal forces and k_T tangential ones, stacked: k = k_N + k_T.
+
+    - `matrix`, `free`: W and b.
+    - `may_push` (k_N,): which contacts there are; the forces of the others are zero.
+    - `of_forces`, `constant`: the normal force of each tangential one is `constant + of_forces @ λ`.
+    - `coefficient`: μ; zero where there is no friction.
+    - `slides` (k_T,): 1 or -1 where the sliding is given, and with it λ_T = -slides μ N; else 0.
+    """
+
+    matrix: Float[Array, "k k"]
+    free: Float[Array, " k"]
+    may_push: Bool[Array, " kN"]
+    of_forces: Float[Array, "kT k"]
+    constant: Float[Array, " kT"]
+    coefficient: Float[Array, " kT"]
+    slides: Float[Array, " kT"]
+
+    @property
+    def step(self) -> Float[Array, " k"]:
+        """r of each force."""
+        own = jnp.diag(self.matrix)
+        return 1 / jnp.where(own > 0, own, 1.0)
+
+    def projected(self, forces: Float[Array, " k"]) -> Float[Array, " k"]:
+        """proj(λ - r (W λ + b))."""
+        count = self.may_push.size
+        z = forces - self.step * (self.matrix @ forces + self.free)
+        normal = jnp.where(self.may_push, jnp.maximum(z[:count], 0.0), 0.0)
+        most = self.coefficient * jnp.maximum(self.normal_forces(jnp.concatenate([normal, forces[count:]])), 0.0)
+        tangential = jnp.where(self.slides != 0, -self.slides * most, jnp.clip(z[count:], -most, most))
+        return jnp.concatenate([normal, tangential])
+
+    def normal_forces(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
+        """N of each tangential force."""
+        return self.constant + self.of_forces @ forces
+
+
+class Forces(NamedTuple):
+    """λ, and whether it is a solution."""
+
+    forces: Float[Array, " k"]
+    found: Bool[Array, ""]
+
+
+def solved(problem: ContactProblem) -> Forces:
+    """The forces of contacts that are solved together; the first derivative is that of the solution's own case."""
+    still = stop_gradient(problem)
+
+    def residual(problem: ContactProblem, forces: Array) -> Array:
+        return forces - problem.projected(forces)
+
+    def slope(forces: Array) -> Array:
+        return jax.jacfwd(lambda forces: residual(still, forces))(forces)
+
+    def sweep(_, forces: Array) -> Array:
+        return lax.fori_loop(0, forces.size, lambda i, x: x.at[i].set(still.projected(x)[i]), forces)
+
+    def error(forces: Array) -> Array:
+        size = jnp.maximum(jnp.max(jnp.abs(forces)), jnp.max(jnp.abs(still.step * still.free)))
+        return jnp.max(jnp.abs(residual(still, forces))) / jnp.where(size > 0, size, 1.0)
+
+    def newton(state: tuple) -> tuple:
+        forces, _, count = state
+        forces = forces - jnp.linalg.pinv(slope(forces), rtol=DEPENDENT) @ residual(still, forces)
+        return forces, error(forces), count + 1
+
+    near = lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still.free))
+    start = near, error(near), jnp.asarray(0)
+    forces, left, _ = lax.while_loop(lambda s: (s[1] > SMALL) & (s[2] < STEPS), newton, start)
+    # The derivative of the solution, by the matrix of its own case.
+    forces = forces - stop_gradient(jnp.linalg.pinv(slope(forces), rtol=DEPENDENT)) @ residual(problem, forces)
+    return Forces(forces, left <= SMALL)

@@ -1,0 +1,321 @@
+"""A system with elements as one system whose constraints and forces depend on modes.
+
+A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
+side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. The functions of the system take
+`InModes` in place of the parameters, so that one program serves all modes; constraints that do not hold are off.
+
+The guard of a mode is above zero as long as it lasts:
+
+    open: the gap        closed: λ_N        slides: ± the sliding velocity        sticks: μ N - |λ_T|
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from lagjax.integrate.events.event import EventKind, Guards
+from lagjax.integrate.jumps.find import OfParams
+from lagjax.system import (
+    OF_POSITION,
+    OF_STATE,
+    WITH_MULTIPLIERS,
+    Call,
+    Contact,
+    Elements,
+    Holonomic,
+    InModes,
+    Nonholonomic,
+    State,
+    System,
+    model_of,
+    takes_of,
+    traced_call,
+    traced_system,
+)
+
+OPEN, CLOSED = 0, 1
+FREE, STICKS = 0, 2
+
+
+class Normal(eqx.Module):
+    """The gaps of a contact; `at`: their places among the modes."""
+
+    name: str = eqx.field(static=True)
+    gap: Callable
+    restitution: Any
+    slower_than: Any
+    at: tuple[int, int] = eqx.field(static=True)
+
+    def gaps(self, t: Array, q: PyTree, params: PyTree) -> Float[Array, " k"]:
+        """The gaps as a vector."""
+        return jnp.ravel(self.gap(t, q, params))
+
+    def returned(self, closing: Float[Array, " k"]) -> Float[Array, " k"]:
+        """The restitution at these speeds."""
+        e = self.restitution
+        return jnp.broadcast_to(jax.vmap(e)(closing) if callable(e) else e, closing.shape).astype(closing.dtype)
+
+
+class Tangent(eqx.Module):
+    """The sliding velocities of an element, and its friction; `name`: that of the constraint while it sticks.
+
+    `source`: the constraint or contact whose multiplier is the normal force; if empty, `normal` is that.
+    """
+
+    name: str = eqx.field(static=True)
+    sliding: Callable
+    coefficient: Any
+    static: Any
+    normal: Any
+    source: str = eqx.field(static=True)
+    at: tuple[int, int] = eqx.field(static=True)
+
+    def slips(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, " k"]:
+        """The sliding velocities as a vector."""
+        return jnp.ravel(self.sliding(t, q, v, params))
+
+    def normal_forces(self, t: Array, q: PyTree, v: PyTree, multipliers: dict, params: PyTree) -> Float[Array, " k"]:
+        """N of each."""
+        count = self.at[1] - self.at[0]
+        if self.source:
+            return jnp.broadcast_to(jnp.ravel(multipliers[self.source]), (count,))
+        found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
+        return jnp.broadcast_to(jnp.ravel(jnp.asarray(found, t.dtype)), (count,))
+
+    def kinetic(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
+        """μ while it slides with this speed."""
+        return _coefficient(self.coefficient, speed, params)
+
+    def sticking(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
+        """μ while it sticks."""
+        return _coefficient(self.coefficient if self.static is None else self.static, jnp.zeros_like(speed), params)
+
+
+def _coefficient(mu, speed: Array, params: PyTree) -> Array:
+    if callable(mu):
+        mu = mu(params) if len(takes_of_coefficient(mu)) == 1 else jax.vmap(lambda s: mu(s, params))(speed)
+    return jnp.broadcast_to(jnp.asarray(mu, speed.dtype), speed.shape)
+
+
+def takes_of_coefficient(mu: Callable) -> tuple[str, ...]:
+    """What a coefficient of friction takes: the parameters, or the speed before them."""
+    known = getattr(mu, "takes", None)
+    if known is not None:
+        return known
+    return ("params",) if len(inspect.signature(mu).parameters) == 1 else ("speed", "params")
+
+
+class Masked(eqx.Module):
+    """A gap, or a sliding velocity, as the residual of a constraint: zero where it does not hold."""
+
+    function: Callable
+    at: tuple[int, int] = eqx.field(static=True)
+    holds: int = eqx.field(static=True)
+
+    def __call__(self, *arguments):
+        *state, given = arguments
+        value = self.function(*state, given.params)
+        on = given.modes[slice(*self.at)] == self.holds
+        return jnp.where(on.reshape(jnp.shape(value)), value, 0.0)
+
+
+class WithFriction(eqx.Module):
+    """The force of a system with that of everything that slides."""
+
+    force: Callable | None
+    tangents: tuple[Tangent, ...]
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        params = given.params
+        total = jax.tree.map(jnp.zeros_like, q) if self.force is None else self.force(t, q, v, params)
+        for law in self.tangents:
+            mode = given.modes[slice(*law.at)]
+            side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
+            slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
+            size = law.kinetic(side * slip, params) * law.normal_forces(t, q, v, multipliers, params)
+            total = jax.tree.map(jnp.add, total, back(-side * size)[0])
+        return total
+
+
+class NormalGuard(eqx.Module):
+    """The guard of one gap."""
+
+    law: Normal
+    i: int = eqx.field(static=True)
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        place = self.law.at[0] + self.i
+        gap, force = self.law.gaps(t, q, given.params)[self.i], jnp.ravel(multipliers[self.law.name])[self.i]
+        return jnp.where(given.modes[place] == CLOSED, force, gap) + given.slack[place]
+
+
+class TangentGuard(eqx.Module):
+    """The guard of one sliding velocity."""
+
+    law: Tangent
+    i: int = eqx.field(static=True)
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        law, i, params = self.law, self.i, given.params
+        mode, slack = given.modes[law.at[0] + i], given.slack[law.at[0] + i]
+        slips = law.slips(t, q, v, params)
+        most = law.sticking(slips, params)[i] * law.normal_forces(t, q, v, multipliers, params)[i]
+        holds = most - jnp.abs(jnp.ravel(multipliers[law.name])[i]) + slack
+        return jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips[i]))
+
+
+class Laws(eqx.Module):
+    """The elements of a system with their places among the modes, normal ones first.
+
+    `rows` (k,): which of the stacked constraint equations belongs to each mode. `owners` (k_T,): for each sliding
+    velocity the gap whose force is its normal force, -1 if it is another.
+    """
+
+    normals: tuple[Normal, ...]
+    tangents: tuple[Tangent, ...]
+    rows: tuple[int, ...] = eqx.field(static=True)
+    owners: tuple[int, ...] = eqx.field(static=True)
+    equations: int = eqx.field(static=True)
+    impacts: str = eqx.field(static=True)
+
+    @property
+    def count(self) -> tuple[int, int]:
+        """The numbers of gaps and of sliding velocities."""
+        return len(self.rows) - len(self.owners), len(self.owners)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each mode."""
+        return tuple(
+            law.name + (f"[{i}]" if law.at[1] - law.at[0] > 1 else "")
+            for law in (*self.normals, *self.tangents)
+            for i in range(law.at[1] - law.at[0])
+        )
+
+    def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
+        """The parameters in these modes."""
+        normal = np.arange(len(self.rows)) < self.count[0]
+        holds = jnp.where(normal, modes == CLOSED, modes == STICKS)
+        off = jnp.zeros(self.equations, bool).at[np.array(self.rows, int)].set(~holds)
+        return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
+
+    def guards(self) -> Guards:
+        """The guard of each mode."""
+        functions = [NormalGuard(law, i) for law in self.normals for i in range(law.at[1] - law.at[0])]
+        functions += [TangentGuard(law, i) for law in self.tangents for i in range(law.at[1] - law.at[0])]
+        kinds = tuple(EventKind(f"mode of {name}", -1, True, 1, True, True, True) for name in self.names)
+        return Guards(tuple(functions), kinds)
+
+
+def in_modes(system: System, start: State) -> tuple[System, Laws]:
+    """A system with elements as a system of `InModes`, with its laws; all functions checked and traced."""
+    assert system.elements is not None
+    plain = traced_system(System(system.lagrangian, system.constraints, system.force, system.dissipation), start)
+    if plain.force is not None and takes_of(plain.force) == WITH_MULTIPLIERS:
+        raise ValueError(
+            "a force that takes multipliers cannot stand beside elements.\n"
+            'Fix: lj.Friction(sliding, coefficient, normal="name of the constraint") among the elements.'
+        )
+    normals, tangents, owners = _laws(system.elements, plain, start)
+    constraints: dict[str, Any] = {
+        name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()
+    }  # fmt: skip
+    constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
+    constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
+    force = None if plain.force is None else OfParams(plain.force)
+    if tangents:
+        force = WithFriction(plain.force, tangents)
+    dissipation = None if plain.dissipation is None else OfParams(plain.dissipation)
+    masked = System(OfParams(plain.lagrangian), constraints, force, dissipation)
+    count = (tangents or normals)[-1].at[1]
+    # The order of the stacked equations is known only with their shapes.
+    given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))
+    form = model_of(masked, *start[:3], given).form
+    places, first = {}, 0
+    for residual in form.residuals:
+        places[residual.name] = range(first, first + residual.size)
+        first += residual.size
+    rows = tuple(place for law in (*normals, *tangents) for place in places[law.name])
+    return masked, Laws(normals, tangents, rows, owners, form.m, system.elements.impacts)
+
+
+def _laws(elements: Elements, plain: System, start: State):
+    given: dict[str, Any] = dict(zip(OF_STATE, start)) | {"speed": start.t}
+    place, normals, tangents, owners = 0, [], [], []
+
+    def traced(name: str, role: str, f, takes: tuple[str, ...], shape: tuple | None = None):
+        if not callable(f):
+            return f
+        return traced_call(Call(role, f, takes, f" of element '{name}'"), given, lambda call, x: _check(call, x, shape))
+
+    for name, contact in elements.items():
+        if not isinstance(contact, Contact):
+            continue
+        _check_name(name, plain)
+        gap = traced(name, "gap", contact.gap, OF_POSITION)
+        e, size = traced(name, "restitution", contact.restitution, ("speed",), ()), _size(gap)
+        normals.append(Normal(name, gap, e, contact.slower_than, (place, place + size)))
+        place += size
+    for name, element in elements.items():
+        smooth = isinstance(element, Contact) and element.sliding is None
+        if smooth:
+            continue
+        own = isinstance(element, Contact)
+        mu = element.friction if isinstance(element, Contact) else element.coefficient
+        mu, static = (
+            traced(name, "coefficient", f, takes_of_coefficient(f) if callable(f) else (), ()) for f in (mu, element.static)
+        )
+        of_gap = [law for law in normals if own and law.name == name]
+        shape = jnp.shape(of_gap[0].gap.program.value) if of_gap else None
+        sliding = traced(name, "sliding", element.sliding, OF_STATE, shape)
+        normal = None if isinstance(element, Contact) else element.normal
+        source = name if own else normal if isinstance(normal, str) else ""
+        if not own:
+            known = [*plain.constraints, *(law.name for law in normals)]
+            if source and source not in known:
+                raise ValueError(
+                    f"normal='{source}' of element '{name}' is no constraint and no contact; there "
+                    f"{'are ' + ', '.join(map(repr, known)) if known else 'are none'}.\n"
+                    "Fix: its name, a number, or a function of (t, q, v, params)."
+                )
+            normal = traced(name, "normal", normal, OF_STATE) if not source else None
+            _check_name(name, plain)
+        size = _size(sliding)
+        key = f"{name} friction" if own else name
+        tangents.append(Tangent(key, sliding, mu, static, normal, source, (place, place + size)))
+        source_of = [law for law in normals if law.name == source]
+        owners += [source_of[0].at[0] + i if source_of else -1 for i in range(size)]
+        place += size
+    return tuple(normals), tuple(tangents), tuple(owners)
+
+
+def _size(function) -> int:
+    return int(np.prod(jnp.shape(function.program.value)))
+
+
+def _check_name(name: str, plain: System):
+    if name in plain.constraints:
+        raise ValueError(
+            f"'{name}' is the name of an element and of a constraint, whose multipliers would have one name.\n"
+            "Fix: another name for one of them; a contact that always holds is a lj.Holonomic and no element."
+        )
+
+
+def _check(call: Call, value, shape: tuple | None):
+    found = jnp.shape(value)
+    if shape is not None and found != shape or len(found) > 1:
+        raise ValueError(
+            f"{call} must return {'a number or a vector' if shape is None else 'a number' if shape == () else f'shape {shape}, as the gap'}"
+            f", and returned shape {found}.\n"
+            "Usual cause: the velocity of a point in space.\n"
+            "Fix: its component along the contact."
+        )

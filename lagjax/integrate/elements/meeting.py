@@ -1,0 +1,289 @@
+"""What happens where the modes of elements change: contacts that touch are solved together, in three steps.
+
+1. Impact: where a gap closes, velocities jump by the impulses of the contacts, until no gap closes any more.
+2. Forces: of the gaps that are closed and do not open, those stay closed that have to push (`complementarity.py`), and
+   of the sliding velocities that are zero, those stick whose friction can hold them.
+3. Velocities are moved onto what holds now.
+
+With the rows A of all contacts, and the constraints that always hold, the response of the velocities to a unit of each
+force is D: M D = Aᵀ + constraint forces, and W = A D.
+
+Impacts one after the other: always the gap that closes fastest, with its restitution, until none with a restitution
+closes; what then still closes is stopped all at once. Simultaneous impacts: Newton's law for all at once,
+0 ≤ Λ ⊥ γ' + e γ ≥ 0.
+
+Source: Glocker, *Set-Valued Force Laws*, §6; Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*, ch. 6-8.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, solved
+from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
+from lagjax.jaxtools import stop_gradient
+from lagjax.mechanics import mass_and_forcing, saddle_point
+from lagjax.numerics import independent_rows
+from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
+
+# A gap is closed, and a velocity zero, below this part of the sizes that it is made of.
+CLOSED_BELOW, STILL_BELOW = 2e-13, 1e-11
+# A force is zero below this part of the forces in the motion.
+NO_FORCE = 1e-11
+# Impacts one after the other, at most: so many for each pair of gaps, and a few more.
+MORE_IMPACTS = 8
+
+
+class Met(NamedTuple):
+    """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws."""
+
+    v: PyTree[Float[Array, "..."]]
+    modes: Int[Array, " k"]
+    slack: Float[Array, " k"]
+    found: Bool[Array, ""]
+
+
+class Rows(NamedTuple):
+    """The rows of all contacts at one state, and how velocities respond to their forces.
+
+    `of_constraints` (k, m_b): what each force adds to the multipliers of the constraints that always hold.
+    """
+
+    jacobian: Float[Array, "k n"]
+    response: Float[Array, "k n"]
+    matrix: Float[Array, "k k"]
+    of_constraints: Float[Array, "k mb"]
+
+
+class Meeting(eqx.Module):
+    """Solves the contacts of a system in modes (`laws.py`) at one state."""
+
+    system: System
+    laws: Laws
+
+    def __call__(
+        self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"],
+        impacts: bool = True,
+    ) -> Met:  # fmt: skip
+        """The modes and velocities after a meeting. `fired`: the modes whose guards are zero; `sizes`: the largest
+        coordinates and velocities of the motion. Without `impacts` gaps that close stay open."""
+        laws, (normals, _) = self.laws, self.laws.count
+        model = self._all_on(t, q, v, given)
+        x, u = model.vectors(q, v)
+        rows = self._rows(model, t, x, u, given)
+        scale = jnp.abs(rows.jacobian) @ jnp.stack([*sizes], axis=1)
+        gaps = jnp.concatenate([law.gaps(t, q, given.params) for law in laws.normals] or [jnp.zeros(0, t.dtype)])
+        width = CLOSED_BELOW * scale[:normals, 0]
+        closed = (given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= 4 * width)
+        if impacts:
+            u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
+        met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), stop_gradient(scale))
+        u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
+        slack = jnp.where(jnp.arange(met.slack.size) >= normals, met.slack, jnp.where(met.modes[: met.slack.size] == CLOSED, met.slack, jnp.concatenate([width, met.slack[normals:]])))
+        return Met(model.tree(u), met.modes, stop_gradient(slack), met.found)
+
+    def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
+        """The modes that fit the start of a motion; gaps that close are left to their guards."""
+        none, sizes = jnp.zeros(len(self.laws.rows), bool), stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
+        return self(t, q, v, self.laws.given(params, none.astype(int)), none, sizes, impacts=False)
+
+    def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
+        normals, tangents = self.laws.count
+        modes = jnp.array([CLOSED] * normals + [STICKS] * tangents, int)
+        return model_of(self.system, t, q, v, self.laws.given(given.params, modes))
+
+    def _rows(self, model: Model, t: Array, x: Array, u: Array, given: InModes) -> Rows:
+        every, mine = constraints.jacobian(model, t, x, u), np.array(self.laws.rows, int)
+        always = np.setdiff1d(np.arange(model.m), mine)
+        mass = mass_and_forcing(self._free(model, given), t, x, u).mass
+        jacobian, held = every[mine], every[always]
+        independent = independent_rows(held)
+        still = jnp.zeros(held.shape[0], x.dtype)
+        response, added = jax.vmap(lambda row: saddle_point(mass, held, row, still, independent))(jacobian)
+        return Rows(jacobian, response, jacobian @ response.T, added)
+
+    def _free(self, model: Model, given: InModes) -> Model:
+        """The model with all gaps open."""
+        return model.of(self.laws.given(given.params, jnp.zeros(len(self.laws.rows), int)))
+
+    def _slopes(self, model: Model, t: Array, x: Array, u: Array) -> Array:
+        return constraints.velocity_residual(model, t, x, u)[np.array(self.laws.rows, int)]
+
+    def _coefficients(self, t: Array, q: PyTree, v: PyTree, params: PyTree, slips: Array, sticking: bool) -> Array:
+        parts = []
+        first = self.laws.count[0]
+        for law in self.laws.tangents:
+            own = slips[law.at[0] - first : law.at[1] - first]
+            parts.append(law.sticking(own, params) if sticking else law.kinetic(jnp.abs(own), params))
+        return jnp.concatenate([*parts, jnp.zeros(0, t.dtype)])
+
+    def _impact(self, model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array) -> Array:
+        """The impulses of the contacts."""
+        laws, (normals, tangents) = self.laws, self.laws.count
+        if not normals:
+            return jnp.zeros(tangents, x.dtype)
+        q, v = model.tree(x), model.tree(u)
+        before = self._slopes(model, t, x, u)
+        mu = self._coefficients(t, q, v, given.params, before[normals:], sticking=False)
+        owners = np.array(laws.owners, int)
+        still = STILL_BELOW * (jnp.abs(rows.jacobian) @ jnp.abs(u))[:normals]
+        closing_at = lambda c: closed & (stop_gradient(c[:normals]) < -still)
+
+        def restitution(closing: Array) -> Array:
+            return jnp.concatenate([law.returned(closing[slice(*law.at)]) for law in laws.normals])
+
+        def at_once(c: Array, bounce: Array) -> Array:
+            """The impulses of all closed contacts together; `bounce`: e γ."""
+            free = jnp.concatenate([c[:normals] + bounce, c[normals:]])
+            problem = ContactProblem(
+                rows.matrix, free, closed, self._of_contacts(x.dtype), jnp.zeros(tangents, x.dtype),
+                jnp.where(owners >= 0, mu, 0.0), jnp.zeros(tangents, x.dtype),
+            )  # fmt: skip
+            return solved(problem).forces
+
+        if laws.impacts == "simultaneous":
+            struck = jnp.any(closing_at(before))
+            closing = jnp.where(closed, jnp.maximum(-before[:normals], 0.0), 0.0)
+            return lax.cond(
+                struck, lambda: at_once(before, -restitution(closing) * closing), lambda: jnp.zeros_like(before)
+            )
+
+        def next_impact(impulses: Array, _) -> tuple[Array, None]:
+            c = before + rows.matrix @ impulses
+            closing = jnp.maximum(-c[:normals], 0.0)
+            e = restitution(closing)
+            struck = closing_at(c) & (stop_gradient(e) > 0)
+            i = jnp.argmax(jnp.where(struck, stop_gradient(closing), 0.0))
+            one = self._one(rows.matrix, c, i, (1 + e[i]) * closing[i], mu)
+            return impulses + jnp.where(jnp.any(struck), one, 0.0), None
+
+        most = normals * (normals + 1) + MORE_IMPACTS if normals > 1 else 1
+        impulses, _ = lax.scan(next_impact, jnp.zeros_like(before), None, length=most)
+        left = before + rows.matrix @ impulses
+        rest = lax.cond(
+            jnp.any(closing_at(left)), lambda: at_once(left, jnp.zeros(normals, x.dtype)), lambda: jnp.zeros_like(left)
+        )
+        return impulses + rest
+
+    def _one(self, matrix: Array, c: Array, i: Array, jump: Array, mu: Array) -> Array:
+        """The impulses of gap i alone, whose velocity changes by `jump`: see `contacts/impacts.py`."""
+        normals, tangents = self.laws.count
+        unit = jnp.zeros(normals + tangents, c.dtype).at[i].set(1.0)
+        smooth = jump / matrix[i, i]
+        if not tangents:
+            return smooth * unit
+        owners = np.array(self.laws.owners, int)
+        j = normals + jnp.argmax(owners == i)
+        n, k, h = matrix[i, i], matrix[i, j], matrix[j, j]
+        after = c[j] + smooth * k
+        det = n * h - k * k
+        held_t = (-c[j] * n - jump * k) / jnp.where(det > 0, det, 1.0)
+        held_n = (jump - k * held_t) / n
+        most, side = mu[j - normals], jnp.sign(after)
+        room = n - side * most * k
+        slid_n = jump / jnp.where(room > 0, room, 1.0)
+        sticks = (jnp.abs(held_t) <= most * held_n) & (det > DEPENDENT * n * h) | (room <= 0)
+        normal = jnp.where(sticks, held_n, slid_n)
+        tangential = jnp.where(sticks, held_t, -side * most * slid_n)
+        both = normal * unit + tangential * jnp.zeros_like(unit).at[j].set(1.0)
+        return jnp.where(jnp.any(owners == i), both, smooth * unit)
+
+    def _of_contacts(self, dtype) -> np.ndarray:
+        """Which normal force belongs to each sliding velocity, (k_T, k)."""
+        normals, tangents = self.laws.count
+        found = np.zeros((tangents, normals + tangents), dtype)
+        for j, owner in enumerate(self.laws.owners):
+            if owner >= 0:
+                found[j, owner] = 1.0
+        return found
+
+    def _forces(
+        self, model: Model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array, scale: Array
+    ) -> Met:
+        """The modes after a meeting, by the forces at accelerations."""
+        laws, (normals, tangents) = self.laws, self.laws.count
+        model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
+        q, v, params = model.tree(x), model.tree(u), given.params
+        every = constraints.acceleration_rows(model, t, x, u)
+        mine = np.array(laws.rows, int)
+        always = np.setdiff1d(np.arange(model.m), mine)
+        linear = mass_and_forcing(self._free(model, given), t, x, u)
+        held = every.jacobian[always]
+        a, multipliers = saddle_point(
+            linear.mass, held, linear.forcing, every.gamma[always], independent_rows(held)
+        )
+        free = rows.jacobian @ a - every.gamma[mine]
+        slopes = self._slopes(model, t, x, u)
+        still = STILL_BELOW * scale[:, 1]
+        slower = jnp.concatenate([*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)])
+        touching = closed & (slopes[:normals] <= jnp.maximum(slower, still[:normals])) & (slopes[:normals] >= -jnp.maximum(slower, still[:normals]))
+        slips = slopes[normals:]
+        slides = jnp.where(jnp.abs(slips) > still[normals:], jnp.sign(slips), 0.0)
+        constant, of_forces = self._normal_forces(t, q, v, params, model, multipliers, rows, always)
+        mu_slides, mu_sticks = (self._coefficients(t, q, v, params, slips, sticking) for sticking in (False, True))
+        problem = ContactProblem(
+            rows.matrix, free, touching, of_forces, constant, jnp.where(slides != 0, mu_slides, mu_sticks), slides
+        )
+        forces, found = solved(problem)
+        accelerations = rows.matrix @ forces + free
+        # Where nothing pushes and nothing opens, a contact is closed.
+        by_motion = jnp.where(sizes_ok(scale[:, 0]), scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], 1.0), 0.0)
+        terms = jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion
+        stays = touching & ((forces[:normals] > 0) | (accelerations[:normals] <= NO_FORCE * terms[:normals]))
+        own = jnp.diag(rows.matrix)
+        slack = NO_FORCE * terms / jnp.where(own > 0, own, 1.0)
+        normal_modes = jnp.where(stays, CLOSED, OPEN)
+        pushed = forces[normals:]
+        most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
+        pulled = jnp.abs(pushed) >= most * (1 - NO_FORCE) - slack[normals:]
+        starts = jnp.where(pulled & (jnp.abs(accelerations[normals:]) > NO_FORCE * terms[normals:]), -jnp.sign(pushed), 0.0)
+        starts = jnp.where((starts == 0) & pulled & (most == 0), jnp.sign(accelerations[normals:]), starts)
+        side = jnp.where(slides != 0, slides, starts).astype(int)
+        owners = np.array(laws.owners, int)
+        present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], True)
+        tangent_modes = jnp.where(present, jnp.where(side != 0, side, STICKS), FREE)
+        modes = jnp.concatenate([normal_modes, tangent_modes]).astype(given.modes.dtype)
+        return Met(v, modes, slack, found)
+
+    def _normal_forces(
+        self, t: Array, q: PyTree, v: PyTree, params: PyTree, model: Model, multipliers: Array, rows: Rows, always
+    ) -> tuple[Array, Array]:
+        """N of each sliding velocity as `constant + of_forces @ λ`."""
+        constant, of_forces = [], []
+        names = model.equation_names
+        place = {names[i].split("[")[0]: k for k, i in reversed(list(enumerate(always)))}
+        for law in self.laws.tangents:
+            count = law.at[1] - law.at[0]
+            if law.source in place:
+                k = place[law.source]
+                constant += [multipliers[k]] * count
+                of_forces += [rows.of_constraints[:, k]] * count
+                continue
+            gaps = [normal for normal in self.laws.normals if normal.name == law.source]
+            if not gaps:
+                constant += [*law.normal_forces(t, q, v, {}, params)]
+            else:
+                constant += [jnp.zeros((), t.dtype)] * count
+            unit = np.eye(len(self.laws.rows))
+            of_forces += [jnp.asarray(unit[gaps[0].at[0] + i] if gaps else 0 * unit[0], t.dtype) for i in range(count)]
+        if not constant:
+            return jnp.zeros(0, t.dtype), jnp.zeros((0, len(self.laws.rows)), t.dtype)
+        return jnp.stack(constant), jnp.stack(of_forces)
+
+    def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, modes: Array) -> Array:
+        """The impulses that move velocities onto what holds."""
+        normals, tangents = self.laws.count
+        on = jnp.where(np.arange(normals + tangents) < normals, modes == CLOSED, modes == STICKS)
+        left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
+        matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
+        return -jnp.linalg.pinv(matrix, rtol=DEPENDENT) @ left
+
+
+def sizes_ok(size: Array) -> Array:
+    """Whether a size is known."""
+    return size > 0
