@@ -170,7 +170,7 @@ class TangentGuard(eqx.Module):
         slips = law.slips(t, q, v, params)
         most = law.sticking(slips, params)[i] * law.normal_forces(t, q, v, multipliers, params)[i]
         holds = most - jnp.abs(jnp.ravel(multipliers[law.name])[i]) + slack
-        return jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips[i]))
+        return jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips[i] + slack))
 
 
 class Laws(eqx.Module):

@@ -32,7 +32,9 @@ from lagjax.numerics import independent_rows
 from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
 
 # A gap is closed, and a velocity zero, below this part of the sizes that it is made of.
-CLOSED_BELOW, STILL_BELOW = 2e-13, 1e-11
+CLOSED_BELOW, STILL_BELOW = 2e-14, 1e-11
+# A coordinate counts at least as heavy as this part of the heaviest, in √M_ii.
+LIGHT = 1e-6
 # A force is zero below this part of the forces in the motion.
 NO_FORCE = 1e-11
 # Impacts one after the other, at most: so many for each pair of gaps, and a few more.
@@ -52,12 +54,25 @@ class Rows(NamedTuple):
     """The rows of all contacts at one state, and how velocities respond to their forces.
 
     `of_constraints` (k, m_b): what each force adds to the multipliers of the constraints that always hold.
+    `root_mass`: √M_ii; `acceleration`: that with all gaps open.
     """
 
     jacobian: Float[Array, "k n"]
     response: Float[Array, "k n"]
     matrix: Float[Array, "k k"]
     of_constraints: Float[Array, "k mb"]
+    root_mass: Float[Array, " n"]
+    acceleration: Float[Array, " n"]
+
+    def sizes(self, known: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+        """How large coordinates and velocities become, where all share one size, measured in √M_ii times them.
+
+        A motion that is at rest now, at x, has velocities of the size √(a x).
+        """
+        x, u = jnp.max(self.root_mass * known, axis=1)
+        u = jnp.maximum(u, jnp.sqrt(x * jnp.max(self.root_mass * jnp.abs(self.acceleration))))
+        least = LIGHT * jnp.max(self.root_mass)
+        return jnp.stack([x, u])[:, None] / jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
 
 
 class Meeting(eqx.Module):
@@ -76,15 +91,15 @@ class Meeting(eqx.Module):
         model = self._all_on(t, q, v, given)
         x, u = model.vectors(q, v)
         rows = self._rows(model, t, x, u, given)
-        scale = jnp.abs(rows.jacobian) @ jnp.stack([*sizes], axis=1)
+        scale = jnp.abs(rows.jacobian) @ rows.sizes(sizes).T
         gaps = jnp.concatenate([law.gaps(t, q, given.params) for law in laws.normals] or [jnp.zeros(0, t.dtype)])
-        width = CLOSED_BELOW * scale[:normals, 0]
-        closed = (given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= 4 * width)
+        closed = (given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * scale[:normals, 0])
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
         met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), stop_gradient(scale))
         u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
-        slack = jnp.where(jnp.arange(met.slack.size) >= normals, met.slack, jnp.where(met.modes[: met.slack.size] == CLOSED, met.slack, jnp.concatenate([width, met.slack[normals:]])))
+        by_motion = CLOSED_BELOW * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
+        slack = jnp.where(self._holds(met.modes), met.slack, by_motion)
         return Met(model.tree(u), met.modes, stop_gradient(slack), met.found)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
@@ -100,12 +115,15 @@ class Meeting(eqx.Module):
     def _rows(self, model: Model, t: Array, x: Array, u: Array, given: InModes) -> Rows:
         every, mine = constraints.jacobian(model, t, x, u), np.array(self.laws.rows, int)
         always = np.setdiff1d(np.arange(model.m), mine)
-        mass = mass_and_forcing(self._free(model, given), t, x, u).mass
+        linear = mass_and_forcing(self._free(model, given), t, x, u)
+        mass = linear.mass
         jacobian, held = every[mine], every[always]
         independent = independent_rows(held)
         still = jnp.zeros(held.shape[0], x.dtype)
+        acceleration, _ = saddle_point(mass, held, linear.forcing, still, independent)
+        root_mass = jnp.sqrt(jnp.max(jnp.abs(mass), axis=1))
         response, added = jax.vmap(lambda row: saddle_point(mass, held, row, still, independent))(jacobian)
-        return Rows(jacobian, response, jacobian @ response.T, added)
+        return Rows(jacobian, response, jacobian @ response.T, added, root_mass, acceleration)
 
     def _free(self, model: Model, given: InModes) -> Model:
         """The model with all gaps open."""
@@ -275,10 +293,13 @@ class Meeting(eqx.Module):
             return jnp.zeros(0, t.dtype), jnp.zeros((0, len(self.laws.rows)), t.dtype)
         return jnp.stack(constant), jnp.stack(of_forces)
 
+    def _holds(self, modes: Int[Array, " k"]) -> Bool[Array, " k"]:
+        """Which laws are constraints in these modes."""
+        return jnp.where(np.arange(modes.size) < self.laws.count[0], modes == CLOSED, modes == STICKS)
+
     def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, modes: Array) -> Array:
         """The impulses that move velocities onto what holds."""
-        normals, tangents = self.laws.count
-        on = jnp.where(np.arange(normals + tangents) < normals, modes == CLOSED, modes == STICKS)
+        on = self._holds(modes)
         left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT) @ left
