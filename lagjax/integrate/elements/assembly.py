@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate.elements.laws import Laws, in_modes
+from lagjax.integrate.elements.laws import Laws, OneGuard, in_modes
 from lagjax.integrate.elements.meeting import Meeting
-from lagjax.integrate.events.event import Crossing, Guards, guards_of
+from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.integrate.solve.segments import Phase
 from lagjax.jaxtools import without_init
@@ -43,13 +43,13 @@ def assembled(system: System, start: State) -> InElements:
 
 
 def only_phase(assembly: InElements, start: State, events: Mapping[str, Crossing]) -> Phase:
-    """The guards of all modes, and of the recorded events; what happens where modes change."""
+    """The guard of all modes, and those of the recorded events; what happens where modes change."""
     laws = assembly.laws
-    modes, count = laws.guards(), len(laws.rows)
+    modes = EventKind("modes", -1, terminal=True, most=1, takes_multipliers=True, long=True, holds=True)
     recorded = guards_of(events, assembly.user, start) if events else Guards((), ())
-    functions = (*modes.functions, *(OfParams(guard) for guard in recorded.functions))
-    guards = Guards(functions, modes.kinds + recorded.kinds)
+    functions = (OneGuard(laws), *(OfParams(guard) for guard in recorded.functions))
+    guards = Guards(functions, (modes, *recorded.kinds))
     meeting = Meeting(assembly.systems[0], laws)
-    return Phase(guards, tuple(range(count)), np.zeros((count, 2), np.int32), (), tuple(events), meeting)
+    return Phase(guards, (0,), np.zeros((1, 2), np.int32), (), tuple(events), meeting)
 
 

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from lagjax.integrate.events.event import EventKind, Guards
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.system import (
     OF_POSITION,
@@ -144,35 +143,6 @@ class WithFriction(eqx.Module):
         return total
 
 
-class NormalGuard(eqx.Module):
-    """The guard of one gap."""
-
-    law: Normal
-    i: int = eqx.field(static=True)
-    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
-
-    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        place = self.law.at[0] + self.i
-        gap, force = self.law.gaps(t, q, given.params)[self.i], jnp.ravel(multipliers[self.law.name])[self.i]
-        return jnp.where(given.modes[place] == CLOSED, force, gap) + given.slack[place]
-
-
-class TangentGuard(eqx.Module):
-    """The guard of one sliding velocity."""
-
-    law: Tangent
-    i: int = eqx.field(static=True)
-    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
-
-    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        law, i, params = self.law, self.i, given.params
-        mode, slack = given.modes[law.at[0] + i], given.slack[law.at[0] + i]
-        slips = law.slips(t, q, v, params)
-        most = law.sticking(slips, params)[i] * law.normal_forces(t, q, v, multipliers, params)[i]
-        holds = most - jnp.abs(jnp.ravel(multipliers[law.name])[i]) + slack
-        return jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips[i] + slack))
-
-
 class Laws(eqx.Module):
     """The elements of a system with their places among the modes, normal ones first.
 
@@ -208,12 +178,32 @@ class Laws(eqx.Module):
         off = jnp.zeros(self.equations, bool).at[np.array(self.rows, int)].set(~holds)
         return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
 
-    def guards(self) -> Guards:
-        """The guard of each mode."""
-        functions = [NormalGuard(law, i) for law in self.normals for i in range(law.at[1] - law.at[0])]
-        functions += [TangentGuard(law, i) for law in self.tangents for i in range(law.at[1] - law.at[0])]
-        kinds = tuple(EventKind(f"mode of {name}", -1, True, 1, True, True, True) for name in self.names)
-        return Guards(tuple(functions), kinds)
+    def last(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> Float[Array, " k"]:
+        """The guard of each mode: above zero, or no farther below than its slack, as long as the mode lasts."""
+        params, found = given.params, []
+        for law in self.normals:
+            force = jnp.ravel(multipliers[law.name])
+            found.append(jnp.where(given.modes[slice(*law.at)] == CLOSED, force, law.gaps(t, q, params)))
+        for law in self.tangents:
+            mode, slips = given.modes[slice(*law.at)], law.slips(t, q, v, params)
+            most = law.sticking(slips, params) * law.normal_forces(t, q, v, multipliers, params)
+            holds = most - jnp.abs(jnp.ravel(multipliers[law.name]))
+            found.append(jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips)))
+        return jnp.concatenate(found)
+
+
+class OneGuard(eqx.Module):
+    """The guards of all modes as one: the least of them, each in units of its slack.
+
+    Guards are followed one by one, so that many of them would take long to compile.
+    """
+
+    laws: Laws
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        size = jnp.where(given.slack > 0, given.slack, 1.0)
+        return jnp.min((self.laws.last(t, q, v, multipliers, given) + given.slack) / size)
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:

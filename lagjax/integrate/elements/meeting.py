@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, solved
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
+from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, saddle_point
 from lagjax.numerics import independent_rows
@@ -81,7 +82,15 @@ class Meeting(eqx.Module):
     system: System
     laws: Laws
 
-    def __call__(
+    def __call__(self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"]) -> tuple[Met, Int[Array, ""]]:
+        """What happens at the end of a leg, and the first of the modes that end there."""
+        guards = self.laws.last(end.t, end.q, end.v, end.multipliers, given)
+        least = jnp.argmin(guards / jnp.where(given.slack > 0, given.slack, 1.0))
+        fired = (guards <= 0) | (jnp.arange(guards.size) == least)
+        met = self.met(end.t, end.q, end.v, given, fired, sizes)
+        return met, least.astype(jnp.int32)
+
+    def met(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"],
         impacts: bool = True,
     ) -> Met:  # fmt: skip
@@ -96,7 +105,7 @@ class Meeting(eqx.Module):
         closed = (given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * scale[:normals, 0])
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
-        met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), stop_gradient(scale))
+        met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
         u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
         by_motion = CLOSED_BELOW * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
         slack = jnp.where(self._holds(met.modes), met.slack, by_motion)
@@ -105,7 +114,7 @@ class Meeting(eqx.Module):
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
         """The modes that fit the start of a motion; gaps that close are left to their guards."""
         none, sizes = jnp.zeros(len(self.laws.rows), bool), stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
-        return self(t, q, v, self.laws.given(params, none.astype(int)), none, sizes, impacts=False)
+        return self.met(t, q, v, self.laws.given(params, none.astype(int)), none, sizes, impacts=False)
 
     def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
         normals, tangents = self.laws.count
@@ -221,8 +230,9 @@ class Meeting(eqx.Module):
         return found
 
     def _forces(
-        self, model: Model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array, scale: Array
-    ) -> Met:
+        self, model: Model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array, fired: Array,
+        scale: Array,
+    ) -> Met:  # fmt: skip
         """The modes after a meeting, by the forces at accelerations."""
         laws, (normals, tangents) = self.laws, self.laws.count
         model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
@@ -249,18 +259,17 @@ class Meeting(eqx.Module):
         )
         forces, found = solved(problem)
         accelerations = rows.matrix @ forces + free
-        # Where nothing pushes and nothing opens, a contact is closed.
-        by_motion = jnp.where(sizes_ok(scale[:, 0]), scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], 1.0), 0.0)
-        terms = jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion
-        stays = touching & ((forces[:normals] > 0) | (accelerations[:normals] <= NO_FORCE * terms[:normals]))
-        own = jnp.diag(rows.matrix)
-        slack = NO_FORCE * terms / jnp.where(own > 0, own, 1.0)
+        # The acceleration of a motion of this size and speed.
+        by_motion = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
+        slack = NO_FORCE * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
+        # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not.
+        nothing = jnp.where(fired & self._holds(given.modes), given.slack / 2, slack) / problem.step
+        stays = touching & ((forces[:normals] > 0) | (accelerations[:normals] <= nothing[:normals]))
         normal_modes = jnp.where(stays, CLOSED, OPEN)
         pushed = forces[normals:]
         most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
-        pulled = jnp.abs(pushed) >= most * (1 - NO_FORCE) - slack[normals:]
-        starts = jnp.where(pulled & (jnp.abs(accelerations[normals:]) > NO_FORCE * terms[normals:]), -jnp.sign(pushed), 0.0)
-        starts = jnp.where((starts == 0) & pulled & (most == 0), jnp.sign(accelerations[normals:]), starts)
+        moves = jnp.abs(accelerations[normals:]) > nothing[normals:]
+        starts = jnp.where(moves, jnp.where(most > 0, -jnp.sign(pushed), jnp.sign(accelerations[normals:])), 0.0)
         side = jnp.where(slides != 0, slides, starts).astype(int)
         owners = np.array(laws.owners, int)
         present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], True)
@@ -304,7 +313,3 @@ class Meeting(eqx.Module):
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT) @ left
 
-
-def sizes_ok(size: Array) -> Array:
-    """Whether a size is known."""
-    return size > 0

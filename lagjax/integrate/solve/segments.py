@@ -246,8 +246,9 @@ def _leg(
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
         end = where(invalid, Snapshot(way.t, way.q, way.v, unknown(end.multipliers)), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
-        unsolved = onward & ~after.found
-        result, onward = RESULTS.where(unsolved, RESULTS.no_contact_forces, result), onward & ~unsolved
+        if after.found is not None:
+            result = RESULTS.where(onward & ~after.found, RESULTS.no_contact_forces, result)
+            onward = onward & after.found
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
@@ -270,12 +271,10 @@ def _leg(
 
 
 class PhaseEnding(NamedTuple):
-    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches, and which of
-    them cross at that time; the result."""
+    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
 
     onward: Bool[Array, ""]
     first: Int[Array, ""]
-    crossed: Bool[Array, " k"]
     end: Snapshot
     result: Any
 
@@ -303,8 +302,8 @@ def _ending(
     missed = (result == RESULTS.successful) & is_below
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
-    crossed = when <= jnp.min(when) + at_one_time
-    return PhaseEnding(onward, jnp.argmax(crossed), crossed, end, result)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return PhaseEnding(onward, first, end, result)
 
 
 def _is_below(end: Snapshot, params: PyTree, guards: Guards, count: int, rtol: Array):
@@ -332,28 +331,29 @@ def _filled(rows: OutputRows, known: Array, found, i: int, modes: Modes | None) 
 
 
 class After(NamedTuple):
-    """The state after a switch; `found`: whether there is one."""
+    """The state after a switch; with elements, their modes, and whether there are any."""
 
     q: PyTree
     v: PyTree
     rests: Bool[Array, ""]
     modes: Modes | None = None
-    found: Bool[Array, ""] | bool = True
+    found: Bool[Array, ""] | None = None
 
 
 def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay):
     """Return the state after the phase's first switch, the next phase, and the record with that switch."""
-    onward, first, crossed, end, _ = ending
+    onward, first, end, _ = ending
+    number = jnp.asarray(phase.switches, jnp.int32)[first]
     if phase.meeting is None:
         states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
         after = jax.tree.map(lambda *x: _one_of(first, x), *states)
     else:
         sizes = jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v))
-        met = phase.meeting(end.t, end.q, end.v, params, crossed, sizes)
+        met, number = phase.meeting(end, params, sizes)
         after = After(end.q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
-    s, way_out = way.switches, jnp.asarray(phase.switches, jnp.int32)[first]
+    s = way.switches
     place = onward & (jnp.arange(s.t.shape[0]) == s.count)
 
     def put(all, new):
@@ -361,7 +361,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
 
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
     record = Switches(
-        t=put(s.t, end.t), way=put(s.way, way_out), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
+        t=put(s.t, end.t), way=put(s.way, number), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
         modes=None if s.modes is None else put(s.modes, after.modes.modes),
