@@ -11,6 +11,7 @@ The guard of a mode is above zero as long as it lasts:
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -209,7 +210,7 @@ class OneGuard(eqx.Module):
 def in_modes(system: System, start: State) -> tuple[System, Laws]:
     """A system with elements as a system of `InModes`, with its laws; all functions checked and traced."""
     assert system.elements is not None
-    plain = traced_system(System(system.lagrangian, system.constraints, system.force, system.dissipation), start)
+    plain = traced_system(replace(system, elements=None), start)
     if plain.force is not None and takes_of(plain.force) == WITH_MULTIPLIERS:
         raise ValueError(
             "a force that takes multipliers cannot stand beside elements.\n"
@@ -225,7 +226,8 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
     if tangents:
         force = WithFriction(plain.force, tangents)
     dissipation = None if plain.dissipation is None else OfParams(plain.dissipation)
-    masked = System(OfParams(plain.lagrangian), constraints, force, dissipation)
+    states = {name: OfParams(f) for name, f in plain.states.items()}
+    masked = System(OfParams(plain.lagrangian), constraints, force, dissipation, states)
     count = (tangents or normals)[-1].at[1]
     # The order of the stacked equations is known only with their shapes.
     given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))
