@@ -27,7 +27,7 @@ from lagjax.integrate import ENDED_WELL, HybridTrajectory, Trajectory, integrate
 from lagjax.jaxtools import compiled, is_traced
 from lagjax.mechanics import of_states, sees_time
 from lagjax.numerics import quadrature
-from lagjax.system import Hybrid, Model, System, constraints, coordinates, model_of
+from lagjax.system import Hybrid, Model, System, check_system, constraints, coordinates, model_of
 
 FORCE, DISSIPATION, STATES, TIME = "force", "dissipation", "states", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.
@@ -457,6 +457,7 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
             "Fix: lj.energy_ledger(jax.tree.map(lambda x: x[0], traj))."
         )
     accounted = trajectory.system if system is None else system
+    check_system(accounted, phases=True)
     if accounted.in_phases != isinstance(trajectory, HybridTrajectory):
         raise TypeError(
             "a motion in phases is accounted for by a lj.Hybrid, any other one by a lj.System, not "

@@ -16,9 +16,7 @@ CONSTRAINTS = (Holonomic, Nonholonomic)
 SYSTEMS = (System, Hybrid)
 
 
-def check_system(
-    system: Any, *others: Any, phases: bool = False, states: bool = True, elements: bool = False
-) -> None:
+def check_system(system: Any, *others: Any, phases: bool = False, states: bool = True, elements: bool = False) -> None:
     """Raise if the first argument of a function is not a `System`, or with `phases` a `Hybrid`.
 
     `others`: the following arguments, among which the system may be. `states`, `elements`: whether it may have them.

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-
 MOST_SWITCHES = 256
 IMPACTS = ("sequential", "simultaneous")
 
@@ -27,14 +26,10 @@ IMPACTS = ("sequential", "simultaneous")
 class Friction(eqx.Module):
     """Coulomb's friction: a force against the sliding velocity, of size μ N; while nothing slides, whatever holds it.
 
-    >>> import jax.numpy as jnp
     >>> import lagjax as lj
-    >>> spring = lambda t, q, v, params: 0.5 * v**2 - 0.5 * 100.0 * q**2
-    >>> floor = Friction(lambda t, q, v, params: v, 0.3, normal=9.81)
-    >>> rubbed = lj.System(spring, elements={"floor": floor})
-    >>> traj = lj.integrate(rubbed, 0.5, 0.0, ts=jnp.array([0.0, 2.6, 4.0]))
-    >>> print(traj.q.round(6), len(traj.switches))
-    [0.5     0.02912 0.02912] 8
+    >>> spring = lambda t, q, v, params: 0.5 * v**2 - 50.0 * q**2
+    >>> lj.System(spring, elements={"floor": Friction(lambda t, q, v, params: v, 0.3, normal=9.81)})
+    System(<lambda>; elements: floor (Friction))
 
     **Arguments:**
 
@@ -140,13 +135,9 @@ class Contact(eqx.Module):
 class Stop(Contact):
     """A coordinate, or anything else that depends on positions, that moves between two stops: a `Contact` with each.
 
-    >>> import jax.numpy as jnp
-    >>> import lagjax as lj
-    >>> free = lambda t, q, v, params: 0.5 * v**2
-    >>> play = lj.System(free, elements={"play": Stop(lambda t, q, params: q, -1.0, 1.0, restitution=0.5)})
-    >>> traj = lj.integrate(play, 0.0, 1.0, ts=jnp.array([0.0, 2.0]))
-    >>> print(traj.q[-1].round(9), traj.v[-1].round(9))
-    0.5 -0.5
+    >>> play = Stop(lambda t, q, params: q, low=-1.0, high=1.0, restitution=0.5)
+    >>> print(play.gap(0.0, 0.25, None))
+    [1.25 0.75]
 
     **Arguments:** `coordinate(t, q, params)` -> a number; `low`, `high`: the smallest and the largest it may be, one
     of them or both; `restitution`, `slower_than` as in `lj.Contact`. Backlash is a stop of a difference of two
@@ -276,5 +267,3 @@ def _check_not_negative(role: str, number):
 def _number(x):
     """A number as an array, so that no program is compiled for its value; a function unchanged."""
     return x if x is None or callable(x) or isinstance(x, jax.Array) else np.asarray(x, float)
-
-

@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
+from lagjax.system.elements import Elements
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System, check_functions
 
@@ -191,6 +192,7 @@ class Hybrid(eqx.Module):
         self.first = np.zeros((), np.int32)
 
     in_phases: ClassVar[bool] = True
+    elements: ClassVar[Elements | None] = None
 
     @property
     def phases(self) -> tuple[System, ...]:

@@ -264,7 +264,8 @@ def _laws(elements: Elements, plain: System, start: State):
         own = isinstance(element, Contact)
         mu = element.friction if isinstance(element, Contact) else element.coefficient
         mu, static = (
-            traced(name, "coefficient", f, takes_of_coefficient(f) if callable(f) else (), ()) for f in (mu, element.static)
+            traced(name, "coefficient", f, takes_of_coefficient(f) if callable(f) else (), ())
+            for f in (mu, element.static)
         )
         of_gap = [law for law in normals if own and law.name == name]
         shape = jnp.shape(of_gap[0].gap.program.value) if of_gap else None
@@ -304,10 +305,10 @@ def _check_name(name: str, plain: System):
 
 def _check(call: Call, value, shape: tuple | None):
     found = jnp.shape(value)
+    wanted = "a number or a vector" if shape is None else f"shape {shape}, as the gap" if shape else "a number"
     if shape is not None and found != shape or len(found) > 1:
         raise ValueError(
-            f"{call} must return {'a number or a vector' if shape is None else 'a number' if shape == () else f'shape {shape}, as the gap'}"
-            f", and returned shape {found}.\n"
+            f"{call} must return {wanted}, and returned shape {found}.\n"
             "Usual cause: the velocity of a point in space.\n"
             "Fix: its component along the contact."
         )

@@ -12,7 +12,8 @@ Impacts one after the other: always the gap that closes fastest, with its restit
 closes; what then still closes is stopped all at once. Simultaneous impacts: Newton's law for all at once,
 0 ≤ Λ ⊥ γ' + e γ ≥ 0.
 
-Source: Glocker, *Set-Valued Force Laws*, §6; Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*, ch. 6-8.
+Source: Glocker, *Set-Valued Force Laws*, §6; Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*,
+ch. 6-8.
 """
 
 from typing import NamedTuple
@@ -37,7 +38,7 @@ CLOSED_BELOW, STILL_BELOW = 2e-14, 1e-11
 # A coordinate counts at least as heavy as this part of the heaviest, in √M_ii.
 LIGHT = 1e-6
 # A force is zero below this part of the forces in the motion.
-NO_FORCE = 1e-11
+NO_FORCE = 1e-13
 # Impacts one after the other, at most: so many for each pair of gaps, and a few more.
 MORE_IMPACTS = 8
 
@@ -70,10 +71,11 @@ class Rows(NamedTuple):
 
         A motion that is at rest now, at x, has velocities of the size √(a x).
         """
-        x, u = jnp.max(self.root_mass * known, axis=1)
+        x, u = jnp.max(self.root_mass[None] * known, axis=1)
         u = jnp.maximum(u, jnp.sqrt(x * jnp.max(self.root_mass * jnp.abs(self.acceleration))))
         least = LIGHT * jnp.max(self.root_mass)
-        return jnp.stack([x, u])[:, None] / jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
+        heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
+        return jnp.stack([x, u])[:, None] / heavy[None]
 
 
 class Meeting(eqx.Module):
@@ -102,7 +104,11 @@ class Meeting(eqx.Module):
         rows = self._rows(model, t, x, u, given)
         scale = jnp.abs(rows.jacobian) @ rows.sizes(sizes).T
         gaps = jnp.concatenate([law.gaps(t, q, given.params) for law in laws.normals] or [jnp.zeros(0, t.dtype)])
-        closed = (given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * scale[:normals, 0])
+        closed = (
+            (given.modes == CLOSED)[:normals]
+            | fired[:normals]
+            | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * scale[:normals, 0])
+        )
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
         met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
@@ -113,7 +119,8 @@ class Meeting(eqx.Module):
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
         """The modes that fit the start of a motion; gaps that close are left to their guards."""
-        none, sizes = jnp.zeros(len(self.laws.rows), bool), stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
+        none = jnp.zeros(len(self.laws.rows), bool)
+        sizes = stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
         return self.met(t, q, v, self.laws.given(params, none.astype(int)), none, sizes, impacts=False)
 
     def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
@@ -159,7 +166,9 @@ class Meeting(eqx.Module):
         mu = self._coefficients(t, q, v, given.params, before[normals:], sticking=False)
         owners = np.array(laws.owners, int)
         still = STILL_BELOW * (jnp.abs(rows.jacobian) @ jnp.abs(u))[:normals]
-        closing_at = lambda c: closed & (stop_gradient(c[:normals]) < -still)
+
+        def closing_at(c: Array) -> Array:
+            return closed & (stop_gradient(c[:normals]) < -still)
 
         def restitution(closing: Array) -> Array:
             return jnp.concatenate([law.returned(closing[slice(*law.at)]) for law in laws.normals])
@@ -234,7 +243,7 @@ class Meeting(eqx.Module):
         scale: Array,
     ) -> Met:  # fmt: skip
         """The modes after a meeting, by the forces at accelerations."""
-        laws, (normals, tangents) = self.laws, self.laws.count
+        laws, (normals, _) = self.laws, self.laws.count
         model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
         q, v, params = model.tree(x), model.tree(u), given.params
         every = constraints.acceleration_rows(model, t, x, u)
@@ -242,14 +251,14 @@ class Meeting(eqx.Module):
         always = np.setdiff1d(np.arange(model.m), mine)
         linear = mass_and_forcing(self._free(model, given), t, x, u)
         held = every.jacobian[always]
-        a, multipliers = saddle_point(
-            linear.mass, held, linear.forcing, every.gamma[always], independent_rows(held)
-        )
+        a, multipliers = saddle_point(linear.mass, held, linear.forcing, every.gamma[always], independent_rows(held))
         free = rows.jacobian @ a - every.gamma[mine]
         slopes = self._slopes(model, t, x, u)
         still = STILL_BELOW * scale[:, 1]
-        slower = jnp.concatenate([*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)])
-        touching = closed & (slopes[:normals] <= jnp.maximum(slower, still[:normals])) & (slopes[:normals] >= -jnp.maximum(slower, still[:normals]))
+        slower = jnp.concatenate(
+            [*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)]
+        )
+        touching = closed & (jnp.abs(slopes[:normals]) <= jnp.maximum(slower, still[:normals]))
         slips = slopes[normals:]
         slides = jnp.where(jnp.abs(slips) > still[normals:], jnp.sign(slips), 0.0)
         constant, of_forces = self._normal_forces(t, q, v, params, model, multipliers, rows, always)
@@ -312,4 +321,3 @@ class Meeting(eqx.Module):
         left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT) @ left
-

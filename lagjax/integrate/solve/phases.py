@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.assembly import InElements, assembled, only_phase
 from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
+from lagjax.integrate.solve.assembly import InElements, assembled, only_phase
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.segments import Phase
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES

@@ -55,8 +55,15 @@ class Instants(NamedTuple):
     phase: Int[Array, " N"] | None
 
 
+def refuse_elements(trajectory, what: str, fix: str):
+    """Raise for what is not done with motions of systems with elements."""
+    if trajectory.in_phases and trajectory.modes is not None:
+        raise ValueError(f"a motion with elements cannot be {what} yet.\nFix: {fix}.")
+
+
 def at(trajectory, t: ArrayLike) -> Snapshot:
     """Return the motion at times of any shape: see `Trajectory.at`."""
+    refuse_elements(trajectory, "computed between its outputs", "give these times to lj.integrate as ts")
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
     t = _times(t, dtype)

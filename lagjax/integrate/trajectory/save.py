@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 
 from lagjax.files import Writer, npz
+from lagjax.integrate.trajectory.dense_output import refuse_elements
 from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.system import UnknownSystem, middle_state, signature
@@ -57,6 +58,7 @@ def _angles(trajectory):
 
 
 def _check_known(trajectory):
+    refuse_elements(trajectory, "saved", "save its numbers, np.savez(path, t=traj.t, q=traj.q, v=traj.v)")
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(trajectory)):
         raise TypeError(
             "this trajectory is being traced, and has no numbers yet.\n"

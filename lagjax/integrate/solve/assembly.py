@@ -13,7 +13,7 @@ from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.integrate.solve.segments import Phase
 from lagjax.jaxtools import without_init
-from lagjax.system import Hybrid, InModes, State, System
+from lagjax.system import Elements, Hybrid, InModes, State, System
 
 MOTION = "motion"
 
@@ -23,6 +23,10 @@ class InElements(Hybrid):
 
     laws: Laws
     user: System
+
+    @property
+    def elements(self) -> Elements | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.user.elements
 
     def given(self, params: PyTree) -> Any:
         """The parameters with all gaps open."""
@@ -51,5 +55,3 @@ def only_phase(assembly: InElements, start: State, events: Mapping[str, Crossing
     guards = Guards(functions, (modes, *recorded.kinds))
     meeting = Meeting(assembly.systems[0], laws)
     return Phase(guards, (0,), np.zeros((1, 2), np.int32), (), tuple(events), meeting)
-
-

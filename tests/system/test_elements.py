@@ -1,0 +1,55 @@
+"""What is wrong with elements is said by name, before anything runs."""
+
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+above = lambda t, q, p: q
+sliding = lambda t, q, v, p: v
+
+
+def lagrangian(t, q, v, p):
+    """A free particle."""
+    return 0.5 * v**2
+
+
+def test_bad_elements():
+    """Signs, kinds and gaps in what is given."""
+    with pytest.raises(ValueError, match="restitution = -0.5 is below zero"):
+        lj.Contact(above, restitution=-0.5)
+    with pytest.raises(ValueError, match="friction is given, but sliding is not"):
+        lj.Contact(above, friction=0.3)
+    with pytest.raises(TypeError, match="gap must be a function"):
+        lj.Contact(1.0)  # pyright: ignore
+    with pytest.raises(ValueError, match="coefficient = -1.0 is below zero"):
+        lj.Friction(sliding, -1.0, 1.0)
+    with pytest.raises(ValueError, match="needs low, high"):
+        lj.Stop(above)
+    with pytest.raises(ValueError, match="above high"):
+        lj.Stop(above, low=2.0, high=1.0)
+    with pytest.raises(TypeError, match="element 'floor' is a Holonomic"):
+        lj.System(lagrangian, elements={"floor": lj.Holonomic(above)})  # pyright: ignore
+    with pytest.raises(ValueError, match="one of 'sequential'"):
+        lj.Elements({"floor": lj.Contact(above)}, impacts="both")
+    np.testing.assert_allclose(lj.Stop(above, -1.0, 1.0).gap(0.0, 0.25, None), [1.25, 0.75])
+
+
+def test_bad_systems():
+    """Names that clash or do not exist, shapes that differ; functions that take one form of equations refuse them."""
+    floor = lj.Contact(above)
+    with pytest.raises(ValueError, match="'floor' is the name of an element and of a constraint"):
+        lj.integrate(
+            lj.System(lagrangian, {"floor": lj.Holonomic(above)}, elements={"floor": floor}), 0.0, 0.0, ts=[0.0, 1.0]
+        )
+    rubbed = lj.System(lagrangian, elements={"brake": lj.Friction(sliding, 0.1, normal="flour"), "floor": floor})
+    with pytest.raises(
+        ValueError, match="normal='flour' of element 'brake' is no constraint and no contact; .*'floor'"
+    ):
+        lj.integrate(rubbed, 0.0, 0.0, ts=[0.0, 1.0])
+    two = lj.Contact(above, friction=0.1, sliding=lambda t, q, v, p: np.ones(2) * v)
+    with pytest.raises(ValueError, match=r"sliding\(t, q, v, params\) of element 'floor' must return a number"):
+        lj.integrate(lj.System(lagrangian, elements={"floor": two}), 0.0, 0.0, ts=[0.0, 1.0])
+    with pytest.raises(TypeError, match="(?s)'brake', 'floor'.*lj.integrate takes elements"):
+        lj.accelerations(rubbed, 0.0, 0.0, 0.0, None)
+    assert repr(rubbed) == "System(lagrangian; elements: brake (Friction), floor (Contact))"
