@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, PyTree
 
 MOST_SWITCHES = 256
@@ -254,7 +255,7 @@ def _check_function(role: str, function, arguments: str, example: str):
 
 
 def _check_not_negative(role: str, number):
-    if number is None or callable(number) or isinstance(number, jax.core.Tracer):
+    if number is None or callable(number) or isinstance(number, Tracer):
         return
     if np.any(np.asarray(number) < 0):
         raise ValueError(
@@ -264,6 +265,6 @@ def _check_not_negative(role: str, number):
         )
 
 
-def _number(x):
+def _number(x: Any) -> Any:
     """A number as an array, so that no program is compiled for its value; a function unchanged."""
     return x if x is None or callable(x) or isinstance(x, jax.Array) else np.asarray(x, float)

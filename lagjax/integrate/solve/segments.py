@@ -364,7 +364,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         t=put(s.t, end.t), way=put(s.way, number), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
-        modes=None if s.modes is None else put(s.modes, after.modes.modes),
+        modes=None if after.modes is None else put(s.modes, after.modes.modes),
     )  # fmt: skip
     return after, to, record
 
