@@ -50,6 +50,16 @@ def test_bad_systems():
     two = lj.Contact(above, friction=0.1, sliding=lambda t, q, v, p: np.ones(2) * v)
     with pytest.raises(ValueError, match=r"sliding\(t, q, v, params\) of element 'floor' must return a number"):
         lj.integrate(lj.System(lagrangian, elements={"floor": two}), 0.0, 0.0, ts=[0.0, 1.0])
+    speed = lj.System(lagrangian, elements={"brake": lj.Friction(lambda t, q, v, p: abs(v), 0.1, 1.0)})
+    with pytest.raises(ValueError, match="linear in v, but its slope depends on v"):
+        lj.integrate(speed, 0.0, 0.0, ts=[0.0, 1.0])
+    lifted = lj.System(
+        lambda t, q, v, p: 0.5 * v["x"] ** 2,
+        states={"lift": lambda t, q, v, p: 1.0},
+        elements={"floor": lj.Contact(lambda t, q, p: q["x"] - q["lift"])},
+    )
+    with pytest.raises(ValueError, match="constraint 'floor' contains state 'lift'"):
+        lj.integrate(lifted, {"x": 1.0, "lift": 0.0}, {"x": 0.0}, ts=[0.0, 1.0])
     with pytest.raises(TypeError, match="(?s)'brake', 'floor'.*lj.integrate takes elements"):
         lj.accelerations(rubbed, 0.0, 0.0, 0.0, None)
     assert repr(rubbed) == "System(lagrangian; elements: brake (Friction), floor (Contact))"

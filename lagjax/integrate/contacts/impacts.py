@@ -38,8 +38,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PyTree
 
+from lagjax.integrate.elements.laws import check_linear
 from lagjax.integrate.solve.phases import OfPhases
-from lagjax.jaxtools import depends, shape_of, stop_gradient
+from lagjax.jaxtools import shape_of, stop_gradient
 from lagjax.mechanics import velocity_change
 from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System, constraints, coordinates, model_of
 
@@ -178,12 +179,4 @@ def _check_sliding(sliding, t: Array, q: PyTree, v: PyTree, params: PyTree):
             "Usual cause: the velocity of a point in space.\n"
             "Fix: its component along the contact, in the plane of the motion."
         )
-    u, unflatten = coordinates.flatten(v)
-    slope = jax.grad(lambda u: sliding(t, q, unflatten(u), params))
-    program = jax.make_jaxpr(slope)(u).jaxpr
-    if depends(program, program.invars):
-        raise ValueError(
-            "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
-            "Usual cause: a speed, jnp.abs of the velocity or its length.\n"
-            'Fix: the velocity with its sign, v["x"] - params["R"] * v["phi"].'
-        )
+    check_linear(sliding, t, q, v, params)

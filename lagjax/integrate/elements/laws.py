@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.integrate.jumps.find import OfParams
+from lagjax.jaxtools import depends
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -33,6 +34,8 @@ from lagjax.system import (
     Nonholonomic,
     State,
     System,
+    check_use,
+    coordinates,
     model_of,
     takes_of,
     traced_call,
@@ -217,9 +220,11 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
             'Fix: lj.Friction(sliding, coefficient, normal="name of the constraint") among the elements.'
         )
     normals, tangents, owners = _laws(system.elements, plain, start)
-    constraints: dict[str, Any] = {
-        name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()
-    }  # fmt: skip
+    # As constraints are, contacts are no place for states.
+    as_constraints = {law.name: Holonomic(law.gap) for law in normals}
+    as_constraints |= {law.name: Nonholonomic(law.sliding) for law in tangents}
+    check_use(replace(plain, constraints=as_constraints, force=None))
+    constraints: dict[str, Any] = {name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()}
     constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
     constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
     force = None if plain.force is None else OfParams(plain.force)
@@ -270,6 +275,7 @@ def _laws(elements: Elements, plain: System, start: State):
         of_gap = [law for law in normals if own and law.name == name]
         shape = jnp.shape(of_gap[0].gap.program.value) if of_gap else None
         sliding = traced(name, "sliding", element.sliding, OF_STATE, shape)
+        check_linear(sliding, *start)
         normal = None if isinstance(element, Contact) else element.normal
         source = name if own else normal if isinstance(normal, str) else ""
         if not own:
@@ -289,6 +295,18 @@ def _laws(elements: Elements, plain: System, start: State):
         owners += [source_of[0].at[0] + i if source_of else -1 for i in range(size)]
         place += size
     return tuple(normals), tuple(tangents), tuple(owners)
+
+
+def check_linear(sliding: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
+    """Raise if a sliding velocity is not linear in v."""
+    u, unflatten = coordinates.flatten(v)
+    program = jax.make_jaxpr(jax.jacfwd(lambda u: sliding(t, q, unflatten(u), params)))(u).jaxpr
+    if depends(program, program.invars):
+        raise ValueError(
+            "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
+            "Usual cause: a speed, jnp.abs of the velocity or its length.\n"
+            'Fix: the velocity with its sign, v["x"] - params["R"] * v["phi"].'
+        )
 
 
 def _size(function) -> int:

@@ -29,7 +29,7 @@ from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem,
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
-from lagjax.mechanics import mass_and_forcing, saddle_point
+from lagjax.mechanics import mass_and_forcing, saddle_point, with_first_order
 from lagjax.numerics import independent_rows
 from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
 
@@ -126,7 +126,7 @@ class Meeting(eqx.Module):
     def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
         normals, tangents = self.laws.count
         modes = jnp.array([CLOSED] * normals + [STICKS] * tangents, int)
-        return model_of(self.system, t, q, v, self.laws.given(given.params, modes))
+        return with_first_order(model_of(self.system, t, q, v, self.laws.given(given.params, modes)))
 
     def _rows(self, model: Model, t: Array, x: Array, u: Array, given: InModes) -> Rows:
         every, mine = constraints.jacobian(model, t, x, u), np.array(self.laws.rows, int)
