@@ -160,10 +160,10 @@ class Stop(Contact):
             raise ValueError("a stop needs low, high, or both.\nFix: lj.Stop(coordinate, low=0.0, high=1.0).")
         if low is not None and high is not None and np.any(np.asarray(low) > np.asarray(high)):
             raise ValueError(f"low = {low} is above high = {high}.\nFix: exchange them.")
-        super().__init__(Room(coordinate, _number(low), _number(high)), restitution, slower_than=slower_than)
+        super().__init__(StopGaps(coordinate, _number(low), _number(high)), restitution, slower_than=slower_than)
 
 
-class Room(eqx.Module):
+class StopGaps(eqx.Module):
     """How far a coordinate is from its stops: a gap (1,) or (2,)."""
 
     coordinate: Callable

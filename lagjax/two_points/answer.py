@@ -21,8 +21,8 @@ from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.newton import FoundPath, extent
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
-from lagjax.two_points.start_velocity import Found, found_by_shooting, shoots_alone
-from lagjax.two_points.starts import Guess, nodes_of
+from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, shoots_alone
+from lagjax.two_points.starts import PathGuess, nodes_of
 
 DEGREE, MOST_ELEMENTS = 8, 128
 # An answer with larger highest coefficients on its elements is none.
@@ -86,8 +86,8 @@ def why_not_variational(model: Model) -> str:
 
 
 def answer_from(
-    model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol
-) -> tuple[SolvedPath | Found, Connection | None, str]:
+    model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int, rtol
+) -> tuple[SolvedPath | FoundVelocity, Connection | None, str]:
     """The path from one start, the answer if it is one, and what became of it in words."""
     x, parts = nodes_of(model, ends, guess, count, DEGREE)
     if shoots_alone(model):
@@ -145,7 +145,7 @@ def _connection(
     )  # fmt: skip
 
 
-def _by_shooting(model: Model, ends: Ends, found: Found, outputs: int, rtol=None, **options) -> Connection:
+def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, rtol=None, **options) -> Connection:
     """The motion from a start that was found without a path, or that comes nearest."""
     there, unknown = found.part >= 1, jnp.full((), jnp.nan, found.aim.u.dtype)
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
@@ -157,9 +157,9 @@ def _by_shooting(model: Model, ends: Ends, found: Found, outputs: int, rtol=None
     )  # fmt: skip
 
 
-def not_found(model: Model, ends: Ends, solved: SolvedPath | Found, outputs: int, words: str) -> Connection:
+def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
     """What there is where no path is an answer."""
-    if isinstance(solved, Found):
+    if isinstance(solved, FoundVelocity):
         return replace(_by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False), tried=words)
     nearest = _connection(model, ends, solved, None, outputs, words)
     return eqx.tree_at(lambda c: c.converged, nearest, np.asarray(False))
@@ -174,7 +174,7 @@ def is_same(a: Connection, b: Connection) -> bool:
 # -- In a program. --
 
 
-def inside(model: Model, ends: Ends, guess: Guess, count: int, outputs: int, rtol) -> Connection:
+def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int, rtol) -> Connection:
     """The answer from one start in a program, with derivatives in both modes."""
     start = stop_gradient(nodes_of(*stop_gradient((model, ends)), guess, count, DEGREE))
     if shoots_alone(model):

@@ -23,7 +23,7 @@ class SolverAnswer(NamedTuple):
     iterations: int
 
 
-class FirstOrder(NamedTuple):
+class FirstDerivatives(NamedTuple):
     """f, g, the gradient of f, and the entries of the Jacobian of g."""
 
     f: float
@@ -59,12 +59,12 @@ class NonlinearProgram:
 
     def __init__(self, blocks: Sequence[Any], size: int, count: int):
         self.blocks, self.size, self.count = blocks, size, count
-        self.last: tuple[np.ndarray, FirstOrder] | None = None
+        self.last: tuple[np.ndarray, FirstDerivatives] | None = None
         columns = [b.columns for b in blocks]
         self.jacobian = _Pattern((count, size), [b.rows for b in blocks], columns, False)
         self.hessian = _Pattern((size, size), columns, columns, True)
 
-    def first_order(self, x: np.ndarray) -> FirstOrder:
+    def first_order(self, x: np.ndarray) -> FirstDerivatives:
         """f, g, the gradient of f and the entries of the Jacobian of g; the last ones are kept."""
         if self.last is not None and np.array_equal(self.last[0], x):
             return self.last[1]
@@ -75,7 +75,7 @@ class NonlinearProgram:
             np.add.at(g, b.rows, rows)
             np.add.at(gradient, b.columns, of_cost)
             parts.append(of_rows)
-        self.last = x.copy(), FirstOrder(f, g, gradient, self.jacobian.sum(parts))
+        self.last = x.copy(), FirstDerivatives(f, g, gradient, self.jacobian.sum(parts))
         return self.last[1]
 
     def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from lagjax.two_points.layout import Layout
 from lagjax.two_points.mesh import Mesh, jumps_of, moved
 from lagjax.two_points.nonlinear_program import NonlinearProgram, SolverAnswer, import_casadi
 from lagjax.two_points.question import Question, asked
-from lagjax.two_points.steering import Motion, Steering, compile_ahead, failure_in_words, is_found, steering_of
+from lagjax.two_points.steering import SteeredMotion, Steering, compile_ahead, failure_in_words, is_found, steering_of
 
 # The solver's own tolerance of optimality; bounds are not widened, which would let the cost fall below the least.
 EXACT = {"tol": 1e-10, "bound_relax_factor": 0.0, "max_iter": 1000}
@@ -104,7 +104,7 @@ def steer(
     times, options = (t_a, t_b), (degree, interpolation)
     counts = ("elements", elements, 1), ("most", most, 1), ("degree", degree, 1), ("outputs", outputs, 2)
     question = asked(system, controls, start, end, cost, params, times, end_cost, bounds, with_control, options, counts)
-    motion = Motion(outputs, rtol, max(most, elements) + CUTS, throw)
+    motion = SteeredMotion(outputs, rtol, max(most, elements) + CUTS, throw)
     import_casadi()
     ahead = compile_ahead(question, motion)
     try:

@@ -56,7 +56,7 @@ class Place(NamedTuple):
     size: Float[Array, ""]
 
 
-class _Search(NamedTuple):
+class _VelocitySearch(NamedTuple):
     """From a place to the next: the trial z, by how much ε grows, the size of the last step, and steps and motions."""
 
     place: Place
@@ -69,7 +69,7 @@ class _Search(NamedTuple):
     going: Bool[Array, ""]
 
 
-class Found(NamedTuple):
+class FoundVelocity(NamedTuple):
     """The start velocity and the time, for a part of the way: all of it, where they were found; the last step."""
 
     aim: Aim
@@ -120,7 +120,9 @@ def _around(z: Float[Array, " z"], units: Float[Array, " z"]) -> Float[Array, "2
 
 
 @compiled
-def _next(model: Model, units: Float[Array, " z"], search: _Search, rho: Float[Array, "2z+1 r"]) -> _Search:
+def _next(
+    model: Model, units: Float[Array, " z"], search: _VelocitySearch, rho: Float[Array, "2z+1 r"]
+) -> _VelocitySearch:
     """A step of Newton's method, or the next part of the way."""
     before, first, count = search.place, search.motions == 0, len(units)
     jacobian = (rho[1 : 1 + count] - rho[1 + count :]).T / (2 * DIFFERENCE[units.dtype] * units)[None]
@@ -139,12 +141,12 @@ def _next(model: Model, units: Float[Array, " z"], search: _Search, rho: Float[A
     again, motions = lost | there, search.motions + 1
     going = (place.part < 1.0) & (more > SHORTEST) & (motions < MOST) & (fine | ~first)
     steps, size = jnp.where(again, 0, search.steps + 1), jnp.where(again, jnp.inf, size)
-    return _Search(place, z, defect, more, size, steps, motions, going)
+    return _VelocitySearch(place, z, defect, more, size, steps, motions, going)
 
 
 def found_by_shooting(
     model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"], outputs: int, rtol
-) -> Found:
+) -> FoundVelocity:
     """The start velocity, from that of the path through given nodes; in a program differentiable in both modes."""
     eager = is_eager() and not is_traced((model, ends, x))
     still, fixed = stop_gradient((model, ends))
@@ -155,14 +157,14 @@ def found_by_shooting(
     units = stop_gradient(units)
     zero, none = jnp.zeros((), start.dtype), jnp.zeros((), int)
     place = Place(start, jnp.zeros((rows, count), start.dtype), zero, zero + jnp.inf)
-    search = _Search(
+    search = _VelocitySearch(
         place, start, jnp.zeros(rows, start.dtype), zero + 1, zero + jnp.inf, none, none, jnp.asarray(True)
     )
 
     def at(z: Array) -> Array:
         return missed(still, fixed, outputs, rtol, z)
 
-    def iterate(search: _Search) -> _Search:
+    def iterate(search: _VelocitySearch) -> _VelocitySearch:
         trials = _around(search.z, units)
         rho = jnp.stack([at(z) for z in trials]) if eager else lax.map(at, trials)
         return _next(still, units, search, rho)
@@ -170,11 +172,11 @@ def found_by_shooting(
     if eager:
         while search.going:
             search = iterate(search)
-        return Found(_aim(model, ends, search.place.z), search.place.part, search.place.size)
+        return FoundVelocity(_aim(model, ends, search.place.z), search.place.part, search.place.size)
     place = stop_gradient(lax.while_loop(lambda search: search.going, iterate, search).place)
     z = place.z
     # Two more steps, as in `shot_inside`: the second squares the error that differences leave in the first one.
     for _ in range(2):
         moved = z - _step(place.jacobian, missed(model, ends, outputs, rtol, z))
         z = jnp.where(place.part < 1.0, z, moved)
-    return Found(_aim(model, ends, z), place.part, place.size)
+    return FoundVelocity(_aim(model, ends, z), place.part, place.size)

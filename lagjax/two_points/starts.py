@@ -17,7 +17,7 @@ from lagjax.two_points.path import Ends
 WAVES, AMPLITUDES = 3, (1.0, 0.5, 0.25)
 
 
-class Guess(NamedTuple):
+class PathGuess(NamedTuple):
     """A start by name: a path q(t), a motion, or the waves (w, n) on the straight line; None for the line itself."""
 
     name: str
@@ -25,25 +25,25 @@ class Guess(NamedTuple):
 
 
 # How many starts, or which ones.
-Starts = int | Callable | Trajectory | Sequence[Callable | Trajectory | Guess]
+Starts = int | Callable | Trajectory | Sequence[Callable | Trajectory | PathGuess]
 
 
-def guesses_of(model: Model, starts: Starts) -> list[Guess]:
+def guesses_of(model: Model, starts: Starts) -> list[PathGuess]:
     """The starts that are asked for."""
     if callable(starts) or isinstance(starts, Trajectory):
-        return [Guess("the given path", starts)]
+        return [PathGuess("the given path", starts)]
     if not isinstance(starts, int):
         named = enumerate(starts, start=1)
-        return [start if isinstance(start, Guess) else Guess(f"given path {i}", start) for i, start in named]
+        return [start if isinstance(start, PathGuess) else PathGuess(f"given path {i}", start) for i, start in named]
     if starts < 1:
         raise ValueError(f"starts={starts}: there must be one at least.\nFix: starts=1, the straight line.")
     random = np.random.default_rng(0)
     falling = 1 / np.arange(1, WAVES + 1)[:, None]
     waves = [AMPLITUDES[i % 3] * falling * random.normal(size=(WAVES, model.n)) for i in range(starts - 1)]
-    return [Guess("straight line"), *(Guess(f"random start {i + 1}", wave) for i, wave in enumerate(waves))]
+    return [PathGuess("straight line"), *(PathGuess(f"random start {i + 1}", wave) for i, wave in enumerate(waves))]
 
 
-def nodes_of(model: Model, ends: Ends, guess: Guess, count: int, degree: int):
+def nodes_of(model: Model, ends: Ends, guess: PathGuess, count: int, degree: int):
     """The nodes (K, s, n) of a start, and where its elements meet."""
     xp, dtype = numpy_of((ends.x_a, ends.x_b, ends.duration)), ends.x_a.dtype
     parts = np.linspace(0.0, 1.0, count + 1)

@@ -116,7 +116,7 @@ class Steering(eqx.Module):
         return "\n".join(["Steering", *(f"  {name.ljust(width)}  {text}" for name, text in rows)])
 
 
-class Motion(NamedTuple):
+class SteeredMotion(NamedTuple):
     """How the motion is integrated: outputs, tolerance, the most elements of a plan, and whether to raise."""
 
     outputs: int
@@ -126,7 +126,7 @@ class Motion(NamedTuple):
 
 
 def steering_of(
-    question: Question, layout: Layout, solved: SolverAnswer, motion: Motion, change: float, iterations: int
+    question: Question, layout: Layout, solved: SolverAnswer, motion: SteeredMotion, change: float, iterations: int
 ) -> Steering:
     """The integrated motion under the controls that were found, beside what was asked."""
     plant, at = question.plant, layout.places
@@ -157,7 +157,7 @@ def steering_of(
 
 
 def _integrated(
-    question: Question, system: System, params: Planned, start: tuple, t_b: float, motion: Motion
+    question: Question, system: System, params: Planned, start: tuple, t_b: float, motion: SteeredMotion
 ) -> Trajectory:
     # Times at which a plan is cut off at its bounds are many, and no more than kinks: only the user's own are sought.
     plant = question.plant
@@ -170,7 +170,7 @@ def _integrated(
     return integrate(system, *start, params, ts=ts, rtol=motion.rtol, jump_ts=ends, jumps=jumps, throw=motion.throw)
 
 
-def compile_ahead(question: Question, motion: Motion) -> Thread:
+def compile_ahead(question: Question, motion: SteeredMotion) -> Thread:
     """Compile what integrates the motion beside the solver's own programs, on the first instants of a motion at rest.
 
     Neither needs the other's result, and both take seconds.
