@@ -16,16 +16,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lagjax.jaxtools import stop_gradient
 
 SWEEPS, STEPS = 30, 30
-# A root is found where the residual is below this part of the forces.
-SMALL = 1e-11
-# Singular values below this part of the largest count as zero.
-DEPENDENT = 1e-10
+# A root is found where the residual is below this part of the forces; singular values below this part of the largest
+# count as zero.
+SMALL = {np.dtype("float64"): 1e-11, np.dtype("float32"): 1e-4}
+DEPENDENT = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
 class ContactProblem(NamedTuple):
@@ -80,8 +81,9 @@ def solved(problem: ContactProblem) -> Forces:
     def residual(problem: ContactProblem, forces: Array) -> Array:
         return forces - problem.projected(forces)
 
-    def slope(forces: Array) -> Array:
-        return jax.jacfwd(lambda forces: residual(still, forces))(forces)
+    def inverse(forces: Array) -> Array:
+        slope = jax.jacfwd(lambda forces: residual(still, forces))(forces)
+        return jnp.linalg.pinv(slope, rtol=DEPENDENT[forces.dtype])
 
     def sweep(_, forces: Array) -> Array:
         return lax.fori_loop(0, forces.size, lambda i, x: x.at[i].set(still.projected(x)[i]), forces)
@@ -92,12 +94,12 @@ def solved(problem: ContactProblem) -> Forces:
 
     def newton(state: tuple) -> tuple:
         forces, _, count = state
-        forces = forces - jnp.linalg.pinv(slope(forces), rtol=DEPENDENT) @ residual(still, forces)
+        forces = forces - inverse(forces) @ residual(still, forces)
         return forces, error(forces), count + 1
 
     near = lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still.free))
     start = near, error(near), jnp.asarray(0)
-    forces, left, _ = lax.while_loop(lambda s: (s[1] > SMALL) & (s[2] < STEPS), newton, start)
+    forces, left, _ = lax.while_loop(lambda s: (s[1] > SMALL[near.dtype]) & (s[2] < STEPS), newton, start)
     # The derivative of the solution, by the matrix of its own case.
-    forces = forces - stop_gradient(jnp.linalg.pinv(slope(forces), rtol=DEPENDENT)) @ residual(problem, forces)
-    return Forces(forces, left <= SMALL)
+    forces = forces - stop_gradient(inverse(forces)) @ residual(problem, forces)
+    return Forces(forces, left <= SMALL[near.dtype])

@@ -33,12 +33,12 @@ from lagjax.mechanics import mass_and_forcing, saddle_point, with_first_order
 from lagjax.numerics import independent_rows
 from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
 
-# A gap is closed, and a velocity zero, below this part of the sizes that it is made of.
-CLOSED_BELOW, STILL_BELOW = 2e-14, 1e-11
+# A gap is closed, and a velocity zero, below so many round-offs of the sizes that it is made of.
+CLOSED_BELOW, STILL_BELOW = 16, 1000
 # A coordinate counts at least as heavy as this part of the heaviest, in √M_ii.
 LIGHT = 1e-6
-# A force is zero below this part of the forces in the motion.
-NO_FORCE = 1e-13
+# A force is zero below so many round-offs of the forces in the motion.
+NO_FORCE = 500
 # Impacts one after the other, at most: so many for each pair of gaps, and a few more.
 MORE_IMPACTS = 8
 
@@ -101,19 +101,19 @@ class Meeting(eqx.Module):
         laws, (normals, _) = self.laws, self.laws.count
         model = self._all_on(t, q, v, given)
         x, u = model.vectors(q, v)
-        rows = self._rows(model, t, x, u, given)
+        eps, rows = jnp.finfo(x.dtype).eps, self._rows(model, t, x, u, given)
         scale = jnp.abs(rows.jacobian) @ rows.sizes(sizes).T
         gaps = jnp.concatenate([law.gaps(t, q, given.params) for law in laws.normals] or [jnp.zeros(0, t.dtype)])
         closed = (
             (given.modes == CLOSED)[:normals]
             | fired[:normals]
-            | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * scale[:normals, 0])
+            | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * eps * scale[:normals, 0])
         )
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
         met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
         u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
-        by_motion = CLOSED_BELOW * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
+        by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
         slack = jnp.where(self._holds(met.modes), met.slack, by_motion)
         return Met(model.tree(u), met.modes, stop_gradient(slack), met.found)
 
@@ -165,7 +165,7 @@ class Meeting(eqx.Module):
         before = self._slopes(model, t, x, u)
         mu = self._coefficients(t, q, v, given.params, before[normals:], sticking=False)
         owners = np.array(laws.owners, int)
-        still = STILL_BELOW * (jnp.abs(rows.jacobian) @ jnp.abs(u))[:normals]
+        still = STILL_BELOW * jnp.finfo(x.dtype).eps * (jnp.abs(rows.jacobian) @ jnp.abs(u))[:normals]
 
         def closing_at(c: Array) -> Array:
             return closed & (stop_gradient(c[:normals]) < -still)
@@ -223,7 +223,7 @@ class Meeting(eqx.Module):
         most, side = mu[j - normals], jnp.sign(after)
         room = n - side * most * k
         slid_n = jump / jnp.where(room > 0, room, 1.0)
-        sticks = (jnp.abs(held_t) <= most * held_n) & (det > DEPENDENT * n * h) | (room <= 0)
+        sticks = (jnp.abs(held_t) <= most * held_n) & (det > DEPENDENT[c.dtype] * n * h) | (room <= 0)
         normal = jnp.where(sticks, held_n, slid_n)
         tangential = jnp.where(sticks, held_t, -side * most * slid_n)
         both = normal * unit + tangential * jnp.zeros_like(unit).at[j].set(1.0)
@@ -254,7 +254,8 @@ class Meeting(eqx.Module):
         a, multipliers = saddle_point(linear.mass, held, linear.forcing, every.gamma[always], independent_rows(held))
         free = rows.jacobian @ a - every.gamma[mine]
         slopes = self._slopes(model, t, x, u)
-        still = STILL_BELOW * scale[:, 1]
+        eps = jnp.finfo(x.dtype).eps
+        still = STILL_BELOW * eps * scale[:, 1]
         slower = jnp.concatenate(
             [*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)]
         )
@@ -270,7 +271,7 @@ class Meeting(eqx.Module):
         accelerations = rows.matrix @ forces + free
         # The acceleration of a motion of this size and speed.
         by_motion = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
-        slack = NO_FORCE * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
+        slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
         # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not.
         nothing = jnp.where(fired & self._holds(given.modes), given.slack / 2, slack) / problem.step
         stays = touching & ((forces[:normals] > 0) | (accelerations[:normals] <= nothing[:normals]))
@@ -320,4 +321,4 @@ class Meeting(eqx.Module):
         on = self._holds(modes)
         left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
-        return -jnp.linalg.pinv(matrix, rtol=DEPENDENT) @ left
+        return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left
