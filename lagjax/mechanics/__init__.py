@@ -18,7 +18,7 @@ from lagjax.mechanics.lagrangian import (
 from lagjax.mechanics.multiplier_forces import response
 from lagjax.mechanics.noether import GeneratorFlow, NoetherCharge, flow, noether_charge
 from lagjax.mechanics.projection import departures, returned, to_manifold, velocity_change, within, worst_residual
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, examined, saddle_point
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, examined, solve_saddle_point
 from lagjax.mechanics.scalar_equations import has_networks
 from lagjax.mechanics.structure import (
     Structure,

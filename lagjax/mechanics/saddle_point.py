@@ -162,7 +162,7 @@ def chosen(model: Model, jacobian: Array, dependent_below: float | None = None) 
     return independent if model.off is None else independent & ~model.off
 
 
-def saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array):
+def solve_saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array):
     """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
     n = mass.shape[0]
     known = jnp.concatenate([forcing, _pick(gamma, independent, n)])
@@ -174,7 +174,7 @@ def saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, ind
 def _solved(linear: LinearEquation, jacobian: Array, gamma: Array, independent: Array) -> Reactions:
     """The solution where the force may depend on the multipliers."""
     return with_reactions(
-        lambda forcing, gamma: saddle_point(linear.mass, jacobian, forcing, gamma, independent),
+        lambda forcing, gamma: solve_saddle_point(linear.mass, jacobian, forcing, gamma, independent),
         linear.forcing,
         gamma,
         linear.response,

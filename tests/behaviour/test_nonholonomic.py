@@ -690,7 +690,7 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
         _, rate = jax.jvp(lambda t, x: level(t, x, u), (t, x), (time, along))
         return constraints.ConstraintRows(jax.jacfwd(level, argnums=2)(t, x, u), -rate)
 
-    solved = saddle_point.saddle_point
+    solved = saddle_point.solve_saddle_point
 
     def acting(*equations):
         # One constraint's force does not depend on a factor in Aᵀ; its multiplier does.
@@ -698,7 +698,7 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
         return a, multiplier / (0.5 if flaw == "half Chetaev" else 1.0)
 
     monkeypatch.setattr(constraints, "acceleration_rows", rows)
-    monkeypatch.setattr(saddle_point, "saddle_point", acting)
+    monkeypatch.setattr(saddle_point, "solve_saddle_point", acting)
     # The parameters differ by `of`, so that the compiled programs of the true equations are not reused.
     system = lj.System(thrown, {"drive": lj.Nonholonomic(driving)})
     ts = np.linspace(0.0, 4.0, 9)

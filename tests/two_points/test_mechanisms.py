@@ -97,7 +97,8 @@ def start_rate(angles, time, g):
         return quad(slowness, *angles, epsabs=0, epsrel=1e-13)[0]
 
     highest = max(parts(angle)[1] for angle in np.linspace(*angles, 200))
-    energy = brentq(lambda energy: duration(energy) - time, highest + 1.0, highest + 1e4, xtol=1e-13, rtol=1e-14)
+    ends = highest + 1.0, highest + 1e4
+    energy = float(np.asarray(brentq(lambda energy: duration(energy) - time, *ends, xtol=1e-13, rtol=1e-14)))
     inertia, value = parts(angles[0])
     return np.sqrt(2 * (energy - value) / inertia)
 
@@ -159,7 +160,7 @@ def test_derivatives_on_a_constraint():
             options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
             return solve_ivp(lambda t, y: [y[1], -g * np.cos(y[0])], (0, 0.5), [0.0, speed], **options).y[0, -1] - angle
 
-        return brentq(off, 0.0, 10.0, xtol=1e-13)
+        return float(np.asarray(brentq(off, 0.0, 10.0, xtol=1e-13)))
 
     at, step = (3.0, 0.7), 1e-3
     exact = [(by_angle(*(np.array(at) + d)) - by_angle(*(np.array(at) - d))) / (2 * step) for d in step * np.eye(2)]

@@ -21,6 +21,7 @@ def test_a_mass():
     """Riccati's equation of a mass on a spring, with a cost of position times push, is solved."""
     m, k = 2.0, -5.0
     found = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": k})
+    assert isinstance(found, lj.LQR)
     a, b = np.array([[0.0, 1.0], [-k / m, 0.0]]), np.array([[0.0], [1 / m]])
     cross, s = np.array([[0.4], [0.0]]), np.asarray(found.cost_to_go)
     residual = a.T @ s + s @ a - (s @ b + cross) @ (b.T @ s + cross.T) / 2.0 + np.diag([3.0, 0.5])
@@ -29,7 +30,7 @@ def test_a_mass():
     assert np.max(np.real(found.eigenvalues)) < 0 and np.all(np.linalg.eigvalsh(s) > 0)
     # Twin: the sign of the spring changes the gain.
     other = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": -k})
-    assert np.max(np.abs(other.gain - found.gain)) > 1.0
+    assert isinstance(other, lj.LQR) and np.max(np.abs(other.gain - found.gain)) > 1.0
     assert abs(found.control(1.0, 2.0)["push"] + found.gain[0, 0] + 2 * found.gain[0, 1]) < 1e-12
 
 
@@ -80,6 +81,7 @@ def test_an_upright_pole():
 
     one = lj.lqr(angle, {"push": 0.0}, (zero, zero), of_angle, cart)
     other = lj.lqr(tip, {"push": 0.0}, (up, rest), of_tip, cart)
+    assert isinstance(one, lj.LQR) and isinstance(other, lj.LQR)
     np.testing.assert_allclose(np.sort_complex(one.eigenvalues), np.sort_complex(other.eigenvalues), rtol=1e-8)
     # A lean of one thousandth, and the same of the tip.
     lean = {"x": 0.0, "angle": 1e-3}

@@ -1,5 +1,7 @@
 """Where the search begins: answers that only a fan of motions finds, against closed forms."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
@@ -40,7 +42,7 @@ def test_lambert_with_revolutions():
         for turns in (1, 2):
             time, velocity, angle = lambert(a, b, turns)
             low, high = (2 * np.pi * turns) ** 2 * (1 + 1e-5), (2 * np.pi * (turns + 1)) ** 2 * (1 - 1e-5)
-            fastest = minimize_scalar(time, bounds=(low, high), method="bounded")
+            fastest: Any = minimize_scalar(time, bounds=(low, high), method="bounded")
             whole, end = 1.3 * fastest.fun, angle + 2 * np.pi * turns
             mean, launches = (whole / end) ** (2 / 3), []
             for axis in np.array([0.85, 1.0, 1.12, 1.25]) * mean:
@@ -54,7 +56,7 @@ def test_lambert_with_revolutions():
             starts = np.array([answer.start_velocity for answer in (found, *found.others)])
             for bracket in ((low, fastest.x), (fastest.x, high)):
                 for longer, near in ((0.0, True), (1e-6, False)):
-                    z = brentq(lambda z: time(z) - whole - longer, *bracket, xtol=1e-14, rtol=1e-15)
+                    z = float(np.asarray(brentq(lambda z: time(z) - whole - longer, *bracket, xtol=1e-14, rtol=1e-15)))
                     assert (np.min(np.max(np.abs(starts - velocity(z)), axis=1)) < 1e-11) == near
                     count += near
     assert count == 8
@@ -75,7 +77,7 @@ def test_both_catenaries():
     for answer, bracket, kind in zip(
         (found, *found.others), ((0.5, 2.0), (0.1, 0.4)), ("minimum", "saddle of index 1"), strict=True
     ):
-        neck = brentq(lambda neck: neck * np.cosh(far / neck) - 1, *bracket, xtol=1e-15)
+        neck = float(np.asarray(brentq(lambda neck: neck * np.cosh(far / neck) - 1, *bracket, xtol=1e-15)))
         area = neck * far + neck**2 / 2 * np.sinh(2 * far / neck)
         assert abs(answer.length - area) < 1e-12 and answer.kind == kind
         assert np.max(np.abs(answer.start_direction - np.array([neck, -np.sqrt(1 - neck**2)]))) < 1e-11

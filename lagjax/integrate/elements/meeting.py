@@ -29,7 +29,7 @@ from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem,
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
-from lagjax.mechanics import mass_and_forcing, saddle_point, with_first_order
+from lagjax.mechanics import mass_and_forcing, solve_saddle_point, with_first_order
 from lagjax.numerics import independent_rows
 from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
 
@@ -136,9 +136,9 @@ class Meeting(eqx.Module):
         jacobian, held = every[mine], every[always]
         independent = independent_rows(held)
         still = jnp.zeros(held.shape[0], x.dtype)
-        acceleration, _ = saddle_point(mass, held, linear.forcing, still, independent)
+        acceleration, _ = solve_saddle_point(mass, held, linear.forcing, still, independent)
         root_mass = jnp.sqrt(jnp.max(jnp.abs(mass), axis=1))
-        response, added = jax.vmap(lambda row: saddle_point(mass, held, row, still, independent))(jacobian)
+        response, added = jax.vmap(lambda row: solve_saddle_point(mass, held, row, still, independent))(jacobian)
         return Rows(jacobian, response, jacobian @ response.T, added, root_mass, acceleration)
 
     def _free(self, model: Model, given: InModes) -> Model:
@@ -251,7 +251,8 @@ class Meeting(eqx.Module):
         always = np.setdiff1d(np.arange(model.m), mine)
         linear = mass_and_forcing(self._free(model, given), t, x, u)
         held = every.jacobian[always]
-        a, multipliers = saddle_point(linear.mass, held, linear.forcing, every.gamma[always], independent_rows(held))
+        gamma, independent = every.gamma[always], independent_rows(held)
+        a, multipliers = solve_saddle_point(linear.mass, held, linear.forcing, gamma, independent)
         free = rows.jacobian @ a - every.gamma[mine]
         slopes = self._slopes(model, t, x, u)
         eps = jnp.finfo(x.dtype).eps
