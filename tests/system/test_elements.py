@@ -47,6 +47,14 @@ def test_bad_systems():
         ValueError, match="normal='flour' of element 'brake' is no constraint and no contact; .*'floor'"
     ):
         lj.integrate(rubbed, 0.0, 0.0, ts=[0.0, 1.0])
+    rough = lj.Contact(above, friction=0.1, sliding=sliding)
+    for clash in (
+        {"constraints": {"floor friction": lj.Nonholonomic(sliding)}},
+        {"elements": {"floor friction": floor}},
+    ):
+        both = lj.System(lagrangian, clash.get("constraints"), elements={"floor": rough, **clash.get("elements", {})})
+        with pytest.raises(ValueError, match="'floor friction' is the name of"):
+            lj.integrate(both, 0.0, 0.0, ts=[0.0, 1.0])
     two = lj.Contact(above, friction=0.1, sliding=lambda t, q, v, p: np.ones(2) * v)
     with pytest.raises(ValueError, match=r"sliding\(t, q, v, params\) of element 'floor' must return a number"):
         lj.integrate(lj.System(lagrangian, elements={"floor": two}), 0.0, 0.0, ts=[0.0, 1.0])

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.jaxtools import depends
@@ -175,11 +175,13 @@ class Laws(eqx.Module):
             for i in range(law.at[1] - law.at[0])
         )
 
+    def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " k"]:
+        """Which laws are constraints in these modes."""
+        return jnp.where(np.arange(modes.size) < self.count[0], modes == CLOSED, modes == STICKS)
+
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
         """The parameters in these modes."""
-        normal = np.arange(len(self.rows)) < self.count[0]
-        holds = jnp.where(normal, modes == CLOSED, modes == STICKS)
-        off = jnp.zeros(self.equations, bool).at[np.array(self.rows, int)].set(~holds)
+        off = jnp.zeros(self.equations, bool).at[np.array(self.rows, int)].set(~self.holds(modes))
         return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
 
     def last(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> Float[Array, " k"]:
@@ -287,9 +289,11 @@ def _laws(elements: Elements, plain: System, start: State):
                     "Fix: its name, a number, or a function of (t, q, v, params)."
                 )
             normal = traced(name, "normal", normal, OF_STATE) if not source else None
-            _check_name(name, plain)
         size = _size(sliding)
         key = f"{name} friction" if own else name
+        _check_name(key, plain)
+        if own and key in elements:
+            raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
         tangents.append(Tangent(key, sliding, mu, static, normal, source, (place, place + size)))
         source_of = [law for law in normals if law.name == source]
         owners += [source_of[0].at[0] + i if source_of else -1 for i in range(size)]

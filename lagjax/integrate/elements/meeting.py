@@ -114,7 +114,7 @@ class Meeting(eqx.Module):
         met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
         u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
         by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
-        slack = jnp.where(self._holds(met.modes), met.slack, by_motion)
+        slack = jnp.where(self.laws.holds(met.modes), met.slack, by_motion)
         return Met(model.tree(u), met.modes, stop_gradient(slack), met.found)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
@@ -274,7 +274,7 @@ class Meeting(eqx.Module):
         by_motion = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
         slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
         # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not.
-        nothing = jnp.where(fired & self._holds(given.modes), given.slack / 2, slack) / problem.step
+        nothing = jnp.where(fired & self.laws.holds(given.modes), given.slack / 2, slack) / problem.step
         stays = touching & ((forces[:normals] > 0) | (accelerations[:normals] <= nothing[:normals]))
         normal_modes = jnp.where(stays, CLOSED, OPEN)
         pushed = forces[normals:]
@@ -313,13 +313,9 @@ class Meeting(eqx.Module):
             return jnp.zeros(0, t.dtype), jnp.zeros((0, len(self.laws.rows)), t.dtype)
         return jnp.stack(constant), jnp.stack(of_forces)
 
-    def _holds(self, modes: Int[Array, " k"]) -> Bool[Array, " k"]:
-        """Which laws are constraints in these modes."""
-        return jnp.where(np.arange(modes.size) < self.laws.count[0], modes == CLOSED, modes == STICKS)
-
     def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, modes: Array) -> Array:
         """The impulses that move velocities onto what holds."""
-        on = self._holds(modes)
+        on = self.laws.holds(modes)
         left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left
