@@ -93,13 +93,14 @@ def solved(problem: ContactProblem) -> Forces:
         return jnp.max(jnp.abs(residual(still, forces))) / jnp.where(size > 0, size, 1.0)
 
     def newton(state: tuple) -> tuple:
-        forces, _, count = state
-        forces = forces - inverse(forces) @ residual(still, forces)
-        return forces, error(forces), count + 1
+        forces, _, _, count = state
+        slope = inverse(forces)
+        return forces - slope @ residual(still, forces), error(forces), slope, count + 1
 
     near = lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still.free))
-    start = near, error(near), jnp.asarray(0)
-    forces, left, _ = lax.while_loop(lambda s: (s[1] > SMALL[near.dtype]) & (s[2] < STEPS), newton, start)
-    # The derivative of the solution, by the matrix of its own case.
-    forces = forces - stop_gradient(inverse(forces)) @ residual(problem, forces)
-    return Forces(forces, left <= SMALL[near.dtype])
+    start = near, jnp.full_like(near[0], jnp.inf), jnp.zeros_like(still.matrix), jnp.asarray(0)
+    small = SMALL[near.dtype]
+    # The last step starts at a solution: its matrix is that of the solution's own case.
+    forces, left, slope, _ = lax.while_loop(lambda s: ~(s[1] <= small) & (s[3] < STEPS), newton, start)
+    forces = stop_gradient(forces)
+    return Forces(forces - stop_gradient(slope) @ residual(problem, forces), left <= small)

@@ -136,10 +136,10 @@ class Meeting(eqx.Module):
         jacobian, held = every[mine], every[always]
         independent = independent_rows(held)
         still = jnp.zeros(held.shape[0], x.dtype)
-        acceleration, _ = solve_saddle_point(mass, held, linear.forcing, still, independent)
         root_mass = jnp.sqrt(jnp.max(jnp.abs(mass), axis=1))
-        response, added = jax.vmap(lambda row: solve_saddle_point(mass, held, row, still, independent))(jacobian)
-        return Rows(jacobian, response, jacobian @ response.T, added, root_mass, acceleration)
+        every = jnp.concatenate([jacobian, linear.forcing[None]])
+        response, added = jax.vmap(lambda row: solve_saddle_point(mass, held, row, still, independent))(every)
+        return Rows(jacobian, response[:-1], jacobian @ response[:-1].T, added[:-1], root_mass, response[-1])
 
     def _free(self, model: Model, given: InModes) -> Model:
         """The model with all gaps open."""
