@@ -20,7 +20,7 @@ from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions,
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import without_init
+from lagjax.jaxtools import is_array, without_init
 from lagjax.system import SYSTEMS, Hybrid, State, System, UnknownSystem, differences, signature
 
 
@@ -142,6 +142,10 @@ def check_shapes(found: dict[str, Any]) -> None:
         check("switches", tuple(switches[name] for name in ("q", "v", "q_after", "v_after", "impulse")), rows)
         check("switches", [switches["count"]], batch, "iu", exactly=True)
         check("switches", [switches["uncertain"]], batch, "b", exactly=True)
+        if (modes := found.get("modes")) is not None:
+            many = len(switches["ways"])
+            check("modes", [modes], (*outputs, many), "iu", exactly=True)
+            check("switches", [switches["modes"]], (*rows, many), "iu", exactly=True)
         if not all(isinstance(x, str) for x in (*switches["names"], *switches["ways"])):
             raise ValueError("its phases have no names.")
 
@@ -154,11 +158,17 @@ def trajectory_from(found: dict, kept: System | Hybrid | UnknownSystem) -> Traje
     error = found["error"]
     fields["error"] = None if error is None else Errors(**error | {"result": result_of_names(error["result"])})
     asked, how = made(SolveOptions, found["asked"]), made(SolveInfo, found["how"])
+    if isinstance(kept, SYSTEMS):
+        # As `vmap` leaves it, so that a lane of a batch has its system.
+        batch = np.shape(found["t"])[:-1]
+        kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape)) if batch and is_array(x) else x, kept)
     integrate = backward_trajectory_of if how.backward else trajectory_of
     fields["arrays"], fields["static"] = pack((kept, found["params"], asked), how, integrate)
     if "phase" not in found:
         return Trajectory(**fields)
-    return HybridTrajectory(**fields, phase=found["phase"], switches=made(Switches, found["switches"]))
+    # Older files have no modes.
+    modes, switches = found.get("modes"), made(Switches, found["switches"])
+    return HybridTrajectory(**fields, phase=found["phase"], switches=switches, modes=modes)
 
 
 def check_is_system(system: Any) -> None:

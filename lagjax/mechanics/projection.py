@@ -25,7 +25,7 @@ from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.mechanics.first_order import resolved
 from lagjax.numerics import largest, last_step, newton
-from lagjax.system import Model, constraints, coordinates
+from lagjax.system import InModes, Model, constraints, coordinates, given_in
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
 # below 1e-8 of the size of the state; a crude fixed step of 0.1 takes eight.
@@ -104,13 +104,20 @@ def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array)
     return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
 
 
-def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree):
+def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes | None = None):
     """Return the largest relative residual along a trajectory, of positions and velocities.
 
     A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
-    velocity for the velocity level): to the residual that a displacement as large as the motion would cause.
+    velocity for the velocity level): to the residual that a displacement as large as the motion would cause. `given`:
+    for a system with elements, the modes in each row.
     """
-    residual, slope, size = jax.vmap(partial(residuals_and_slopes, equations_of(model)))(t, q, v)
+    equations = equations_of(model)
+
+    def at(t: Array, q: PyTree, v: PyTree, row: InModes | None):
+        here = equations if row is None else equations_of(model.of(given_in(row, model.params.params)))
+        return residuals_and_slopes(here, t, q, v)
+
+    residual, slope, size = jax.vmap(at)(t, q, v, given)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
     scale = slope @ level_size(jnp.nanmax(size, axis=0))
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))

@@ -139,6 +139,8 @@ def _of_motion(motion: Any, prefix: str):
         yield part(f"multipliers.{name}", name, dims, x, name)
     if hasattr(motion, "phase"):
         yield part("phase", "phase", dims, motion.phase)
+        if motion.modes is not None:
+            yield part("modes", "modes", dims, motion.modes, "mode")
     yield part("end.t", "end", batch, motion.end.t)
     for name, found in motion.events.items():
         yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{prefix}crossing_of_{name}"), found.t)

@@ -19,6 +19,7 @@ from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
+from lagjax.system.coordinates import State
 from lagjax.system.elements import Elements
 from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System, check_functions
@@ -199,9 +200,17 @@ class Hybrid(eqx.Module):
         """The systems of all phases."""
         return self.systems
 
-    def given(self, params: PyTree) -> PyTree:
-        """What the functions of the phases take as `params`."""
+    def given(self, params: PyTree, modes: Array | None = None) -> PyTree:
+        """What the functions of the phases take as `params`; `modes`: those of elements, of which there are none."""
         return params
+
+    def cases(self, params: PyTree) -> dict[str, PyTree]:
+        """The parameters in as many cases, by what is said of them, as it takes to see what every function returns."""
+        return {"": params}
+
+    def laws_in_numbers(self, state: State) -> dict[str, np.ndarray]:
+        """What tells the laws of elements from others, by role, beside the functions of the phases."""
+        return {}
 
     @property
     def first_phase(self) -> System:

@@ -99,6 +99,11 @@ class InModes(NamedTuple):
     slack: Float[Array, " k"]
 
 
+def given_in(row: InModes | None, params: PyTree) -> PyTree:
+    """What functions take as parameters in the modes of a row, which has None in their place; without modes, these."""
+    return params if row is None else row._replace(params=params)
+
+
 class Model(eqx.Module):
     """A system, or hybrid, with its parameters, for states of one form. n coordinates, m constraint equations."""
 

@@ -60,9 +60,11 @@ def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
         return _signature(system, *state)
     found = {}
     for name, phase in zip(system.names, system.systems):
-        found |= {f"{role} of phase '{name}'": x for role, x in _signature(phase, *state).items()}
+        for case, params in system.cases(state.params).items():
+            of_phase = _signature(phase, *state[:3], params)
+            found |= {f"{role} of phase '{name}'{case}": x for role, x in of_phase.items()}
     names = [f"{i}: {switch.phase} -> {switch.to}, {switch.rest}" for i, switch in enumerate(system.switches)]
-    return found | {f"switch {name}": np.zeros(0) for name in names}
+    return found | {f"switch {name}": np.zeros(0) for name in names} | system.laws_in_numbers(state)
 
 
 def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:

@@ -44,6 +44,7 @@ from lagjax.system import (
 
 OPEN, CLOSED = 0, 1
 FREE, STICKS = 0, 2
+ALL_CLOSED = {"where contacts stick": STICKS, "where contacts slide": 1}
 
 
 class Normal(eqx.Module):
@@ -138,13 +139,20 @@ class WithFriction(eqx.Module):
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
         params = given.params
         total = jax.tree.map(jnp.zeros_like, q) if self.force is None else self.force(t, q, v, params)
+        for force in self.by_element(t, q, v, multipliers, given).values():
+            total = jax.tree.map(jnp.add, total, force)
+        return total
+
+    def by_element(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        """The forces that elements add, each like q, by the names of their modes: of friction, while it slides."""
+        found, params = {}, given.params
         for law in self.tangents:
             mode = given.modes[slice(*law.at)]
             side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
             size = law.kinetic(side * slip, params) * law.normal_forces(t, q, v, multipliers, params)
-            total = jax.tree.map(jnp.add, total, back(-side * size)[0])
-        return total
+            found[law.name] = back(-side * size)[0]
+        return found
 
 
 class Laws(eqx.Module):
@@ -177,12 +185,32 @@ class Laws(eqx.Module):
 
     def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " k"]:
         """Which laws are constraints in these modes."""
-        return jnp.where(np.arange(modes.size) < self.count[0], modes == CLOSED, modes == STICKS)
+        return jnp.where(np.arange(modes.shape[-1]) < self.count[0], modes == CLOSED, modes == STICKS)
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
-        """The parameters in these modes."""
-        off = jnp.zeros(self.equations, bool).at[np.array(self.rows, int)].set(~self.holds(modes))
+        """The parameters in these modes; rows of modes, (..., k), give rows of the rest."""
+        off = jnp.zeros((*modes.shape[:-1], self.equations), bool)
+        off = off.at[..., np.array(self.rows, int)].set(~self.holds(modes))
         return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
+
+    def all_closed(self) -> dict[str, Int[Array, " k"]]:
+        """All gaps closed, by whether what can slide sticks or slides."""
+        gaps, slips = self.count
+        return {words: jnp.array([CLOSED] * gaps + [mode] * slips, int) for words, mode in ALL_CLOSED.items()}
+
+    def in_numbers(self, state: State) -> dict[str, Array]:
+        """What the laws are besides the functions of the system, by role, at a state."""
+        found = {}
+        for law in self.normals:
+            ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
+            slower = jnp.broadcast_to(jnp.asarray(law.slower_than, ones.dtype), ones.shape)
+            found[f"the restitution of '{law.name}'"] = jnp.concatenate([law.returned(ones), law.returned(2 * ones)])
+            found[f"slower_than of '{law.name}'"] = slower
+        for law in self.tangents:
+            ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
+            mu = law.sticking(ones, state.params), law.kinetic(ones, state.params), law.kinetic(2 * ones, state.params)
+            found[f"the coefficients of '{law.name}'"] = jnp.concatenate(mu)
+        return found
 
     def last(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> Float[Array, " k"]:
         """The guard of each mode: above zero, or no farther below than its slack, as long as the mode lasts."""

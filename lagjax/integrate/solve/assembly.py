@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from lagjax.integrate.elements.laws import Laws, OneGuard, in_modes
 from lagjax.integrate.elements.meeting import Meeting
@@ -28,11 +29,19 @@ class InElements(Hybrid):
     def elements(self) -> Elements | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.user.elements
 
-    def given(self, params: PyTree) -> Any:
-        """The parameters with all gaps open."""
+    def given(self, params: PyTree, modes: Array | None = None) -> Any:
+        """The parameters in these modes, or in rows of modes; without any, with all gaps open."""
         if isinstance(params, InModes):
             return params
-        return self.laws.given(params, jnp.zeros(len(self.laws.rows), int))
+        return self.laws.given(params, jnp.zeros(len(self.laws.rows), int) if modes is None else modes)
+
+    def cases(self, params: PyTree) -> dict[str, PyTree]:
+        """The parameters where every contact holds, and where every one that can slide does."""
+        return {f" {words}": self.laws.given(params, modes) for words, modes in self.laws.all_closed().items()}
+
+    def laws_in_numbers(self, state: State) -> dict[str, np.ndarray]:
+        found = {f"elements, impacts {self.laws.impacts}": np.zeros(0)}
+        return found | jax.tree.map(np.asarray, self.laws.in_numbers(state))
 
     def __repr__(self):
         return repr(self.user)

@@ -70,6 +70,8 @@ class Reset(eqx.Module):
 
 def traced_phases(system: System | Hybrid, start: State) -> Any:
     """The system, or hybrid with its switches, with all its functions checked and traced for such states."""
+    if isinstance(system, InElements):
+        return assembled(system.user, start)
     if not system.in_phases:
         return traced_system(system, start) if system.elements is None else assembled(system, start)
     hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))

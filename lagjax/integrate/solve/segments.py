@@ -172,7 +172,7 @@ def solved_in_legs(
         "scaled_error": way.scaled_error,
         "result": way.result,
         "settled": way.settled,
-        "events": way.events | ({SWITCHES: way.switches.as_crossings()} if hybrid.switches else {}),
+        "events": way.events | ({SWITCHES: way.switches.as_crossings()} if way.switches.ways else {}),
         "phase": rows.phase,
         "modes": rows.modes,
         "switches": way.switches,
@@ -200,6 +200,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
         modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
+        gaps=0 if modes is None else phase.meeting.laws.count[0],
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
@@ -364,7 +365,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         t=put(s.t, end.t), way=put(s.way, number), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
-        modes=None if after.modes is None else put(s.modes, after.modes.modes),
+        modes=None if after.modes is None else put(s.modes, after.modes.modes), gaps=s.gaps,
     )  # fmt: skip
     return after, to, record
 

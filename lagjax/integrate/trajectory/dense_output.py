@@ -27,7 +27,7 @@ from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
 from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of
 from lagjax.mechanics import accelerations
-from lagjax.system import System
+from lagjax.system import InModes, System, given_in
 
 # Controllers that can begin at any time; others plan the steps of the whole motion.
 BEGIN_ANYWHERE = type(None), diffrax.PIDController, diffrax.ConstantStepSize, diffrax.ClipStepSizeController
@@ -47,23 +47,18 @@ IN_PHASES = (
 class Instants(NamedTuple):
     """The instants from which a motion can be continued, in the order of its run: outputs and states after switches.
 
-    `phase`: the number of the phase that begins or goes on there; None for a motion without phases.
+    `phase`: the number of the phase that begins or goes on there; None for a motion without phases. `given`: likewise
+    the modes of elements, as functions take them.
     """
 
     at: Snapshot
-    is_output: np.ndarray | None
-    phase: Int[Array, " N"] | None
-
-
-def refuse_elements(trajectory, what: str, fix: str):
-    """Raise for what is not done with motions of systems with elements."""
-    if trajectory.in_phases and trajectory.modes is not None:
-        raise ValueError(f"a motion with elements cannot be {what} yet.\nFix: {fix}.")
+    is_output: np.ndarray | None = None
+    phase: Int[Array, " N"] | None = None
+    given: InModes | None = None
 
 
 def at(trajectory, t: ArrayLike) -> Snapshot:
     """Return the motion at times of any shape: see `Trajectory.at`."""
-    refuse_elements(trajectory, "computed between its outputs", "give these times to lj.integrate as ts")
     _check_can_be_continued(trajectory)
     dtype = trajectory.t.dtype
     t = _times(t, dtype)
@@ -76,26 +71,28 @@ def at(trajectory, t: ArrayLike) -> Snapshot:
     times = t.ravel()
     known = _known_of(trajectory)
     index = _before(known, times, trajectory.static.how.backward)
-    nodes = jax.tree.map(lambda x: np.asarray(x)[index], known.at)
+    nodes, given = jax.tree.map(lambda x: np.asarray(x)[index], (known.at, known.given))
     found = jax.tree.map(np.array, nodes._replace(t=times))
     between = np.flatnonzero(nodes.t != times)
     for phase in [None] if known.phase is None else np.unique(np.asarray(known.phase)[index[between]]):
         rows = between if phase is None else between[np.asarray(known.phase)[index[between]] == phase]
         if rows.size:
-            _fill(found, rows, trajectory, phase, jax.tree.map(lambda x, rows=rows: x[rows], nodes), times[rows])
+            here = jax.tree.map(lambda x, rows=rows: x[rows], (nodes, given))
+            _fill(found, rows, trajectory, phase, *here, times[rows])
     return jax.tree.map(lambda x: jnp.asarray(x.reshape(t.shape + x.shape[1:])), found)
 
 
-def _fill(found, rows, trajectory, phase, nodes, times):
+def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None, times):
     """Write the motion at `times`, all in one phase, into the rows `rows` of `found`."""
     system = trajectory.system if phase is None else trajectory.system.systems[phase]
     multipliers = {name: x for name, x in nodes.multipliers.items() if name in system.constraints}
     # Padded to one of a few sizes, since a program is compiled for each size.
     count = filled_up(len(times)) if len(times) <= LANES else LANES * filled_up(-(-len(times) // LANES))
     fill = np.minimum(np.arange(count), len(times) - 1)
-    nodes, times = jax.tree.map(lambda x: x[fill], (nodes._replace(multipliers=multipliers), times))
+    nodes = nodes._replace(multipliers=multipliers)
+    nodes, given, times = jax.tree.map(lambda x: x[fill], (nodes, given, times))
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
-    new, result = _continue_all(*of_system, nodes, times, trajectory.static.integrate)
+    new, result = _continue_all(*of_system, nodes, given, times, trajectory.static.integrate)
     new, result = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result))
     # Not `ended_well`, which would compile a comparison for each number of times.
     well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
@@ -110,7 +107,7 @@ def _fill(found, rows, trajectory, phase, nodes, times):
 def _known_of(trajectory) -> Instants:
     outputs = Snapshot(trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers)
     if not trajectory.in_phases:
-        return Instants(outputs, None, None)
+        return Instants(outputs)
     outputs = jax.tree.map(np.asarray, outputs)
     s, count = trajectory.switches, len(trajectory.switches)
     unknown = {name: np.full((count, *x.shape[1:]), np.nan) for name, x in outputs.multipliers.items()}
@@ -123,7 +120,11 @@ def _known_of(trajectory) -> Instants:
     is_output = np.arange(len(phase)) < reached.sum()
     # An output at the time of a switch comes before it.
     order = np.lexsort((np.arange(len(phase)), both.t))
-    return Instants(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order])
+    given = None
+    if trajectory.modes is not None:
+        modes = np.concatenate([np.asarray(trajectory.modes)[reached], np.asarray(s.modes)[:count]])
+        given = trajectory.system.given(None, modes[order])
+    return Instants(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order], given)
 
 
 def _before(known: Instants, t, backward: bool):
@@ -232,12 +233,14 @@ def _solved_from(
 
 @partial(compiled, in_numpy=True)
 def _continue_all(
-    system: System, params: PyTree, asked: SolveOptions, tolerance, nodes: Snapshot, times, integrate: Callable
-):
-    of_system = system, params, asked, tolerance
-    return lax.map(
-        lambda pair: _continued(*of_system, *pair, integrate), (nodes, times), batch_size=min(LANES, len(times))
-    )
+    system: System, params: PyTree, asked: SolveOptions, tolerance, nodes: Snapshot, given: InModes | None, times,
+    integrate: Callable,
+):  # fmt: skip
+    def one(each: tuple):
+        node, row, t = each
+        return _continued(system, given_in(row, params), asked, tolerance, node, t, integrate)
+
+    return lax.map(one, (nodes, given, times), batch_size=min(LANES, len(times)))
 
 
 def _of_length_zero(system: System, params: PyTree, node: Snapshot, t):

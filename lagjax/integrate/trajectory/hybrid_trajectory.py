@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.trajectory.parts import NO_PHASE
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
-from lagjax.system import Hybrid, Model, UnknownSystem, known_system, model_of
+from lagjax.system import Hybrid, InModes, Model, UnknownSystem, known_system, model_of
 
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
@@ -32,7 +33,8 @@ class Switches(eqx.Module):
       last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
-    - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names.
+    - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
+      of which the first `gaps` are those of gaps.
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -53,6 +55,7 @@ class Switches(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     ways: tuple[str, ...] = eqx.field(static=True)
     modes: Int[Array, "S k"] | None = None
+    gaps: int = eqx.field(static=True, default=0)
 
     def as_crossings(self) -> Crossings:
         """Return the switches as crossings of one guard, with the states before them."""
@@ -76,8 +79,22 @@ class Switches(eqx.Module):
     def _rows(self):
         times, ways, to = map(np.asarray, (self.t, self.way, self.to))
         if self.modes is not None:
-            return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]}" for k in range(int(self.count))]
+            return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} {self._happened(k)}" for k in range(int(self.count))]
         return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} -> {self.names[to[k]]}" for k in range(int(self.count))]
+
+    def _happened(self, k: int) -> str:
+        """What a mode does where it ends at switch k."""
+        way = int(self.way[k])
+        after = self.mode_in_words(way, int(np.asarray(self.modes)[k, way]))
+        impulses = jax.tree.leaves(self.impulse)
+        struck = way < self.gaps and any(np.any(np.asarray(x)[k]) for x in impulses)
+        return f"is struck, then {after}" if struck else after
+
+    def mode_in_words(self, way: int, mode: int) -> str:
+        """A mode in a word; `way`: its place among the modes."""
+        if way < self.gaps:
+            return "closed" if mode else "open"
+        return {0: "free", 2: "sticks"}.get(mode, "slides")
 
 
 class HybridTrajectory(Trajectory):
@@ -109,6 +126,10 @@ class HybridTrajectory(Trajectory):
         first = jax.tree.map(lambda x: x[0], (self.t, self.q, self.v))
         return model_of(self.system, *first, self.system.given(self.params))
 
+    def given(self) -> InModes | None:
+        """The modes of elements at each output as the functions of the system take them; None without elements."""
+        return None if self.modes is None else self.system.given(None, self.modes)
+
     def named_phases(self) -> np.ndarray:
         """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
         return np.array([*self.switches.names, ""])[np.asarray(self.phase)]
@@ -128,7 +149,8 @@ class HybridTrajectory(Trajectory):
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, but not between them, each in its own phase, relative."""
-        worst = [_residual_in(model, i, self) for i, model in enumerate(self.model.phases) if model.m]
+        given = self.given()
+        worst = [_residual_in(model, i, self, given) for i, model in enumerate(self.model.phases) if model.m]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
     def plot(self, charges: Any = False):
@@ -154,17 +176,24 @@ class HybridTrajectory(Trajectory):
             lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)")]
         else:
             lines = []
-        names, counts = np.unique(self.named_phases(), return_counts=True)
-        outputs = ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
         found = [row.strip() for row in self.switches._rows()]
         shown = found[:6] + (["..."] if len(found) > 6 else [])
         return [
             *lines,
-            ("phases", f"outputs: {outputs}"),
+            self._of_phases(),
             ("switches", self.switches.in_words()),
             *(("", row) for row in shown),
             *((f"event '{name}'", found.in_words()) for name, found in self.events.items() if name != SWITCHES),
         ]
+
+    def _of_phases(self) -> tuple[str, str]:
+        if self.modes is not None:
+            s, reached = self.switches, np.asarray(self.modes)[np.asarray(self.phase) != NO_PHASE]
+            last = [*reached, *np.asarray(s.modes)[len(s) - 1 : len(s)]][-1] if len(reached) else []
+            words = [f"{name} {s.mode_in_words(i, int(mode))}" for i, (name, mode) in enumerate(zip(s.ways, last))]
+            return "modes", f"at the end: {', '.join(words)}"
+        names, counts = np.unique(self.named_phases(), return_counts=True)
+        return "phases", "outputs: " + ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
 
 
 def _integral(model: Model, t: Array, q: PyTree, v: PyTree):
@@ -180,14 +209,14 @@ def _of_phases(function: Callable, trajectory):
     return found
 
 
-def _residual_in(model: Model, i: int, trajectory):
-    return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v)
+def _residual_in(model: Model, i: int, trajectory, given: InModes | None):
+    return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v, given)
 
 
 @compiled
-def _worst(model: Model, i: int, phase: Array, t: Array, q: PyTree, v: PyTree):
+def _worst(model: Model, i: int, phase: Array, t: Array, q: PyTree, v: PyTree, given: InModes | None):
     in_phase = phase == i
     # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
     at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))
-    t, q, v = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v))
-    return lax.cond(jnp.any(in_phase), lambda: worst_residual(model, t, q, v), lambda: jnp.zeros_like(t[0]))
+    t, q, v, given = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v, given))
+    return lax.cond(jnp.any(in_phase), lambda: worst_residual(model, t, q, v, given), lambda: jnp.zeros_like(t[0]))

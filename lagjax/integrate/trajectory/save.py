@@ -9,7 +9,6 @@ import numpy as np
 from jax.core import Tracer
 
 from lagjax.files import Writer, npz
-from lagjax.integrate.trajectory.dense_output import refuse_elements
 from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.system import UnknownSystem, middle_state, signature
@@ -36,7 +35,7 @@ def parts(trajectory, of_result: Callable) -> dict[str, Any]:
     error = trajectory.error
     tree["error"] = None if error is None else error._asdict() | {"result": of_result(error.result)}
     if hasattr(trajectory, "phase"):
-        tree |= {"phase": trajectory.phase, "switches": _fields(trajectory.switches)}
+        tree |= {"phase": trajectory.phase, "switches": _fields(trajectory.switches), "modes": trajectory.modes}
     return tree
 
 
@@ -47,18 +46,15 @@ def described(trajectory) -> UnknownSystem:
         return system
     if 0 in np.shape(trajectory.t):
         return UnknownSystem(repr(system), (), {}, None)
-    state = middle_state(trajectory.t, trajectory.q, trajectory.v, trajectory.params)
-    return UnknownSystem(repr(system), _angles(trajectory), signature(system, state), tuple(state))
-
-
-def _angles(trajectory):
+    # In a batch the numbers of the system have its axes too.
     first = (0,) * (np.ndim(trajectory.t) - 1)
     one = jax.tree.map(lambda x: x[first] if isinstance(x, (jax.Array, np.ndarray)) else x, trajectory)
-    return tuple(map(bool, angle_mask(one)))
+    state = middle_state(one.t, one.q, one.v, one.params)
+    angles = tuple(map(bool, angle_mask(one)))
+    return UnknownSystem(repr(system), angles, signature(one.any_system, state), tuple(state))
 
 
 def _check_known(trajectory):
-    refuse_elements(trajectory, "saved", "save its numbers, np.savez(path, t=traj.t, q=traj.q, v=traj.v)")
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(trajectory)):
         raise TypeError(
             "this trajectory is being traced, and has no numbers yet.\n"

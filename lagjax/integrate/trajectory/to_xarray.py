@@ -16,6 +16,8 @@ from lagjax.integrate.trajectory.results import in_words
 # The counts that a trajectory keeps for each motion.
 COUNTS = "num_steps", "num_accepted_steps", "num_rejected_steps"
 
+MODES = {"of_gaps": "0 open, 1 closed", "of_sliding_velocities": "1 and -1 slides, 2 sticks, 0 free"}
+
 
 def import_xarray():
     """Import xarray, or say how to get it."""
@@ -58,6 +60,9 @@ def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
         names = trajectory.switches.names
         flags = {"flag_values": np.arange(len(names)), "flag_meanings": " ".join(map(_one_word, names))}
         found[f"{under}phase"].attrs = flags
+    if f"{under}modes" in found:
+        found = found.assign_coords({"mode": list(trajectory.switches.ways)})
+        found[f"{under}modes"].attrs = MODES
     return found
 
 
@@ -86,6 +91,8 @@ def outputs(trajectory):
         yield free, axes(name, x, lead), np.asarray(x)
     if hasattr(trajectory, "phase"):
         yield "phase", (), np.asarray(trajectory.phase)
+        if trajectory.modes is not None:
+            yield "modes", ("mode",), np.asarray(trajectory.modes)
     if trajectory.error is None:
         return
     for which in ("q", "v"):
@@ -144,7 +151,7 @@ def axes(name: str, x, lead: int) -> tuple[str, ...]:
 
 def _taken(trajectory):
     coordinates = [named(which, path) for which in ("q", "v") for path, _ in _leaves(getattr(trajectory, which))]
-    return {"t", "times", "phase", "result", "end", "scaled_error", *COUNTS, *coordinates}
+    return {"t", "times", "phase", "modes", "mode", "result", "end", "scaled_error", *COUNTS, *coordinates}
 
 
 def _leaves(tree: PyTree):
