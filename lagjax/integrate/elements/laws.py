@@ -112,7 +112,8 @@ def takes_of_coefficient(mu: Callable) -> tuple[str, ...]:
     known = getattr(mu, "takes", None)
     if known is not None:
         return known
-    return ("params",) if len(inspect.signature(mu).parameters) == 1 else ("speed", "params")
+    needed = [x for x in inspect.signature(mu).parameters.values() if x.default is x.empty]
+    return ("params",) if len(needed) == 1 else ("speed", "params")
 
 
 class Masked(eqx.Module):
