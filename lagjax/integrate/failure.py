@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.integrate import arguments
+from lagjax.integrate.diagnose_contacts import of_elements
 from lagjax.integrate.diagnose_guard import of_guards
 from lagjax.integrate.diagnose_stop import stopped_early
 from lagjax.integrate.settings import Settings
@@ -24,7 +25,7 @@ from lagjax.integrate.trajectory.parts import pack
 from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import as_usual, primitive
-from lagjax.mechanics import accelerations, describe, explain_failure, listed
+from lagjax.mechanics import accelerations, describe, explain_failure
 from lagjax.system import Hybrid, State, coordinates
 
 
@@ -78,41 +79,10 @@ def _raise(trajectory, start: State, settings: Settings, about_guards: str, wher
     raise RuntimeError(where + stopped_early(trajectory, settings, about_guards))
 
 
-def _raise_of_elements(trajectory, start: State) -> NoReturn:
-    result, switches, count = trajectory.result, trajectory.switches, len(trajectory.switches)
-    last = list(dict.fromkeys(switches.ways[i] for i in np.asarray(switches.way)[max(0, count - 8) : count]))
-    when = f"t = {float(trajectory.end.t):.9g}"
-    if is_among(result, [RESULTS.too_many_switches]):
-        raise RuntimeError(
-            f"there were {count} changes of modes until {when}, the last ones of {listed(last)}, and that is all there "
-            "is room for.\n"
-            "Usual cause: very many impacts before a contact rests; a force that pulls a contact to and fro.\n"
-            "Fix: elements=lj.Elements({...}, most_switches=1000); slower_than= of the contact."
-        )
-    if is_among(result, [RESULTS.guard_below_zero]):
-        laws, state = trajectory.system.laws, (start.t, start.q, trajectory.params)
-        names, gaps = laws.names, np.concatenate([np.asarray(law.gaps(*state)) for law in laws.normals])
-        inside = ", ".join(f"'{names[i]}' = {gaps[i]:.3g}" for i in np.flatnonzero(gaps < 0))
-        raise ValueError(
-            f"the motion starts inside a contact: the gap {inside} is below zero.\n"
-            "Usual cause: positions in rounded numbers, or a radius forgotten in the gap.\n"
-            "Fix: move the start out by that; lj.consistent_state of the system with lj.Holonomic(gap) in place of the "
-            "element gives the nearest state that touches."
-        )
-    if is_among(result, [RESULTS.no_contact_forces]):
-        raise RuntimeError(
-            f"no forces obey the laws of contact and friction together at {when}"
-            f"{f', where {listed(last[-1:])} changes' if last else ''}.\n"
-            "Usual cause: Painlevé's paradox, friction that pushes a contact together harder than it is pushed apart.\n"
-            "Fix: a smaller friction, or a contact with a spring and a damper in place of a rigid one."
-        )
-    raise RuntimeError(f"at {when}: {message(result)}")
-
-
 def _raise_in_phase(trajectory, start: State, settings: Settings, about_guards: str) -> NoReturn:
     hybrid, switches, result = trajectory.system, trajectory.switches, trajectory.result
     if hybrid.elements is not None:
-        _raise_of_elements(trajectory, start)
+        raise of_elements(trajectory, start)
     if is_among(result, [RESULTS.too_many_switches]):
         raise RuntimeError(_too_many(trajectory))
     if is_among(result, [RESULTS.guard_below_zero]):

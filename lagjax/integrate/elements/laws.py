@@ -290,6 +290,7 @@ def _laws(elements: Elements, plain: System, start: State):
             continue
         _check_name(name, plain)
         gap = traced(name, "gap", contact.gap, OF_POSITION)
+        _check_slope(name, gap, *start)
         e, size = traced(name, "restitution", contact.restitution, ("speed",), ()), _size(gap)
         normals.append(Normal(name, gap, e, contact.slower_than, (place, place + size)))
         place += size
@@ -339,6 +340,17 @@ def check_linear(sliding: Callable, t: Array, q: PyTree, v: PyTree, params: PyTr
             "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
             "Usual cause: a speed, jnp.abs of the velocity or its length.\n"
             'Fix: the velocity with its sign, v["x"] - params["R"] * v["phi"].'
+        )
+
+
+def _check_slope(name: str, gap: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
+    """Raise if no motion changes a gap, as far as JAX sees."""
+    program = jax.make_jaxpr(lambda v: jax.jvp(lambda q: gap(t, q, params), (q,), (v,))[1])(v).jaxpr
+    if not depends(program, program.invars):
+        raise ValueError(
+            f"the gap of element '{name}' has no derivative by q: its rate is zero in every motion.\n"
+            "Usual cause: jnp.floor, jnp.round, or a comparison, which is 0 or 1; a gap that does not depend on q.\n"
+            'Fix: a length that changes as the bodies move, such as q["y"] - params["R"].'
         )
 
 

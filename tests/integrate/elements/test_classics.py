@@ -1,0 +1,215 @@
+"""Problems of the textbooks, written down in elements, against their closed forms."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.scenes import rolling_hoop
+from lagjax.scenes.slipping_hoop import FIRST, PARAMS, exact, height
+from tests.integrate.elements.test_motions import moved
+from tests.system.test_hybrid import G
+
+
+def at_rest(q: dict) -> dict:
+    """Velocities of zero."""
+    return {name: np.zeros(np.shape(x)) for name, x in q.items()}
+
+
+@pytest.mark.exhaustive
+def test_a_ladder_leaves_the_wall():
+    """It leaves at sin θ = 2/3 sin θ0, at the time of the quadrature, and then its speed along the floor stays. Twin: a
+    ladder that is pushed leaves higher, as if it came from where it would have been at rest."""
+    lagrangian = lambda t, q, v, l: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + (l * v["theta"]) ** 2 / 12) - G * q["y"]
+    wall = lj.Contact(lambda t, q, l: q["x"] - 0.5 * l * jnp.cos(q["theta"]))
+    floor = lj.Contact(lambda t, q, l: q["y"] - 0.5 * l * jnp.sin(q["theta"]))
+    ladder = lj.System(lagrangian, elements={"wall": wall, "floor": floor})
+    l, first = 2.0, 1.2
+
+    def slides(rate: float):
+        q = {"x": 0.5 * l * np.cos(first), "y": 0.5 * l * np.sin(first), "theta": first}
+        v = {"x": -q["y"] * rate, "y": q["x"] * rate, "theta": rate}
+        return moved(ladder, q, v, l, ts=np.array([0.0, 0.3, 0.8]), rtol=1e-11)
+
+    traj = slides(0.0)
+    assert traj.switches.ways[int(traj.switches.way[0])] == "wall" and len(traj.switches) == 1
+    np.testing.assert_allclose(np.sin(traj.switches.q["theta"][0]), 2 / 3 * np.sin(first), rtol=1e-11)
+    # θ = first - s² takes the square root out of the quadrature of dθ/θ̇.
+    leaves = np.arcsin(2 / 3 * np.sin(first))
+    rate = lambda theta: np.sqrt(3 * G / l * (np.sin(first) - np.sin(theta)))
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    s = np.sqrt(first - leaves) * (nodes + 1) / 2
+    took = np.sqrt(first - leaves) / 2 * weights @ (2 * s / rate(first - s**2))
+    np.testing.assert_allclose(traj.switches.t[0], took, rtol=1e-11)
+    np.testing.assert_allclose(traj.v["x"][-1], 0.5 * l * np.sin(leaves) * rate(leaves), rtol=1e-11)
+    for pushed in (-0.5, -1.0):
+        height = np.sin(first) + pushed**2 * l / (3 * G)
+        np.testing.assert_allclose(np.sin(slides(pushed).switches.q["theta"][0]), 2 / 3 * height, rtol=1e-11)
+
+
+@pytest.mark.exhaustive
+def test_a_disk_on_a_slope():
+    """It rolls with 2/3 g sin α where μ is above tan α / 3, and slides with g (sin α - μ cos α) below. Twin: the two
+    differ at once below the threshold."""
+    slope, radius = 0.5, 0.3
+    inertia = 0.5 * radius**2
+    along, across = G * np.sin(slope), G * np.cos(slope)
+
+    def lagrangian(t, q, v, mu):
+        return 0.5 * (v["x"] ** 2 + v["y"] ** 2 + inertia * v["phi"] ** 2) + along * q["x"] - across * q["y"]
+
+    touch = lj.Contact(
+        lambda t, q, mu: q["y"] - radius,
+        friction=lambda mu: mu,
+        sliding=lambda t, q, v, mu: v["x"] - radius * v["phi"],
+    )
+    disk = lj.System(lagrangian, elements={"slope": touch})
+    q0, rolls = {"x": 0.0, "y": radius, "phi": 0.0}, 2 / 3 * along
+    for share in (0.0, 0.2, 0.999, 1.001, 3.0):
+        mu = share * np.tan(slope) / 3
+        traj = moved(disk, q0, at_rest(q0), mu, ts=np.array([0.0, 0.5, 1.0]), rtol=1e-11)
+        slides = along - mu * across
+        spins = mu * across * radius / inertia
+        a, turns = (slides, spins) if share < 1 else (rolls, rolls / radius)
+        np.testing.assert_allclose(traj.q["x"][1:], [a / 8, a / 2], rtol=1e-11)
+        np.testing.assert_allclose(traj.v["phi"][-1], turns, rtol=1e-11)
+        assert np.asarray(traj.modes).tolist() == [[1, 1 if share < 1 else 2]] * 3 and not len(traj.switches)
+        assert (abs(slides - rolls) > 1e-4 * rolls) and (share > 1) == (slides < rolls)
+
+
+@pytest.mark.slow
+def test_the_hoop_with_friction():
+    """The hoop rolls, slips, leaves and lands where the closed forms say, from two elements. Twin: a smaller friction
+    slips earlier and leaves later."""
+    cylinder = lj.Contact(rolling_hoop.contact, friction=lambda p: p["mu"], sliding=rolling_hoop.rolling)
+    hoop = lj.System(rolling_hoop.lagrangian, elements={"cylinder": cylinder, "ground": lj.Contact(height)})
+    rate, angles = rolling_hoop.exact_rate(PARAMS, FIRST, rolling_hoop.TOP), []
+    for mu in (0.25, 1.0):
+        params = PARAMS | {"mu": mu}
+        traj = moved(hoop, *rolling_hoop.start(params, FIRST, rate), params, ts=np.array([0.0, 3.0]), rtol=1e-11)
+        at, expected = traj.switches.q, exact(params)
+        assert len(traj.switches) == 3
+        np.testing.assert_allclose(at["theta"][:2], [expected.slips, expected.leaves], rtol=1e-11)
+        np.testing.assert_allclose(at["r"][2] * np.cos(at["theta"][2]), expected.lands, rtol=1e-11)
+        angles.append(at["theta"][:2])
+    assert angles[0][0] > angles[1][0] + 0.1 and angles[0][1] > angles[1][1] + 0.01
+
+
+def blocks(count: int) -> lj.System:
+    """Blocks of height 1, one on the other; a force pulls at the lowest."""
+
+    def lagrangian(t, q, v, p):
+        return jnp.sum(p["m"] * (0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]))
+
+    under = lambda x, ground: jnp.concatenate([jnp.array([ground]), x[:-1]])
+    touch = [
+        lj.Contact(
+            lambda t, q, p, i=i: (q["y"] - under(q["y"], -0.5))[i] - 1.0,
+            friction=lambda p, i=i: p["mu"][i],
+            sliding=lambda t, q, v, p, i=i: (v["x"] - under(v["x"], 0.0))[i],
+        )
+        for i in range(count)
+    ]
+    pull = lambda t, q, v, p: {"x": jnp.zeros(count).at[0].set(p["pull"]), "y": jnp.zeros(count)}
+    return lj.System(lagrangian, force=pull, elements={str(i): x for i, x in enumerate(touch)})
+
+
+@pytest.mark.exhaustive
+def test_a_block_on_a_moving_block():
+    """The upper block slides on the lower one until both have one speed, and then they stop together, or go on where
+    the floor is smooth. Twin: with another mass they meet elsewhere."""
+    system, mu, v0, m = blocks(2), 0.3, 4.0, np.array([2.0, 1.0])
+    q0 = {"x": np.zeros(2), "y": np.array([0.5, 1.5])}
+    start = q0, {"x": np.array([0.0, v0]), "y": np.zeros(2)}
+
+    def slides(floor: float, m=m):
+        params = {"m": m, "mu": np.array([floor, mu]), "pull": 0.0}
+        return moved(system, *start, params, ts=np.array([0.0, 0.3, 8.0]), rtol=1e-11)
+
+    for floor in (0.0, 0.05, 0.2):
+        traj = slides(floor)
+        lower = max(0.0, (mu * m[1] - floor * m.sum()) * G / m[0])
+        meet = v0 / (mu * G + lower)
+        together = lower * meet
+        np.testing.assert_allclose(traj.switches.t[0], meet, rtol=1e-10)
+        further = together * (8.0 - meet) if floor == 0 else together**2 / (2 * floor * G)
+        places = np.array([0.5 * lower, -0.5 * mu * G]) * meet**2 + [0.0, v0 * meet] + further
+        np.testing.assert_allclose(traj.q["x"][-1], places, rtol=1e-10)
+        np.testing.assert_allclose(traj.v["x"][-1], together if floor == 0 else 0.0, atol=1e-10)
+        assert len(traj.switches) == (1 if lower == 0 or floor == 0 else 2)
+        assert abs(slides(floor, np.array([1.0, 1.0])).q["x"][-1, 0] - places[0]) > 0.1 or lower == 0
+
+
+@pytest.mark.exhaustive
+def test_a_stack_of_five():
+    """At rest for 100 s without a switch; pulled at the bottom, the second and the fourth slide with those above them.
+    Twin: a pull that friction holds, and one a little above it, by which all move together."""
+    system = blocks(5)
+    q0 = {"x": np.zeros(5), "y": np.arange(5) + 0.5}
+    params = {"m": np.ones(5), "mu": np.array([0.1, 0.5, 0.45, 0.2, 0.3])}
+
+    def after(pull: float, until: float):
+        ts = np.array([0.0, 0.5 * until, until])
+        return moved(system, q0, at_rest(q0), params | {"pull": pull}, ts=ts, rtol=1e-11)
+
+    rests = after(0.0, 100.0)
+    assert not len(rests.switches) and np.asarray(rests.modes[-1]).tolist() == [1] * 5 + [2] * 5
+    np.testing.assert_allclose(rests.q["y"][-1], q0["y"], atol=1e-12)
+    np.testing.assert_allclose(rests.q["x"][-1], 0.0, atol=1e-12)
+    np.testing.assert_allclose([rests.multipliers[str(i)][-1] for i in range(5)], G * np.arange(5, 0, -1), rtol=1e-12)
+    # From the top: 4 and 5 get 0.2 g by the friction under them; 2 and 3 get 0.5·4 - 0.2·2 = 1.6 m g, less than what
+    # the friction between them can hold; the lowest 3.5 - 0.1·5 - 0.5·4 = 1 m g.
+    pulled = after(3.5 * G, 2.0)
+    np.testing.assert_allclose(pulled.v["x"][-1], 2.0 * G * np.array([1.0, 0.8, 0.8, 0.2, 0.2]), rtol=1e-11)
+    assert np.asarray(pulled.modes[-1])[5:].tolist() == [1, -1, 2, -1, 2]
+    held, more = after(0.499 * G, 2.0), after(0.501 * G, 2.0)
+    assert np.all(held.v["x"][-1] == 0)
+    np.testing.assert_allclose(more.v["x"][-1], 2.0 * 0.001 * G / 5, rtol=1e-10)
+
+
+@pytest.mark.exhaustive
+def test_the_rod_of_painleve():
+    """A rod that slides with its end ahead has no forces above μ = 4/3 at tan θ = 2; that is said with the contact and
+    this number. Twins: with less friction it stops, and with the end behind it slides."""
+    lagrangian = lambda t, q, v, mu: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["theta"] ** 2 / 12) - G * q["y"]
+    floor = lj.Contact(
+        lambda t, q, mu: q["y"] - jnp.sin(q["theta"]) / 2,
+        friction=lambda mu: mu,
+        sliding=lambda t, q, v, mu: v["x"] + jnp.sin(q["theta"]) / 2 * v["theta"],
+    )
+    rod = lj.System(lagrangian, elements={"floor": floor})
+    theta = np.arctan(2.0)
+    q0 = {"x": 0.0, "y": np.sin(theta) / 2, "theta": theta}
+
+    def slides(speed: float, mu: float):
+        return moved(rod, q0, {"x": speed, "y": 0.0, "theta": 0.0}, mu, ts=np.array([0.0, 0.005, 0.01]))
+
+    with pytest.raises(RuntimeError, match=r"(?s)'floor', which slides with 1.4, .* above 1.33333.*Painlevé.*Fix"):
+        slides(-1.0, 1.4)
+    assert np.asarray(slides(-1.0, 1.3).modes)[:, 1].tolist() == [-1, 2, 2]
+    assert np.asarray(slides(1.0, 1.4).modes)[:, 1].tolist() == [1, 1, 1]
+
+
+def in_contact(gap, y: float, rail=None):
+    """A mass point at rest in the plane, at (0, y), with one contact."""
+    lagrangian = lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
+    held = {} if rail is None else {"rail": lj.Holonomic(rail)}
+    system, q0 = lj.System(lagrangian, held, elements={"floor": lj.Contact(gap)}), {"x": 0.0, "y": y}
+    return moved(system, q0, at_rest(q0), ts=np.array([0.0, 0.1]))
+
+
+@pytest.mark.parametrize("gap", [lambda t, q, p: jnp.floor(q["y"]), lambda t, q, p: jnp.where(q["y"] > 0, 1.0, -1.0)])
+def test_a_gap_without_derivative(gap):
+    """It is refused by name."""
+    with pytest.raises(ValueError, match="(?s)gap of element 'floor' has no derivative.*floor.*comparison.*Fix"):
+        in_contact(gap, 0.5)
+
+
+@pytest.mark.exhaustive
+def test_a_start_inside():
+    """It is refused with the nearest state outside; where a constraint fixes the gap, that is said instead."""
+    gap = lambda t, q, p: q["y"] + 0.5 * q["x"] - 1.0
+    with pytest.raises(ValueError, match=r"(?s)'floor' = -0.5 is below.*nearest.* q0 = \(x = 0.2, y = 0.9\)"):
+        in_contact(gap, 0.5)
+    with pytest.raises(ValueError, match="(?s)constraints 'rail' fix the gap 'floor' = -0.5.*leave out the contact"):
+        in_contact(lambda t, q, p: q["y"] - 1.0, 0.5, lambda t, q, p: q["y"] - 0.5)
