@@ -16,7 +16,19 @@ from typing import TYPE_CHECKING
 # isort: split
 # A system: its Lagrangian and its constraints.
 from lagjax.mechanics import Generator, NoetherCharge, noether_charge
-from lagjax.system import Contact, Elements, Friction, Holonomic, Hybrid, Nonholonomic, Stop, Switch, System
+from lagjax.system import (
+    CompliantContact,
+    Contact,
+    Elements,
+    Friction,
+    Holonomic,
+    Hybrid,
+    Nonholonomic,
+    SampledControl,
+    Stop,
+    Switch,
+    System,
+)
 
 # isort: split
 # One state: quantities from the Lagrangian and the constraints.
@@ -193,8 +205,10 @@ __all__ = [
     "Hybrid",
     "Switch",
     "Contact",
+    "CompliantContact",
     "Friction",
     "Stop",
+    "SampledControl",
     "Elements",
     "touches",
     "releases",

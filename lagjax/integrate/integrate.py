@@ -168,9 +168,10 @@ def integrate(
     ts = arguments.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, with_rates(system, q0, v0), params)
     dtype = state.t.dtype
-    system = traced_phases(system if start is None else system.starting(start), state)
+    system = traced_phases(system if start is None else system.starting(start), state, ts[-1])
     for phase in system.phases:
-        warn_of_odd_dissipation(phase.dissipation, state)
+        given = state._replace(params=system.given(state.params)) if system.in_phases else state
+        warn_of_odd_dissipation(phase.dissipation, given)
     crossings, left = crossings_of(events, event), left_to_diffrax(event)
     if system.in_phases:
         refuse_beside_switches(system, state, ts, adjoint, event)

@@ -4,7 +4,7 @@ from lagjax.mechanics.accelerations import accelerations, accelerations_at, cons
 from lagjax.mechanics.consistent_state import consistent_state, free_coordinates, unreachable_ahead
 from lagjax.mechanics.diagnosis import dependencies, describe, explain_failure, listed, where
 from lagjax.mechanics.equations import Equations, all_finite, equations_of
-from lagjax.mechanics.first_order import completed, of_states, with_first_order
+from lagjax.mechanics.first_order import completed, of_states, resolved, with_first_order
 from lagjax.mechanics.generators import AXES, Generator, as_generator, points, turned
 from lagjax.mechanics.indefinite_mass import IndefiniteMass, indefinite_mass
 from lagjax.mechanics.lagrangian import (

@@ -5,7 +5,7 @@ from lagjax.system.argument_checks import SYSTEMS, by_name, check_system
 from lagjax.system.check_functions import checked, prepare, traced_call, traced_system
 from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.coordinates import PrecisionWarning, State, is_traced
-from lagjax.system.elements import Contact, Elements, Friction, Stop
+from lagjax.system.elements import CompliantContact, Contact, Elements, Friction, Held, SampledControl, Stop
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.system.hybrid import Hybrid, Switch, replace_fields
 from lagjax.system.model import FirstOrder, Form, InModes, Model, given_in, model_of, unchecked

@@ -1,8 +1,10 @@
 """Elements: contacts and dry friction, which a person writes down in a line each.
 
-    Contact     a gap that may close: impact, rest, sliding, letting go
-    Friction    Coulomb's friction on a sliding velocity
-    Stop        a contact at each end of the way of a coordinate
+    Contact             a gap that may close: impact, rest, sliding, letting go
+    CompliantContact    a spring and a damper behind a gap, which push and do not pull
+    Friction            Coulomb's friction on a sliding velocity
+    Stop                a contact at each end of the way of a coordinate
+    SampledControl      a controller that acts at instants and holds its output between them
 
 A `System` with elements moves in modes: each gap is open or closed, and each sliding velocity slides to one side,
 or sticks, or is free since its gap is open. `integrate` finds the modes that fit the state and changes them.
@@ -38,7 +40,7 @@ class Friction(eqx.Module):
       with friction of its own. The force acts along `∂sliding/∂v`.
     - `coefficient`: μ of sliding: a number, a function of `params`, or `mu(speed, params)` (Stribeck's law).
     - `normal`: the normal force N: a number, a function of (t, q, v, params), or the name of a constraint whose
-      multiplier it is, above zero where it presses.
+      multiplier it is, above zero where it presses, or of a contact among the elements.
     - `static`: μ of sticking, a number or a function of `params`; by default `coefficient`, at speed zero.
 
     **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force.
@@ -115,14 +117,7 @@ class Contact(eqx.Module):
         slower_than: ArrayLike = 1e-6,
     ):
         _check_function("gap", gap, "(t, q, params)", 'q["y"]')
-        if (friction is None) != (sliding is None):
-            given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
-            raise ValueError(
-                f"{given} is given, but {missing} is not: friction needs a coefficient and a velocity.\n"
-                'Fix: lj.Contact(gap, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
-            )
-        if sliding is not None:
-            _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
+        _check_pair(friction, sliding)
         for role, number in (("restitution", restitution), ("friction", friction), ("static", static)):
             _check_not_negative(role, number)
         self.gap, self.restitution, self.sliding = gap, _number(restitution), sliding
@@ -176,6 +171,120 @@ class StopGaps(eqx.Module):
         return jnp.stack(ends + ([self.high - x] if self.high is not None else []))
 
 
+class CompliantContact(eqx.Module):
+    """A spring and a damper behind a gap: F = k d + c d' at the depth d = -gap, while both d and F are above zero.
+
+    It pushes and does not pull: a damped contact lets go before its gap opens. Velocities do not jump.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> free = lambda t, q, v, params: 0.5 * v**2
+    >>> ball = lj.System(free, elements={"mat": CompliantContact(lambda t, q, params: q, stiffness=100.0)})
+    >>> traj = lj.integrate(ball, 1.0, -1.0, ts=jnp.array([0.0, 1.0 + jnp.pi / 20, 2.0]))
+    >>> print(traj.q[1].round(9), traj.multipliers["mat"][1].round(9), traj.v[2].round(9))
+    -0.1 10.0 1.0
+
+    **Arguments:**
+
+    - `gap`: `gap(t, q, params)`, above zero as long as nothing touches: a number, or (k,) for k gaps.
+    - `stiffness`, `damping`: k > 0 and c ≥ 0, `[L]/[gap]²` and `[L] [t]/[gap]²`: numbers, functions of `params`, or
+      functions of `(depth, params)`. Hertz's law is `lambda depth, params: params["k"] * depth**0.5`, and Hunt and
+      Crossley's damping `lambda depth, params: params["c"] * depth**1.5`.
+    - `friction`, `sliding`, `static`: as for `lj.Contact`, with F as the normal force.
+
+    F is `traj.multipliers` of the element's name.
+
+    **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a stiffness that is
+    not above zero, a damping below zero, and for friction without a sliding velocity.
+
+    Source: Schwager & Pöschel, Granular Matter 9 (2007) 465 (Eq. 8, the end of a damped contact); Hunt & Crossley, J.
+    Appl. Mech. 42 (1975) 440.
+    """
+
+    gap: Callable
+    stiffness: Callable | ArrayLike
+    damping: Callable | ArrayLike
+    friction: Callable | ArrayLike | None
+    sliding: Callable | None
+    static: Callable | ArrayLike | None
+
+    def __init__(
+        self,
+        gap: Callable,
+        stiffness: Callable | ArrayLike,
+        damping: Callable | ArrayLike = 0.0,
+        friction: Callable | ArrayLike | None = None,
+        sliding: Callable | None = None,
+        static: Callable | ArrayLike | None = None,
+    ):
+        _check_function("gap", gap, "(t, q, params)", 'q["y"]')
+        _check_pair(friction, sliding)
+        for role, number in (("damping", damping), ("friction", friction), ("static", static)):
+            _check_not_negative(role, number)
+        _check_above_zero("stiffness", stiffness, "a spring that pulls, or none: a rigid contact is lj.Contact(gap)")
+        self.gap, self.sliding = gap, sliding
+        self.stiffness, self.damping, self.friction, self.static = map(_number, (stiffness, damping, friction, static))
+
+    def __repr__(self):
+        return f"CompliantContact({'smooth' if self.friction is None else 'with friction'})"
+
+
+class SampledControl(eqx.Module):
+    """A controller that acts at instants and holds its output between them, as a state of the element's name.
+
+    The state is read as `q[name]` in L, forces and elements, and is constant between instants; at the instants
+    offset + k every, k = 0, 1, ..., it becomes `controller(t, q, v, params)`.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> brake = SampledControl(lambda t, q, v, params: -v["x"], every=0.5)
+    >>> cart = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 + q["u"] * q["x"], elements={"u": brake})
+    >>> traj = lj.integrate(cart, {"x": 0.0, "u": 0.0}, {"x": 1.0}, ts=jnp.array([0.0, 0.25, 0.5, 0.75]))
+    >>> print(traj.q["u"].round(9), traj.v["x"].round(9))
+    [-1.  -1.  -0.5 -0.5] [1.    0.75  0.5   0.375]
+
+    **Arguments:**
+
+    - `controller`: `controller(t, q, v, params)` -> like `q[name]`, whose entry in `q0` holds before the first instant.
+      A controller with memory reads its own last output there. Controllers that act at one instant all read what was
+      before it.
+    - `every`, `offset`: the time between instants, and the first one, `[t]`: numbers, or functions of `params`. A start
+      of the motion at an instant is one.
+
+    At an output that is an instant, `traj.q[name]` is the new value; the end of the motion is none, so that it may be
+    continued from there. An instant is a switch of the motion (`traj.switches`): `lj.Elements(most_switches=)` makes
+    room for them, and `lj.integrate` for those that it can count, if `every`, `offset` and `ts` are numbers.
+
+    **Raises:** `TypeError` for a controller that is no function; `ValueError` for `every` that is not above zero.
+
+    Source: Åström & Wittenmark, *Computer-Controlled Systems*, §2.3 (zero-order hold).
+    """
+
+    controller: Callable
+    every: Callable | ArrayLike
+    offset: Callable | ArrayLike
+
+    def __init__(self, controller: Callable, every: Callable | ArrayLike, offset: Callable | ArrayLike = 0.0):
+        _check_function("controller", controller, "(t, q, v, params)", '-params["gain"] * v["x"]')
+        _check_above_zero("every", every, "a rate, 1 / every, in place of the time between two instants")
+        self.controller, self.every, self.offset = controller, _number(every), _number(offset)
+
+    def __repr__(self):
+        return "SampledControl()"
+
+
+class Held(eqx.Module):
+    """The rate of a held output: zero."""
+
+    name: str = eqx.field(static=True)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
+        return jnp.zeros_like(q[self.name])
+
+
+Element = Contact | CompliantContact | Friction | SampledControl
+
+
 class Elements(Mapping):
     """Elements by name, with how their impacts are solved; a dict of them is the same with the defaults.
 
@@ -186,7 +295,7 @@ class Elements(Mapping):
 
     **Arguments:**
 
-    - `elements`: by name, `Contact` or `Friction`.
+    - `elements`: by name, `Contact`, `CompliantContact`, `Friction`, `SampledControl`.
     - `impacts`: where several contacts are struck at once: "sequential", one after the other, always the one that
       closes fastest (Newton's cradle sends on as many balls as came); or "simultaneous", all at once by Newton's law
       (in the cradle all balls move on).
@@ -197,7 +306,7 @@ class Elements(Mapping):
 
     def __init__(
         self,
-        elements: Mapping[str, Contact | Friction],
+        elements: Mapping[str, Element],
         impacts: str = "sequential",
         most_switches: int = MOST_SWITCHES,
     ):
@@ -207,10 +316,10 @@ class Elements(Mapping):
                 'Fix: elements={"floor": lj.Contact(gap)}.'
             )
         for name, element in elements.items():
-            if not isinstance(name, str) or not isinstance(element, Contact | Friction):
+            if not isinstance(name, str) or not isinstance(element, Element):
                 raise TypeError(
-                    f"element {name!r} is a {type(element).__name__}, and must be a lj.Contact or a lj.Friction with "
-                    'a name.\nFix: elements={"floor": lj.Contact(gap)}.'
+                    f"element {name!r} is a {type(element).__name__}, and must be a lj.Contact, lj.CompliantContact, "
+                    'lj.Friction or lj.SampledControl with a name.\nFix: elements={"floor": lj.Contact(gap)}.'
                 )
         if impacts not in IMPACTS:
             raise ValueError(f"impacts must be one of {', '.join(map(repr, IMPACTS))}, not {impacts!r}.")
@@ -219,7 +328,7 @@ class Elements(Mapping):
         self.by_name = dict(sorted(elements.items()))
         self.impacts, self.most_switches = impacts, most_switches
 
-    def __getitem__(self, name: str) -> Contact | Friction:
+    def __getitem__(self, name: str) -> Element:
         return self.by_name[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -252,6 +361,26 @@ def _check_function(role: str, function, arguments: str, example: str):
             f"{role} must be a function of {arguments}, not {type(function).__name__}.\n"
             f"Fix: {role}=lambda {arguments[1:-1]}: {example}"
         )
+
+
+def _check_pair(friction, sliding):
+    if (friction is None) != (sliding is None):
+        given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
+        raise ValueError(
+            f"{given} is given, but {missing} is not: friction needs a coefficient and a velocity.\n"
+            'Fix: lj.Contact(gap, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
+        )
+    if sliding is not None:
+        _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
+
+
+def _check_above_zero(role: str, number, cause: str):
+    if callable(number) or isinstance(number, Tracer):
+        return
+    given = np.asarray(number)
+    if not np.all(given > 0):
+        fix = np.where(given == 0, 1.0, abs(given))
+        raise ValueError(f"{role} = {number} is not above zero.\nUsual cause: {cause}.\nFix: {role}={fix}.")
 
 
 def _check_not_negative(role: str, number):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools import depends, numpy_of, varies
+from lagjax.system.elements import Held
 from lagjax.system.system import System
 from lagjax.system.traced_functions import Traced
 from lagjax.system.user_errors import Call
@@ -27,7 +28,12 @@ def _zeros_like(x: Any):
 
 def check_starts(states: Mapping, q: PyTree):
     """Raise where q is not a dict, or has no array of numbers by the name of a state."""
-    for name in states:
+    for name, rate in states.items():
+        if isinstance(rate, Held) and isinstance(q, Mapping) and name not in q:
+            raise ValueError(
+                f"q0 has no entry '{name}', the output of the lj.SampledControl of that name before its first instant; "
+                f"q has {', '.join(map(repr, q))}.\nFix: q0 = {{..., '{name}': 0.0}}; v0 may leave it out."
+            )
         if not isinstance(q, Mapping):
             raise ValueError(
                 f"state '{name}' has a name, and q has none: it is {'a number' if not np.ndim(q) else 'an array'}.\n"

@@ -20,7 +20,7 @@ from jaxtyping import PyTree
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
 from lagjax.system.constraints import Holonomic, Nonholonomic
-from lagjax.system.elements import Contact, Elements, Friction
+from lagjax.system.elements import Element, Elements, Held, SampledControl
 from lagjax.system.traced_functions import Traced
 
 # Packages that pickle any function, whatever its name: they write down what it does.
@@ -97,7 +97,8 @@ class System(eqx.Module):
       the state as `q[name]`; the force and events also its rate, as `v[name]`. No force acts on it. See
       `docs/states.md`.
 
-    - `elements`: by name, contacts and friction (`lj.Contact`, `lj.Friction`, `lj.Stop`); or `lj.Elements` of them.
+    - `elements`: by name, contacts, friction and sampled control (`lj.Contact`, `lj.CompliantContact`, `lj.Stop`,
+      `lj.Friction`, `lj.SampledControl`); or `lj.Elements` of them.
 
     Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
     functions can, that is if these are defined with `def` in a module.
@@ -121,7 +122,7 @@ class System(eqx.Module):
         force: Callable | None = None,
         dissipation: Callable | None = None,
         states: Mapping[str, Callable] | None = None,
-        elements: Elements | Mapping[str, Contact | Friction] | None = None,
+        elements: Elements | Mapping[str, Element] | None = None,
     ):
         if isinstance(lagrangian, System):
             raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
@@ -168,9 +169,9 @@ class System(eqx.Module):
         self.constraints = dict(sorted((constraints or {}).items()))
         self.force = force
         self.dissipation = dissipation
-        self.states = dict(sorted(states.items()))
         # None where there are none, so that nothing else has to ask.
         self.elements = (elements if isinstance(elements, Elements) else Elements(elements)) if elements else None
+        self.states = dict(sorted({**states, **_held(self.elements or {}, states)}.items()))
 
     def map(self, change: Callable[[Callable, str], Callable]) -> "System":
         """The system with `change(function, role)` in place of each of its functions, unchecked.
@@ -246,11 +247,25 @@ class System(eqx.Module):
             parts.append(f"force: {_name(self.force)}")
         if self.dissipation is not None:
             parts.append(f"dissipation: {_name(self.dissipation)}")
-        if self.states:
-            parts.append("states: " + ", ".join(self.states))
+        states = [name for name, rate in self.states.items() if not isinstance(rate, Held)]
+        if states:
+            parts.append("states: " + ", ".join(states))
         if self.elements is not None:
             parts.append("elements: " + ", ".join(f"{k} ({type(x).__name__})" for k, x in self.elements.items()))
         return by_line(f"System({'; '.join(parts)})")
+
+
+def _held(elements: Mapping, states: Mapping) -> dict[str, Held]:
+    """The outputs of sampled controls, as states that are constant."""
+    found = {name: Held(name) for name, element in elements.items() if isinstance(element, SampledControl)}
+    for name in found:
+        # A copy of a system has its held outputs already.
+        if not isinstance(states.get(name, found[name]), Held):
+            raise ValueError(
+                f"'{name}' is the name of a state and of a lj.SampledControl, whose output is a state of its name.\n"
+                "Fix: another name for one of them; the controller reads both from q."
+            )
+    return found
 
 
 def rate_of(state: str) -> str:

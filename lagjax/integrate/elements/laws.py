@@ -1,15 +1,18 @@
 """A system with elements as one system whose constraints and forces depend on modes.
 
 A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
-side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. The functions of the system take
-`InModes` in place of the parameters, so that one program serves all modes; constraints that do not hold are off.
+side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. A spring behind a gap is apart (0) or
+pressed (1), with a force (`compliant.py`). The functions of the system take `InModes` in place of the parameters, so
+that one program serves all modes; constraints that do not hold are off.
 
 The guard of a mode is above zero as long as it lasts:
 
     open: the gap        closed: λ_N        slides: ± the sliding velocity        sticks: μ N - |λ_T|
+    apart: -m            pressed: m
+
+Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
 """
 
-import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,18 +23,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
+from lagjax.integrate.elements.compliant import PRESSED, Compliant
+from lagjax.integrate.elements.sampled import Sampled
 from lagjax.integrate.jumps.find import OfParams
-from lagjax.jaxtools import depends
+from lagjax.jaxtools import depends, is_traced, stop_gradient
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
     WITH_MULTIPLIERS,
     Call,
+    CompliantContact,
     Contact,
     Elements,
+    Friction,
     Holonomic,
     InModes,
     Nonholonomic,
+    SampledControl,
     State,
     System,
     check_use,
@@ -84,36 +93,21 @@ class Tangent(eqx.Module):
         """The sliding velocities as a vector."""
         return jnp.ravel(self.sliding(t, q, v, params))
 
-    def normal_forces(self, t: Array, q: PyTree, v: PyTree, multipliers: dict, params: PyTree) -> Float[Array, " k"]:
-        """N of each."""
+    def normal_forces(self, t: Array, q: PyTree, v: PyTree, forces: dict, params: PyTree) -> Float[Array, " k"]:
+        """N of each; `forces`: multipliers, and what is compliant, by name."""
         count = self.at[1] - self.at[0]
         if self.source:
-            return jnp.broadcast_to(jnp.ravel(multipliers[self.source]), (count,))
+            return jnp.broadcast_to(jnp.ravel(forces[self.source]), (count,))
         found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
         return jnp.broadcast_to(jnp.ravel(jnp.asarray(found, t.dtype)), (count,))
 
     def kinetic(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """μ while it slides with this speed."""
-        return _coefficient(self.coefficient, speed, params)
+        return coefficient(self.coefficient, speed, params)
 
     def sticking(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """μ while it sticks."""
-        return _coefficient(self.coefficient if self.static is None else self.static, jnp.zeros_like(speed), params)
-
-
-def _coefficient(mu, speed: Array, params: PyTree) -> Array:
-    if callable(mu):
-        mu = mu(params) if len(takes_of_coefficient(mu)) == 1 else jax.vmap(lambda s: mu(s, params))(speed)
-    return jnp.broadcast_to(jnp.asarray(mu, speed.dtype), speed.shape)
-
-
-def takes_of_coefficient(mu: Callable) -> tuple[str, ...]:
-    """What a coefficient of friction takes: the parameters, or the speed before them."""
-    known = getattr(mu, "takes", None)
-    if known is not None:
-        return known
-    needed = [x for x in inspect.signature(mu).parameters.values() if x.default is x.empty]
-    return ("params",) if len(needed) == 1 else ("speed", "params")
+        return coefficient(self.coefficient if self.static is None else self.static, jnp.zeros_like(speed), params)
 
 
 class Masked(eqx.Module):
@@ -130,11 +124,12 @@ class Masked(eqx.Module):
         return jnp.where(on.reshape(jnp.shape(value)), value, 0.0)
 
 
-class WithFriction(eqx.Module):
-    """The force of a system with that of everything that slides."""
+class WithElements(eqx.Module):
+    """The force of a system with those of everything that slides, or is pressed."""
 
     force: Callable | None
     tangents: tuple[Tangent, ...]
+    compliant: tuple[Compliant, ...]
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
@@ -146,25 +141,29 @@ class WithFriction(eqx.Module):
 
     def by_element(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
         """The forces that elements add, each like q, by the names of their modes: of friction, while it slides."""
-        found, params = {}, given.params
+        found, params, forces = {}, given.params, dict(multipliers)
+        for law in self.compliant:
+            forces[law.name], found[law.name] = law.push(t, q, v, given)
         for law in self.tangents:
             mode = given.modes[slice(*law.at)]
             side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
-            size = law.kinetic(side * slip, params) * law.normal_forces(t, q, v, multipliers, params)
+            size = law.kinetic(side * slip, params) * law.normal_forces(t, q, v, forces, params)
             found[law.name] = back(-side * size)[0]
         return found
 
 
 class Laws(eqx.Module):
-    """The elements of a system with their places among the modes, normal ones first.
+    """The elements of a system with their places among the modes: normals, tangents, compliant ones, sampled controls.
 
-    `rows` (k,): which of the stacked constraint equations belongs to each mode. `owners` (k_T,): for each sliding
-    velocity the gap whose force is its normal force, -1 if it is another.
+    `rows` (k,): which of the stacked constraint equations belongs to each normal and tangent. `owners` (k_T,): for each
+    sliding velocity the gap whose force is its normal force, -1 if it is another.
     """
 
     normals: tuple[Normal, ...]
     tangents: tuple[Tangent, ...]
+    compliant: tuple[Compliant, ...]
+    sampled: tuple[Sampled, ...]
     rows: tuple[int, ...] = eqx.field(static=True)
     owners: tuple[int, ...] = eqx.field(static=True)
     equations: int = eqx.field(static=True)
@@ -176,17 +175,45 @@ class Laws(eqx.Module):
         return len(self.rows) - len(self.owners), len(self.owners)
 
     @property
+    def size(self) -> int:
+        """The number of modes."""
+        return self.guarded + len(self.sampled)
+
+    @property
+    def guarded(self) -> int:
+        """The number of modes that have guards."""
+        return self.compliant[-1].at[1] if self.compliant else len(self.rows)
+
+    @property
+    def kinds(self) -> dict[str, int]:
+        """How many modes are those of gaps, of springs and of controls."""
+        return {"gaps": self.count[0], "springs": self.guarded - len(self.rows), "controls": len(self.sampled)}
+
+    @property
+    def is_sampled(self) -> np.ndarray:
+        """Which modes are those of sampled controls."""
+        return np.arange(self.size) >= self.guarded
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The name of each mode."""
-        return tuple(
+        guarded = tuple(
             law.name + (f"[{i}]" if law.at[1] - law.at[0] > 1 else "")
-            for law in (*self.normals, *self.tangents)
+            for law in (*self.normals, *self.tangents, *self.compliant)
             for i in range(law.at[1] - law.at[0])
         )
+        return guarded + tuple(law.name for law in self.sampled)
 
-    def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " k"]:
-        """Which laws are constraints in these modes."""
-        return jnp.where(np.arange(modes.shape[-1]) < self.count[0], modes == CLOSED, modes == STICKS)
+    def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " kNT"]:
+        """Which of the normals and tangents are constraints in these modes."""
+        of_rows = modes[..., : len(self.rows)]
+        return jnp.where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
+
+    def rubs(self, modes: Int[Array, " k"]) -> Bool[Array, " kT"]:
+        """Which sliding velocities are not free for that the spring that presses them is apart."""
+        pressed = {law.name: modes[slice(*law.at)] == PRESSED for law in self.compliant}
+        found = [jnp.broadcast_to(pressed.get(law.source, True), (law.at[1] - law.at[0],)) for law in self.tangents]
+        return jnp.concatenate([*found, jnp.zeros(0, bool)])
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
         """The parameters in these modes; rows of modes, (..., k), give rows of the rest."""
@@ -194,10 +221,20 @@ class Laws(eqx.Module):
         off = off.at[..., np.array(self.rows, int)].set(~self.holds(modes))
         return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
 
+    def in_rows(self, given: InModes, modes: Int[Array, " kNT"]) -> InModes:
+        """The same with these modes of normals and tangents."""
+        return self.given(given.params, jnp.concatenate([modes, given.modes[len(self.rows) :]]))
+
+    def at_first(self, t: Array, params: PyTree) -> InModes:
+        """The parameters at the start of a motion, with all gaps open."""
+        instants = [jnp.reshape(law.first(t, params), 1) for law in self.sampled]
+        return self.given(params, jnp.concatenate([jnp.zeros(self.guarded, int), *instants]))
+
     def all_closed(self) -> dict[str, Int[Array, " k"]]:
         """All gaps closed, by whether what can slide sticks or slides."""
         gaps, slips = self.count
-        return {words: jnp.array([CLOSED] * gaps + [mode] * slips, int) for words, mode in ALL_CLOSED.items()}
+        rest = [PRESSED] * (self.guarded - gaps - slips) + [0] * len(self.sampled)
+        return {words: jnp.array([CLOSED] * gaps + [mode] * slips + rest, int) for words, mode in ALL_CLOSED.items()}
 
     def in_numbers(self, state: State) -> dict[str, Array]:
         """What the laws are besides the functions of the system, by role, at a state."""
@@ -211,20 +248,72 @@ class Laws(eqx.Module):
             ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
             mu = law.sticking(ones, state.params), law.kinetic(ones, state.params), law.kinetic(2 * ones, state.params)
             found[f"the coefficients of '{law.name}'"] = jnp.concatenate(mu)
+        for law in self.compliant:
+            ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
+            both = (coefficient(f, x * ones, state.params) for f in (law.stiffness, law.damping) for x in (1, 2))
+            found[f"stiffness and damping of '{law.name}'"] = jnp.concatenate([*both])
+        for law in self.sampled:
+            acts = jnp.ravel(law.controller(state.t, state.q, state.v, state.params))
+            found[f"the controller of '{law.name}'"] = acts
+            found[f"the instants of '{law.name}'"] = jnp.stack([law.instant(k, state.t, state.params) for k in (0, 1)])
         return found
 
     def last(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> Float[Array, " k"]:
         """The guard of each mode: above zero, or no farther below than its slack, as long as the mode lasts."""
-        params, found = given.params, []
+        params, found, forces = given.params, [], multipliers | self.forces(t, q, v, given)
         for law in self.normals:
             force = jnp.ravel(multipliers[law.name])
             found.append(jnp.where(given.modes[slice(*law.at)] == CLOSED, force, law.gaps(t, q, params)))
         for law in self.tangents:
             mode, slips = given.modes[slice(*law.at)], law.slips(t, q, v, params)
-            most = law.sticking(slips, params) * law.normal_forces(t, q, v, multipliers, params)
+            most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params)
             holds = most - jnp.abs(jnp.ravel(multipliers[law.name]))
             found.append(jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips)))
-        return jnp.concatenate(found)
+        for law in self.compliant:
+            found.append(law.last(t, q, v, given))
+        return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
+
+    def pressed(
+        self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"]
+    ) -> tuple[InModes, Float[Array, " kC"]]:
+        """The parameters in the modes of what is compliant, and the slack of these modes (`Compliant.after`)."""
+        modes, slack = given.modes, [jnp.zeros(0, t.dtype)]
+        for law in self.compliant:
+            own, reach = law.after(t, q, v, given, fired[slice(*law.at)], sizes)
+            modes = modes.at[slice(*law.at)].set(own.astype(modes.dtype))
+            slack.append(reach)
+        return self.given(given.params, modes), jnp.concatenate(slack)
+
+    def forces(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> dict[str, Array]:
+        """F of what is compliant, by name."""
+        return {law.name: jnp.reshape(law.forces(t, q, v, given), law.shape) for law in self.compliant}
+
+    def acted(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> tuple[PyTree, InModes]:
+        """q and the modes after the instants at this time, if any."""
+        new, modes = {}, given.modes
+        for law in self.sampled:
+            k = modes[law.place]
+            acts = law.acts(k, t, given.params)
+            new[law.name] = jnp.where(acts, law.controller(t, q, v, given.params), q[law.name])
+            modes = modes.at[law.place].add(acts)
+        return ({**q, **new} if new else q), self.given(given.params, modes, given.slack)
+
+    def instants(self, start: Array, end: Array, params: PyTree) -> int:
+        """How many instants there are from the start to the end; zero where that is not known while JAX is tracing."""
+        counted = [law.first(end, params) - law.first(start, params) for law in self.sampled]
+        return 0 if is_traced(counted) else int(sum(counted))
+
+    def next_instant(self, modes: Int[Array, " k"], ts: Float[Array, " T"], params: PyTree) -> Float[Array, ""]:
+        """The first of the next instants; infinite where none comes before the end. One that is an output, within
+        round-off, is that."""
+        found = jnp.asarray(jnp.inf, ts.dtype)
+        for law in self.sampled:
+            t = law.instant(modes[law.place], ts[-1], params)
+            near = jnp.abs(ts - t) <= law.slack(t, params)
+            output = jnp.max(jnp.where(near, ts, -jnp.inf))
+            t = t + stop_gradient(jnp.where(jnp.any(near), output - t, 0.0))
+            found = jnp.where((t < ts[-1]) & (t < found), t, found)
+        return found
 
 
 class OneGuard(eqx.Module):
@@ -250,21 +339,22 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
             "a force that takes multipliers cannot stand beside elements.\n"
             'Fix: lj.Friction(sliding, coefficient, normal="name of the constraint") among the elements.'
         )
-    normals, tangents, owners = _laws(system.elements, plain, start)
+    normals, tangents, owners, compliant, sampled = _laws(system.elements, plain, start)
     # As constraints are, contacts are no place for states.
-    as_constraints = {law.name: Holonomic(law.gap) for law in normals}
+    as_constraints = {law.name: Holonomic(law.gap) for law in (*normals, *compliant)}
     as_constraints |= {law.name: Nonholonomic(law.sliding) for law in tangents}
     check_use(replace(plain, constraints=as_constraints, force=None))
     constraints: dict[str, Any] = {name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()}
     constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
     constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
     force = None if plain.force is None else OfParams(plain.force)
-    if tangents:
-        force = WithFriction(plain.force, tangents)
+    if tangents or compliant:
+        force = WithElements(plain.force, tangents, compliant)
     dissipation = None if plain.dissipation is None else OfParams(plain.dissipation)
     states = {name: OfParams(f) for name, f in plain.states.items()}
     masked = System(OfParams(plain.lagrangian), constraints, force, dissipation, states)
-    count = (tangents or normals)[-1].at[1]
+    guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
+    count = max(guarded, default=0) + len(sampled)
     # The order of the stacked equations is known only with their shapes.
     given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))
     form = model_of(masked, *start[:3], given).form
@@ -273,45 +363,51 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
         places[residual.name] = range(first, first + residual.size)
         first += residual.size
     rows = tuple(place for law in (*normals, *tangents) for place in places[law.name])
-    return masked, Laws(normals, tangents, rows, owners, form.m, system.elements.impacts)
+    return masked, Laws(normals, tangents, compliant, sampled, rows, owners, form.m, system.elements.impacts)
 
 
 def _laws(elements: Elements, plain: System, start: State):
-    given: dict[str, Any] = dict(zip(OF_STATE, start)) | {"speed": start.t}
-    place, normals, tangents, owners = 0, [], [], []
+    given: dict[str, Any] = dict(zip(OF_STATE, start)) | {"speed": start.t, "depth": start.t}
+    place, normals, tangents, owners, compliant, sampled = 0, [], [], [], [], []
+    with_friction = (Contact, CompliantContact)
 
     def traced(name: str, role: str, f, takes: tuple[str, ...], shape: tuple | None = None):
         if not callable(f):
             return f
         return traced_call(Call(role, f, takes, f" of element '{name}'"), given, lambda call, x: _check(call, x, shape))
 
+    def coefficients(name: str, of: str, **laws):
+        takes = {role: takes_of_coefficient(f, of) if callable(f) else () for role, f in laws.items()}
+        return [traced(name, role, f, takes[role], ()) for role, f in laws.items()]
+
+    gaps = {
+        name: traced(name, "gap", element.gap, OF_POSITION)
+        for name, element in elements.items()
+        if isinstance(element, with_friction)
+    }
+    for name, gap in gaps.items():
+        _check_name(name, plain)
+        _check_slope(name, gap, *start)
     for name, contact in elements.items():
         if not isinstance(contact, Contact):
             continue
-        _check_name(name, plain)
-        gap = traced(name, "gap", contact.gap, OF_POSITION)
-        _check_slope(name, gap, *start)
+        gap = gaps[name]
         e, size = traced(name, "restitution", contact.restitution, ("speed",), ()), _size(gap)
         normals.append(Normal(name, gap, e, contact.slower_than, (place, place + size)))
         place += size
     for name, element in elements.items():
-        smooth = isinstance(element, Contact) and element.sliding is None
-        if smooth:
+        if isinstance(element, SampledControl) or isinstance(element, with_friction) and element.sliding is None:
             continue
-        own = isinstance(element, Contact)
-        mu = element.friction if isinstance(element, Contact) else element.coefficient
-        mu, static = (
-            traced(name, "coefficient", f, takes_of_coefficient(f) if callable(f) else (), ())
-            for f in (mu, element.static)
-        )
-        of_gap = [law for law in normals if own and law.name == name]
-        shape = jnp.shape(of_gap[0].gap.program.value) if of_gap else None
+        own = isinstance(element, with_friction)
+        mu = element.friction if isinstance(element, with_friction) else element.coefficient
+        mu, static = coefficients(name, "speed", coefficient=mu, static=element.static)
+        shape = jnp.shape(gaps[name].program.value) if own else None
         sliding = traced(name, "sliding", element.sliding, OF_STATE, shape)
         check_linear(sliding, *start)
-        normal = None if isinstance(element, Contact) else element.normal
+        normal = element.normal if isinstance(element, Friction) else None
         source = name if own else normal if isinstance(normal, str) else ""
         if not own:
-            known = [*plain.constraints, *(law.name for law in normals)]
+            known = [*plain.constraints, *gaps]
             if source and source not in known:
                 raise ValueError(
                     f"normal='{source}' of element '{name}' is no constraint and no contact; there "
@@ -328,7 +424,20 @@ def _laws(elements: Elements, plain: System, start: State):
         source_of = [law for law in normals if law.name == source]
         owners += [source_of[0].at[0] + i if source_of else -1 for i in range(size)]
         place += size
-    return tuple(normals), tuple(tangents), tuple(owners)
+    for name, element in elements.items():
+        if isinstance(element, CompliantContact):
+            k, c = coefficients(name, "depth", stiffness=element.stiffness, damping=element.damping)
+            size = _size(gaps[name])
+            shape = jnp.shape(gaps[name].program.value)
+            compliant.append(Compliant(name, gaps[name], k, c, (place, place + size), shape))
+            place += size
+    for name, element in elements.items():
+        if isinstance(element, SampledControl):
+            every, offset = coefficients(name, "speed", every=element.every, offset=element.offset)
+            controller = traced(name, "controller", element.controller, OF_STATE, jnp.shape(start.q[name]))
+            sampled.append(Sampled(name, controller, every, offset, place))
+            place += 1
+    return tuple(normals), tuple(tangents), tuple(owners), tuple(compliant), tuple(sampled)
 
 
 def check_linear(sliding: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):

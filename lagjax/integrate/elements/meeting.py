@@ -29,7 +29,7 @@ from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem,
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
-from lagjax.mechanics import mass_and_forcing, solve_saddle_point, with_first_order
+from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
 from lagjax.numerics import independent_rows
 from lagjax.system import InModes, Model, System, constraints, coordinates, model_of
 
@@ -86,14 +86,20 @@ class Meeting(eqx.Module):
     system: System
     laws: Laws
 
-    def __call__(self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"]) -> tuple[Met, Int[Array, ""]]:
-        """What happens at the end of a leg, and the first of the modes that end there."""
+    def __call__(
+        self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"], instant: Bool[Array, ""]
+    ) -> tuple[PyTree, Met, Int[Array, ""]]:
+        """What happens at the end of a leg: q, and the first of the modes that end there, or are at an `instant`."""
         guards = self.laws.last(end.t, end.q, end.v, end.multipliers, given)
-        least = jnp.argmin(guards / jnp.where(given.slack > 0, given.slack, 1.0))
-        zero = jnp.where(self.laws.holds(given.modes), -given.slack / 2, 0.0)
-        fired = (guards <= zero) | (jnp.arange(guards.size) == least)
-        met = self.met(end.t, end.q, end.v, given, fired, sizes)
-        return met, least.astype(jnp.int32)
+        size = jnp.where(given.slack > 0, given.slack, 1.0)[: guards.size]
+        least = jnp.argmin(jnp.concatenate([guards / size, jnp.full(1, jnp.inf)]))
+        holds = jnp.concatenate([self.laws.holds(given.modes), jnp.zeros(guards.size - len(self.laws.rows), bool)])
+        zero = jnp.where(holds, -given.slack[: guards.size] / 2, 0.0)
+        fired = (guards <= zero) | (jnp.arange(guards.size) == least) & ~instant
+        q, after = self.laws.acted(end.t, end.q, end.v, given)
+        acts = after.modes[guards.size :] != given.modes[guards.size :]
+        first = jnp.where(instant, guards.size + jnp.argmax(jnp.append(acts, True)), least)
+        return q, self.met(end.t, q, end.v, after, fired, sizes), first.astype(jnp.int32)
 
     def met(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"],
@@ -114,22 +120,28 @@ class Meeting(eqx.Module):
         )
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
+        given, reach = laws.pressed(t, q, model.tree(u), given, fired, rows.sizes(sizes))
         met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
         u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
         by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
-        slack = jnp.where(self.laws.holds(met.modes), met.slack, by_motion)
-        return Met(model.tree(u), met.modes, stop_gradient(slack), met.found)
+        slack = jnp.where(laws.holds(met.modes), met.slack, by_motion)
+        slack = jnp.concatenate([slack, reach, jnp.zeros(len(laws.sampled), x.dtype)])
+        # The rates of states are those of the new velocities.
+        after = laws.in_rows(given, met.modes)
+        u = resolved(model.of(after), t, x, u)
+        return Met(model.tree(u), after.modes, stop_gradient(slack), met.found)
 
-    def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Met:
-        """The modes that fit the start of a motion; gaps that close are left to their guards."""
-        none = jnp.zeros(len(self.laws.rows), bool)
+    def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
+        """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
+        none = jnp.zeros(self.laws.guarded, bool)
+        q, given = self.laws.acted(t, q, v, self.laws.at_first(t, params))
         sizes = stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
-        return self.met(t, q, v, self.laws.given(params, none.astype(int)), none, sizes, impacts=False)
+        return q, self.met(t, q, v, given, none, sizes, impacts=False)
 
     def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
         normals, tangents = self.laws.count
         modes = jnp.array([CLOSED] * normals + [STICKS] * tangents, int)
-        return with_first_order(model_of(self.system, t, q, v, self.laws.given(given.params, modes)))
+        return with_first_order(model_of(self.system, t, q, v, self.laws.in_rows(given, modes)))
 
     def _rows(self, model: Model, t: Array, x: Array, u: Array, given: InModes) -> Rows:
         every, mine = constraints.jacobian(model, t, x, u), np.array(self.laws.rows, int)
@@ -139,14 +151,16 @@ class Meeting(eqx.Module):
         jacobian, held = every[mine], every[always]
         independent = independent_rows(held)
         still = jnp.zeros(held.shape[0], x.dtype)
-        root_mass = jnp.sqrt(jnp.max(jnp.abs(mass), axis=1))
+        # What has no inertia says nothing about the sizes of what has.
+        light = model.form.first_order.mask(model.n) if model.form.first_order else np.zeros(model.n, bool)
+        root_mass = jnp.where(light, 0.0, jnp.sqrt(jnp.max(jnp.abs(mass), axis=1)))
         every = jnp.concatenate([jacobian, linear.forcing[None]])
         response, added = jax.vmap(lambda row: solve_saddle_point(mass, held, row, still, independent))(every)
         return Rows(jacobian, response[:-1], jacobian @ response[:-1].T, added[:-1], root_mass, response[-1])
 
     def _free(self, model: Model, given: InModes) -> Model:
         """The model with all gaps open."""
-        return model.of(self.laws.given(given.params, jnp.zeros(len(self.laws.rows), int)))
+        return model.of(self.laws.in_rows(given, jnp.zeros(len(self.laws.rows), int)))
 
     def _slopes(self, model: Model, t: Array, x: Array, u: Array) -> Array:
         return constraints.velocity_residual(model, t, x, u)[np.array(self.laws.rows, int)]
@@ -246,7 +260,9 @@ class Meeting(eqx.Module):
         scale: Array,
     ) -> Met:  # fmt: skip
         """The modes after a meeting, by the forces at accelerations."""
-        laws, (normals, _) = self.laws, self.laws.count
+        laws, (normals, _), count = self.laws, self.laws.count, len(self.laws.rows)
+        if not count:
+            return Met(model.tree(u), given.modes[:0], jnp.zeros(0, x.dtype), jnp.asarray(True))
         model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
         q, v, params = model.tree(x), model.tree(u), given.params
         every = constraints.acceleration_rows(model, t, x, u)
@@ -266,7 +282,7 @@ class Meeting(eqx.Module):
         touching = closed & (jnp.abs(slopes[:normals]) <= jnp.maximum(slower, still[:normals]))
         slips = slopes[normals:]
         slides = jnp.where(jnp.abs(slips) > still[normals:], jnp.sign(slips), 0.0)
-        constant, of_forces = self._normal_forces(t, q, v, params, model, multipliers, rows, always)
+        constant, of_forces = self._normal_forces(t, q, v, given, model, multipliers, rows, always)
         mu_slides, mu_sticks = (self._coefficients(t, q, v, params, slips, sticking) for sticking in (False, True))
         problem = ContactProblem(
             rows.matrix, free, touching, of_forces, constant, jnp.where(slides != 0, mu_slides, mu_sticks), slides
@@ -278,7 +294,8 @@ class Meeting(eqx.Module):
         slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
         # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
         # may open far more slowly than by its own response, since others stay closed.
-        nothing = jnp.where(fired & self.laws.holds(given.modes), LET_GO * given.slack, slack) / problem.step
+        let_go = fired[:count] & laws.holds(given.modes)
+        nothing = jnp.where(let_go, LET_GO * given.slack[:count], slack) / problem.step
         # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
         pushes = forces > problem.step * accelerations
         stays = touching & (pushes[:normals] | (accelerations[:normals] <= nothing[:normals]))
@@ -289,13 +306,13 @@ class Meeting(eqx.Module):
         starts = jnp.where(moves, jnp.where(most > 0, -jnp.sign(pushed), jnp.sign(accelerations[normals:])), 0.0)
         side = jnp.where(slides != 0, slides, starts).astype(int)
         owners = np.array(laws.owners, int)
-        present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], True)
+        present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], laws.rubs(given.modes))
         tangent_modes = jnp.where(present, jnp.where(side != 0, side, STICKS), FREE)
         modes = jnp.concatenate([normal_modes, tangent_modes]).astype(given.modes.dtype)
         return Met(v, modes, slack, found)
 
     def _normal_forces(
-        self, t: Array, q: PyTree, v: PyTree, params: PyTree, model: Model, multipliers: Array, rows: Rows, always
+        self, t: Array, q: PyTree, v: PyTree, given: InModes, model: Model, multipliers: Array, rows: Rows, always
     ) -> tuple[Array, Array]:
         """N of each sliding velocity as `constant + of_forces @ λ`."""
         constant, of_forces = [], []
@@ -310,7 +327,7 @@ class Meeting(eqx.Module):
                 continue
             gaps = [normal for normal in self.laws.normals if normal.name == law.source]
             if not gaps:
-                constant += [*law.normal_forces(t, q, v, {}, params)]
+                constant += [*law.normal_forces(t, q, v, self.laws.forces(t, q, v, given), given.params)]
             else:
                 constant += [jnp.zeros((), t.dtype)] * count
             unit = np.eye(len(self.laws.rows))
@@ -321,6 +338,8 @@ class Meeting(eqx.Module):
 
     def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, modes: Array) -> Array:
         """The impulses that move velocities onto what holds."""
+        if not self.laws.rows:
+            return jnp.zeros(0, x.dtype)
         on = self.laws.holds(modes)
         left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))

@@ -33,7 +33,7 @@ class InElements(Hybrid):
         """The parameters in these modes, or in rows of modes; without any, with all gaps open."""
         if isinstance(params, InModes):
             return params
-        return self.laws.given(params, jnp.zeros(len(self.laws.rows), int) if modes is None else modes)
+        return self.laws.given(params, jnp.zeros(self.laws.size, int) if modes is None else modes)
 
     def cases(self, params: PyTree) -> dict[str, PyTree]:
         """The parameters where every contact holds, and where every one that can slide does."""
@@ -47,20 +47,24 @@ class InElements(Hybrid):
         return repr(self.user)
 
 
-def assembled(system: System, start: State) -> InElements:
-    """The assembly, with all functions checked and traced."""
+def assembled(system: System, start: State, until: Array | None) -> InElements:
+    """The assembly for a motion until then, with all functions checked and traced."""
     assert system.elements is not None
     masked, laws = in_modes(system, start)
-    hybrid = Hybrid({MOTION: masked}, most_switches=system.elements.most_switches)
+    most = system.elements.most_switches
+    if until is not None and (instants := laws.instants(start.t, until, start.params)):
+        # A power of two, so that a few instants more do not compile again.
+        most = 1 << (most + instants - 1).bit_length()
+    hybrid = Hybrid({MOTION: masked}, most_switches=most)
     return without_init(InElements, vars(hybrid) | {"laws": laws, "user": system})
 
 
 def only_phase(assembly: InElements, start: State, events: Mapping[str, Crossing]) -> Phase:
     """The guard of all modes, and those of the recorded events; what happens where modes change."""
-    laws = assembly.laws
+    laws, guarded = assembly.laws, bool(assembly.laws.guarded)
     modes = EventKind("modes", -1, terminal=True, most=1, takes_multipliers=True, long=True, holds=True)
     recorded = guards_of(events, assembly.user, start) if events else Guards((), ())
-    functions = (OneGuard(laws), *(OfParams(guard) for guard in recorded.functions))
-    guards = Guards(functions, (modes, *recorded.kinds))
+    functions = (OneGuard(laws),) * guarded + tuple(OfParams(guard) for guard in recorded.functions)
+    guards = Guards(functions, (modes,) * guarded + recorded.kinds) if functions else None
     meeting = Meeting(assembly.systems[0], laws)
-    return Phase(guards, (0,), np.zeros((1, 2), np.int32), (), tuple(events), meeting)
+    return Phase(guards, (0,) * guarded, np.zeros((1, 2), np.int32), (), tuple(events), meeting)

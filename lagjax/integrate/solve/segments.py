@@ -94,6 +94,17 @@ class Phase(NamedTuple):
     events: tuple[str, ...]
     meeting: Any = None
 
+    @property
+    def has_instants(self) -> bool:
+        """Whether legs end at instants of sampled controls, too."""
+        return self.meeting is not None and bool(self.meeting.laws.sampled)
+
+    def until(self, modes: "Modes | None", ts: Array, params: PyTree) -> Float[Array, ""]:
+        """The next instant."""
+        if modes is None:
+            return jnp.asarray(jnp.inf, ts.dtype)
+        return self.meeting.laws.next_instant(modes.modes, ts, params)
+
     def given(self, params: PyTree, modes: "Modes | None") -> PyTree:
         """What the functions of the phase take as `params`."""
         return params if modes is None else self.meeting.laws.given(params, *modes)
@@ -190,8 +201,9 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
     met, modes = None, None
     if phase.meeting is not None:
-        met = phase.meeting.first(ts[0], q0, v0, params)
+        q0, met = phase.meeting.first(ts[0], q0, v0, params)
         v0, modes = met.v, Modes(met.modes, met.slack)
+        multipliers = multipliers | phase.meeting.laws.forces(ts[0], q0, v0, phase.given(params, modes))
     of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
     rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
     none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q0, v0), room)
@@ -200,7 +212,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
         modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
-        gaps=0 if modes is None else phase.meeting.laws.count[0],
+        **({} if modes is None else phase.meeting.laws.kinds),
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
@@ -225,23 +237,35 @@ def _leg(
     adjoint: Any,
 ) -> PhaseWay:  # fmt: skip
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
+    until = phase.until(way.modes, ts, params)
     system, params = hybrid.systems[i], phase.given(params, way.modes)
     # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
     # still.
     place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
     ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
-    times = jnp.where(in_phase, ahead, way.t)
+    times = jnp.where(in_phase, jnp.minimum(ahead, until), way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
     result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
     after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
-    if phase.guards is not None and phase.switches:
-        crossings = [found["events"][kind.name] for kind in phase.guards.kinds]
-        when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-        uncertain = in_phase & jnp.any(jnp.stack([x.uncertain for x in crossings[: len(phase.switches)]]))
-        ending = apart(_ending, phase, result, end, when, in_phase, way, params, resolution(ts), settings.rtol)
+    rows, known = {name: found[name] for name in ROWS}, (ts > way.t) & (ts <= end.t)
+    if phase.meeting is not None:
+        forces = jax.vmap(partial(phase.meeting.laws.forces, given=params))
+        rows["multipliers"] = rows["multipliers"] | forces(times, rows["q"], rows["v"])
+    instant = in_phase & jnp.isfinite(until) & (result == RESULTS.successful)
+    if phase.guards is not None and phase.switches or phase.has_instants:
+        count, terminal = len(phase.switches), () if phase.guards is None else phase.guards.terminal
+        crossings = [] if phase.guards is None else [events[kind.name] for kind in phase.guards.kinds]
+        when = [jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings]
+        of_events = [t for t, ends in zip(when[count:], terminal[count:]) if ends]
+        when = [*when[:count], *[jnp.where(instant, until, jnp.inf)] * phase.has_instants]
+        uncertain = in_phase & reduce(jnp.logical_or, (x.uncertain for x in crossings[:count]), jnp.asarray(False))
+        times_of = jnp.stack(when), jnp.stack([*of_events, jnp.asarray(jnp.inf, ts.dtype)])
+        ending = apart(
+            _ending, phase, result, end, times_of, in_phase, instant, way, params, resolution(ts), settings.rtol
+        )  # fmt: skip
         result, end, onward = ending.result, ending.end, ending.onward
-        after, target, switches = apart(_switched, system, ending, params, phase, way)
+        after, target, switches = apart(_switched, system, ending, params, phase, way, instant)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
         # A motion in the wrong phase is wrong from that phase's start on, its first output included.
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
@@ -252,15 +276,21 @@ def _leg(
             onward = onward & after.found
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
-    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
-    known = (ts > way.t) & (ts <= end.t) | (way.switches.count == 0) & (ts <= way.t)
+    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], rows)
+    known = known | (way.switches.count == 0) & (ts <= way.t)
+    of_modes = None if way.modes is None else way.modes.modes[None]
+    if phase.has_instants:
+        # Outputs at instants have the new values.
+        new = instant & onward & (ts == until)
+        of_modes = jnp.where(phase.meeting.laws.is_sampled[None] & new[:, None], after.modes.modes[None], of_modes)
+        rows["q"] = jax.tree.map(lambda x, y: jnp.where(like(new, x), y[None], x), rows["q"], after.q)
     known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
     end = end._replace(multipliers=unknown(way.end.multipliers) | end.multipliers)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     further = PhaseWay(
         t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
-        rows=_filled(way.rows, in_phase & known, rows, i, way.modes), switches=switches,
+        rows=_filled(way.rows, in_phase & known, rows, i, of_modes), switches=switches,
         events=with_those_of(events, way.events),
         end=where(onward, end._replace(q=after.q, v=after.v), end),
         stats={name: n + found["stats"][name] for name, n in way.stats.items()},
@@ -281,34 +311,35 @@ class PhaseEnding(NamedTuple):
 
 
 def _ending(
-    phase: Phase, result, end: Snapshot, when: Array, in_phase: Array, way: PhaseWay, params: PyTree, resolution: Array,
-    rtol: Array,
+    phase: Phase, result, end: Snapshot, when: tuple[Array, Array], in_phase: Array, instant: Array, way: PhaseWay,
+    params: PyTree, resolution: Array, rtol: Array,
 ) -> PhaseEnding:  # fmt: skip
-    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
-    assert phase.guards is not None
-    count, at_one_time, at_start = len(phase.switches), AT_ONCE * resolution, way.switches.count == 0
+    """Find out what ends a leg; `when`: the times at which its guards, and events that end the motion, cross, infinite
+    for those that do not; `instant`: whether it ends at one of a sampled control."""
+    at_one_time, at_start = AT_ONCE * resolution, way.switches.count == 0
     # An event that ends the motion at the time of a switch comes first.
-    ending = jnp.where(phase.guards.terminal, when, jnp.inf)[count:]
-    when = when[:count]
-    by_event = jnp.any(ending <= jnp.min(when) + at_one_time)
-    switched = in_phase & (result == RESULTS.event_occurred) & ~by_event
+    when, of_events = when
+    by_event = jnp.any(of_events <= jnp.min(when) + at_one_time)
+    switched = in_phase & ((result == RESULTS.event_occurred) & ~by_event | instant)
     at_once = switched & (end.t - way.t <= at_one_time)
     # A switch at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
-    is_below = _is_below(end, params, phase.guards, count, rtol)
+    is_below = _is_below(end, params, phase.guards, len(phase.switches), rtol)
     refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
-    onward = switched & ~refused & ~full
-    failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
     missed = (result == RESULTS.successful) & is_below
+    onward = switched & ~refused & ~full & ~missed
+    failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
     return PhaseEnding(onward, first, end, result)
 
 
-def _is_below(end: Snapshot, params: PyTree, guards: Guards, count: int, rtol: Array):
+def _is_below(end: Snapshot, params: PyTree, guards: Guards | None, count: int, rtol: Array):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
+    if guards is None or not count:
+        return jnp.asarray(False)
     state = stop_gradient(tuple(end))
     g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(params))[:count]), state, uneven(state))
     return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
@@ -319,14 +350,14 @@ def reached(q: PyTree):
     return jnp.isfinite(jax.vmap(lambda q: jnp.sum(coordinates.flatten(q)[0]))(q))
 
 
-def _filled(rows: OutputRows, known: Array, found, i: int, modes: Modes | None) -> OutputRows:
+def _filled(rows: OutputRows, known: Array, found, i: int, modes: Array | None) -> OutputRows:
     """Return the outputs, with those of a leg in phase i where they are `known`."""
 
     def put(all, new):
         return jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
 
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
-    of_modes = None if modes is None else jnp.where(known[:, None], modes.modes[None], rows.modes)
+    of_modes = None if modes is None else jnp.where(known[:, None], modes, rows.modes)
     phase = jnp.where(known, i, rows.phase)
     return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, phase, of_modes)
 
@@ -341,17 +372,18 @@ class After(NamedTuple):
     found: Bool[Array, ""] | None = None
 
 
-def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay):
+def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay, instant: Array):
     """Return the state after the phase's first switch, the next phase, and the record with that switch."""
     onward, first, end, _ = ending
-    number = jnp.asarray(phase.switches, jnp.int32)[first]
     if phase.meeting is None:
+        number = jnp.asarray(phase.switches, jnp.int32)[first]
         states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
         after = jax.tree.map(lambda *x: _one_of(first, x), *states)
     else:
         sizes = jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v))
-        met, number = phase.meeting(end, params, sizes)
-        after = After(end.q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
+        q, met, number = phase.meeting(end, params, sizes, instant)
+        first = jnp.zeros_like(first)
+        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     s = way.switches
@@ -365,7 +397,8 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         t=put(s.t, end.t), way=put(s.way, number), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
-        modes=None if after.modes is None else put(s.modes, after.modes.modes), gaps=s.gaps,
+        modes=None if after.modes is None else put(s.modes, after.modes.modes),
+        gaps=s.gaps, springs=s.springs, controls=s.controls,
     )  # fmt: skip
     return after, to, record
 

@@ -34,7 +34,7 @@ class Switches(eqx.Module):
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      of which the first `gaps` are those of gaps.
+      of which the first `gaps` are those of gaps, and the last ones those of `springs` and of sampled `controls`.
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -56,6 +56,8 @@ class Switches(eqx.Module):
     ways: tuple[str, ...] = eqx.field(static=True)
     modes: Int[Array, "S k"] | None = None
     gaps: int = eqx.field(static=True, default=0)
+    springs: int = eqx.field(static=True, default=0)
+    controls: int = eqx.field(static=True, default=0)
 
     def as_crossings(self) -> Crossings:
         """Return the switches as crossings of one guard, with the states before them."""
@@ -94,6 +96,11 @@ class Switches(eqx.Module):
         """A mode in a word; `way`: its place among the modes."""
         if way < self.gaps:
             return "closed" if mode else "open"
+        from_end = len(self.ways) - way
+        if from_end <= self.controls:
+            return "holds its output"
+        if from_end <= self.controls + self.springs:
+            return "pressed" if mode else "apart"
         return {0: "free", 2: "sticks"}.get(mode, "slides")
 
 
@@ -105,7 +112,7 @@ class HybridTrajectory(Trajectory):
     - `switches`: the `Switches`.
     - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
       `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
-      gap is open).
+      gap is open); of a spring 0 (apart) or 1 (pressed); of a sampled control the number of its next instant.
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
     - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces

@@ -1,0 +1,24 @@
+"""Coefficients of laws: a number, a function of the parameters, or of a speed or depth and the parameters."""
+
+import inspect
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+
+def coefficient(law, of: Array, params: PyTree) -> Array:
+    """The coefficient for each of the speeds, or depths, `of`."""
+    if callable(law):
+        law = law(params) if len(takes_of_coefficient(law)) == 1 else jax.vmap(lambda x: law(x, params))(of)
+    return jnp.broadcast_to(jnp.asarray(law, of.dtype), of.shape)
+
+
+def takes_of_coefficient(law: Callable, of: str = "speed") -> tuple[str, ...]:
+    """What a coefficient takes: the parameters, or `of` before them."""
+    known = getattr(law, "takes", None)
+    if known is not None:
+        return known
+    needed = [x for x in inspect.signature(law).parameters.values() if x.default is x.empty]
+    return ("params",) if len(needed) == 1 else (of, "params")
