@@ -326,8 +326,9 @@ class OneGuard(eqx.Module):
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        size = jnp.where(given.slack > 0, given.slack, 1.0)
-        return jnp.min((self.laws.last(t, q, v, multipliers, given) + given.slack) / size)
+        slack = given.slack[: self.laws.guarded]
+        size = jnp.where(slack > 0, slack, 1.0)
+        return jnp.min((self.laws.last(t, q, v, multipliers, given) + slack) / size)
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:

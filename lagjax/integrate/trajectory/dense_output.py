@@ -100,8 +100,22 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         _raise_not_continued(nodes.t, times, result._value, int(np.argmin(well)))
     for name, x in found.multipliers.items():
         x[rows] = new.multipliers[name] if name in multipliers else np.nan
+    if given is not None:
+        here = jax.tree.map(lambda x: x[: rows.size], (times, given.modes))
+        for name, x in of_springs(trajectory, here[0], new.q, new.v, here[1]).items():
+            found.multipliers[name][rows] = x
     for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
         old[rows] = x
+
+
+def of_springs(trajectory, times, q: PyTree, v: PyTree, modes) -> dict[str, Array]:
+    """The forces of compliant contacts at these states, by name."""
+    laws = trajectory.system.laws
+
+    def forces(t: Array, q: PyTree, v: PyTree, modes: Array) -> dict[str, Array]:
+        return laws.forces(t, q, v, laws.given(trajectory.params, modes))
+
+    return jax.vmap(forces)(times, q, v, modes) if laws.compliant else {}
 
 
 def _known_of(trajectory) -> Instants:

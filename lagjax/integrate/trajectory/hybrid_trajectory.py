@@ -87,6 +87,8 @@ class Switches(eqx.Module):
     def _happened(self, k: int) -> str:
         """What a mode does where it ends at switch k."""
         way = int(self.way[k])
+        if way >= len(self.ways) - self.controls:
+            return "acts"
         after = self.mode_in_words(way, int(np.asarray(self.modes)[k, way]))
         impulses = jax.tree.leaves(self.impulse)
         struck = way < self.gaps and any(np.any(np.asarray(x)[k]) for x in impulses)
