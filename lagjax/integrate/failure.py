@@ -61,7 +61,9 @@ STILL = 1e-12
 
 def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guards=None) -> NoReturn:
     """Raise the error of a failed motion; `start` is its first state, `guards` those of each phase."""
-    about_guards = of_guards(trajectory, guards)
+    # The guards of elements take modes, and are said in words of their own.
+    elements = trajectory.in_phases and trajectory.system.elements is not None
+    about_guards = "" if elements else of_guards(trajectory, guards)
     if trajectory.in_phases:
         _raise_in_phase(trajectory, start, settings, about_guards)
     _raise(trajectory, start, settings, about_guards)
