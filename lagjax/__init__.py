@@ -74,7 +74,7 @@ from lagjax.integrate import (
     sticks,
     touches,
 )
-from lagjax.numerics import RK4, Dopri8, Nystrom8, Nystrom12, Radau5, Tsit5
+from lagjax.numerics import RK4, Dopri8, Gauss, Nystrom8, Nystrom12, Radau5, Splitting, Tsit5
 from lagjax.steps import rollout, step
 from lagjax.system import PrecisionWarning
 
@@ -239,8 +239,10 @@ __all__ = [
     "Tsit5",
     "RK4",
     "Nystrom8",
+    "Gauss",
     "Nystrom12",
     "Radau5",
+    "Splitting",
     "Replay",
     "Trajectory",
     "HybridTrajectory",

@@ -28,6 +28,10 @@ lagjax.numerics.methods.runge_kutta
   Dopri8 Tsit5 RK4: in_a_loop
 lagjax.numerics.methods.nystrom
   Nystrom8 Nystrom12: in_a_loop
+lagjax.numerics.methods.gauss
+  Gauss: stages newton
+lagjax.numerics.methods.splitting
+  Splitting: order
 lagjax.numerics.methods.radau
   Radau5: root_finder root_find_max_steps step_powers
 lagjax.numerics.methods.radau

@@ -14,7 +14,8 @@ from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Trajectory
 from lagjax.jaxtools import is_traced, numpy_of, once
 from lagjax.mechanics import departures
-from lagjax.system import Model, State, coordinates, warn
+from lagjax.numerics import EqualSteps
+from lagjax.system import Hybrid, Model, State, System, coordinates, warn
 
 # From here on, with a network in L, Tsit5 is the default, with outputs inside its steps. Evaluations at rtol 1e-5 with
 # 21 outputs, by Tsit5, by it with outputs at ends of steps, and by Dopri8: 54, 132 and 286 (a slow motion), 324, 276
@@ -34,9 +35,9 @@ REFUSED = (RESULTS.start_not_finite, RESULTS.start_singular, RESULTS.contradicto
 
 def check_method(method: Any):
     """Raise unless `method` is None or an instance of a diffrax solver for a whole state."""
-    if method is None:
+    if method is None or isinstance(method, EqualSteps):
         return
-    if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver):
+    if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver | EqualSteps):
         raise TypeError(
             f"method must be a solver instance, and {method.__name__} is the class.\n"
             "Usual cause: missing brackets.\n"
@@ -53,6 +54,29 @@ def check_method(method: Any):
             f"{type(method).__name__} needs a vector field of a special form, and the accelerations of a general "
             "Lagrangian depend on q and v together.\nFix: method=diffrax.Dopri8(), or any method for one ODETerm."
         )
+
+
+def check_equal_steps(method: EqualSteps, dt0: Any, system: System | Hybrid, **others: Any):
+    """Raise unless steps of equal length are possible: their length is known, and nothing has to change it.
+
+    `others`: arguments that have no meaning for them, by name.
+    """
+    if dt0 is None:
+        raise ValueError(
+            f"lj.{method.label} makes steps of equal length, which is not given.\n"
+            "Fix: dt0=0.01, about a fiftieth of the shortest period."
+        )
+    if system.in_phases or getattr(system, "elements", None) is not None:
+        raise ValueError(
+            f"lj.{method.label} makes steps of equal length, and a motion in phases has steps that end at switches.\n"
+            "Fix: leave method out."
+        )
+    for name, given in others.items():
+        if given is not None:
+            raise ValueError(
+                f"{name} has no meaning for lj.{method.label}, whose steps have equal length throughout, and end at "
+                f"outputs alone.\nFix: leave {name} out; or method=lj.Dopri8()."
+            )
 
 
 def check_jumps(jumps: Any) -> str:

@@ -16,6 +16,7 @@ each fix.
 Source: Hairer & Wanner, *Solving ODEs II*, §IV.2 (stiffness and its detection).
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import diffrax
@@ -32,7 +33,7 @@ from lagjax.integrate.solve.programs import method_of
 from lagjax.integrate.stepping.projected_solver import Field
 from lagjax.integrate.stepping.tolerances import tolerances_at
 from lagjax.integrate.trajectory.error_report import of_a_step
-from lagjax.integrate.trajectory.results import RESULTS, is_among
+from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import jitted
 from lagjax.mechanics import (
@@ -43,6 +44,7 @@ from lagjax.mechanics import (
     indefinite_mass,
     unreachable_ahead,
 )
+from lagjax.numerics import EqualSteps, Gauss
 from lagjax.system import Model, State, coordinates
 
 # The number of steps that are examined, and the first of these, which only find their length.
@@ -161,6 +163,8 @@ def _of_controller(trajectory: Trajectory, settings: Settings):
     """The fix for steps of a user's controller: whether a shorter one can be taken from where it failed."""
     if settings.dt0 is None or not isinstance(settings.controller, diffrax.ConstantStepSize):
         return "leave stepsize_controller out: failed steps are then repeated, shorter"
+    if isinstance(settings.method, EqualSteps):
+        return _of_equal_steps(trajectory, settings)
     attempt, _, (t, y), direction = _attempts(trajectory, settings)
     for part in (2, 4, 8, 16, 32):
         h = float(settings.dt0) / part
@@ -168,6 +172,19 @@ def _of_controller(trajectory: Trajectory, settings: Settings):
         if np.all(np.isfinite(coordinates.flatten(after)[0])):
             return f"dt0={h:.3g}, which succeeds there; or leave stepsize_controller out"
     return f"leave stepsize_controller out: there even a step of dt0 / 32 = {float(settings.dt0) / 32:.3g} fails"
+
+
+def _of_equal_steps(trajectory: Trajectory, settings: Settings):
+    """The fix for equal steps, one of which was not solved: a shorter one that is."""
+    end, longest = trajectory.end, float(settings.dt0)
+    ts = end.t + np.sign(float(trajectory.t[-1] - end.t)) * np.array([0.0, longest], np.asarray(end.t).dtype)
+    newton = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else ""
+    for part in (2, 4, 8, 16, 32):
+        shorter = replace(settings, dt0=settings.dt0 / part, repeated_up_to=np.zeros((), np.int32))
+        found = trajectory.static.integrate(trajectory.system, end.q, end.v, trajectory.params, ts, None, shorter)
+        if is_among(found.result, ENDED_WELL):
+            return f"dt0={longest / part:.3g}, with which a step is solved there{newton}"
+    return f"look at the motion near its end: there even a step of dt0 / 32 = {longest / 32:.3g} is not solved{newton}"
 
 
 def _rounded_up(count: int):

@@ -32,6 +32,7 @@ from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
 from lagjax.mechanics import has_networks
+from lagjax.numerics import EqualSteps
 from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates, with_rates
 
 
@@ -45,7 +46,7 @@ def integrate(
     ts: Array | np.ndarray | Sequence[float],
     rtol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     atol: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
-    method: diffrax.AbstractSolver | None = None,
+    method: diffrax.AbstractSolver | EqualSteps | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: ArrayLike | None = None,
     max_step: ArrayLike | None = None,
@@ -98,9 +99,11 @@ def integrate(
       `rtol` counts as the default one. With these and with `lj.Tsit5()` small systems run on equations that are written
       out number by number, as they also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours;
       diffrax's other methods take 2 to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast,
-      and `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter.
+      and `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter. `lj.Gauss` and
+      `lj.Splitting` are symplectic, for long motions; their steps have the length `dt0`, whatever the tolerances are.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
-    - `dt0`: the length of the first step, `[t]`; needed with `diffrax.ConstantStepSize()`.
+    - `dt0`: the length of the first step, `[t]`; of all steps with `diffrax.ConstantStepSize()`, `lj.Gauss` and
+      `lj.Splitting`, which need it.
     - `max_step`: the longest step, `[t]`. Adaptive steps may miss what is narrower than they are, such as a short push
       or a thin barrier, without a warning. No step is longer than this, nor than the time between two
       exact outputs.
@@ -163,6 +166,14 @@ def integrate(
     """
     check_system(system, q0, v0, params, phases=True, elements=True)
     arguments.check_method(method)
+    if isinstance(method, EqualSteps):
+        fixed = isinstance(stepsize_controller, diffrax.ConstantStepSize)
+        arguments.check_equal_steps(
+            method, dt0, system, stepsize_controller=None if fixed else stepsize_controller, max_step=max_step, jump_ts=jump_ts,
+            events=events, event=event, adjoint=adjoint, outputs=outputs, start=start,
+            drift=None if drift == "project" else drift,
+        )  # fmt: skip
+        stepsize_controller = diffrax.ConstantStepSize()
     arguments.check_controller(stepsize_controller, max_step, jump_ts)
     arguments.check_max_steps(max_steps)
     ts = arguments.vector_of_times(ts)

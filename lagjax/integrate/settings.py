@@ -9,6 +9,8 @@ import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from lagjax.numerics import EqualSteps
+
 # A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
 # in a loop. In batches of a rod or a double pendulum copies are twice as fast. A single motion's step is a fifth slower
 # in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
@@ -24,7 +26,7 @@ PATIENCE = jax.make_user_context(default_value=None)
 class Settings:
     """How to integrate: everything but the system, the state and the times."""
 
-    method: diffrax.AbstractSolver | None
+    method: diffrax.AbstractSolver | EqualSteps | None
     controller: diffrax.AbstractStepSizeController | None
     event: diffrax.Event | None
     adjoint: diffrax.AbstractAdjoint | None
@@ -54,6 +56,8 @@ class Settings:
     outputs: str | None = eqx.field(static=True, default="exact")
     # Whether the tolerance is loose, as far as it is known while JAX traces.
     loose: bool = eqx.field(static=True, default=False)
+    # Whether this solve is for a derivative.
+    differentiated: bool = eqx.field(static=True, default=False)
     # A right-hand side of up to this many operations is copied to each of a method's stages.
     unroll_up_to: int = eqx.field(static=True, default=UNROLL_UP_TO)
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.adjoint.replay import Replay, replayed
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, with_room
+from lagjax.integrate.equal_steps.loop import stepped
 from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
@@ -53,7 +54,7 @@ from lagjax.mechanics import (
     within,
     worst_residual,
 )
-from lagjax.numerics import ExplicitRungeKutta, Nystrom, Radau5, SimplifiedNewton, with_tolerances
+from lagjax.numerics import EqualSteps, ExplicitRungeKutta, Nystrom, Radau5, SimplifiedNewton, with_tolerances
 from lagjax.system import State, System, coordinates, model_of
 
 # Packages whose checks at run time are known to pass, since `solve` examines their subjects itself.
@@ -91,7 +92,7 @@ def solved(
 
     `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
     """
-    ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom))
+    ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom, EqualSteps))
     # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
     fast = ours and settings.event is None
     equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
@@ -106,7 +107,9 @@ def solved(
     if settings.dt0 is not None:
         # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
-    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
+    if isinstance(settings.method, EqualSteps):
+        solution = _in_equal_steps(equations, start, ts, settings, adjoint)
+    elif guards is None or isinstance(adjoint, diffrax.ForwardMode):
         solution = _loop(equations, start, ts, guards, settings, adjoint)
     else:
         solution = _loop_twice(equations, start, ts, guards, settings, adjoint)
@@ -255,6 +258,18 @@ def _loop(
         (reached, end_t), (outputs, end_y) = reached, outputs
         end = end_t, end_y
     return Solution(reached, outputs, end, *rest)
+
+
+def _in_equal_steps(equations: Equations, start: Start, ts: Array, settings: Settings, adjoint: Any) -> Solution:
+    """The same in steps of equal length."""
+    assert isinstance(settings.method, EqualSteps) and settings.dt0 is not None
+    state = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
+    at = jnp.where(start.refused, ts[0], ts)
+    states, reached, count, end, result = stepped(
+        equations.model, settings.method, *state, at, settings.dt0, adjoint, settings.differentiated
+    )
+    stats = {"num_steps": count, "num_accepted_steps": count, "num_rejected_steps": jnp.zeros_like(count)}
+    return Solution(jnp.where(reached, ts, jnp.inf), states, end, stats, result, None)
 
 
 def _loop_twice(

@@ -22,6 +22,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.display import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
+from lagjax.integrate.equal_steps.suits import check_can_be_stepped
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
@@ -47,7 +48,7 @@ from lagjax.jaxtools import (
     takes_for_regular,
 )
 from lagjax.mechanics import has_networks, is_free_of_velocities
-from lagjax.numerics import Dopri8, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
+from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
 from lagjax.system import Model, State, System, model_of
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
@@ -173,7 +174,9 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
         # With guards to be watched a program is long anyway, and compiles a third faster without copies.
         unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
-        settings = replace(settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust)
+        settings = replace(
+            settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust, differentiated=differentiated
+        )
         fields = solve(*motion, settings, adjoint)
         if too_many is not None:
             fields["stats"] = with_lost(fields["stats"], too_many)
@@ -181,7 +184,9 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
 
     if settings.adjoint is None:
         # Each leg of a motion in phases is replayed separately.
-        fields = solve_in_both_modes(solve_arrays, x, fixed, recorded=solve is solved)
+        fields = solve_in_both_modes(
+            solve_arrays, x, fixed, recorded=solve is solved and not isinstance(method, EqualSteps)
+        )
     else:
         fields, _ = solve_arrays(x, fixed, settings.adjoint, True)
     arrays, described = pack((system, params, asked), how, trajectory_of)
@@ -211,7 +216,8 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
 
 
 def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):
-    name = type(method).__name__ + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
+    own = method.label if isinstance(method, EqualSteps) else type(method).__name__
+    name = own + ("" if asked is None or asked is method else " (diffrax's, in lagjax's form)")
     terms = diffrax.ODETerm(lambda t, y, args: y)
     chosen = "fixed" if isinstance(settings.controller, diffrax.ConstantStepSize) else "controller"
     # With many short legs the number of steps does not tell what chose them.
@@ -240,6 +246,9 @@ def method_of(settings: Settings, model: Model):
         if not pairs or not is_free_of_velocities(model):
             return Dopri8()
         return nystrom_for(model)
+    if isinstance(chosen, EqualSteps):
+        check_can_be_stepped(chosen, model)
+        return chosen
     if isinstance(chosen, Nystrom) and not is_free_of_velocities(model):
         cause = "there are constraints" if any(phase.m for phase in model.phases) else "these do"
         raise ValueError(

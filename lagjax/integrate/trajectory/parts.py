@@ -7,6 +7,7 @@ import diffrax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools import HashablePart, hashable_partition
+from lagjax.numerics import EqualSteps
 
 # The phase of an output that was not reached, and the number in unused places for switches.
 NO_PHASE = -1
@@ -40,7 +41,7 @@ class SolveInfo(NamedTuple):
 class SolveOptions(NamedTuple):
     """The other arguments of `integrate`, apart from the motion and its tolerances, as it takes them."""
 
-    method: diffrax.AbstractSolver | None
+    method: diffrax.AbstractSolver | EqualSteps | None
     stepsize_controller: diffrax.AbstractStepSizeController | None
     dt0: Array | None
     max_step: Array | None

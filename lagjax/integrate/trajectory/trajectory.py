@@ -26,6 +26,10 @@ from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
 from lagjax.system import Model, System, UnknownSystem, known_system, model_of
 
 
+# A line through fewer outputs says nothing of a drift.
+ENOUGH_FOR_A_SLOPE = 8
+
+
 class AccuracyWarning(UserWarning):
     """A motion was computed, and its own checks show that it is less accurate than its tolerance suggests."""
 
@@ -247,6 +251,8 @@ class Trajectory(eqx.Module):
         as_it_may = "" if changed_by is None else f"; need not be conserved: {changed_by}"
         drift = f"{float(self.drift()):.1e} (relative, at the outputs)"
         found.append(("change of the Jacobi integral", drift + as_it_may))
+        if self.static.how.steps == "fixed" and changed_by is None:
+            found += _of_slope(self)
         return found + of_events
 
     def _check_alone(self, call: str):
@@ -296,7 +302,7 @@ def _worst_residual(model: Model, t: Array, q: PyTree, v: PyTree):
 def _lines(traj) -> list[str]:
     """The printed lines of one motion."""
     rows = [
-        ("method", f"{traj.static.method}, rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"),
+        ("method", f"{traj.static.method}, {_lengths(traj)}"),
         ("result", message(traj.result) + _ended(traj)),
         *error_report.of_cost(traj),
         *(error_report.of_error(traj) or _not_estimated(traj)),
@@ -309,10 +315,33 @@ def _lines(traj) -> list[str]:
     return ["Trajectory", *_aligned(rows)]
 
 
+def _of_slope(traj):
+    """What fixed steps make of a Jacobi integral that stays constant: whether it only varies, or drifts."""
+    t, h = np.asarray(traj.t, float), np.asarray(traj.jacobi_integral(), float)
+    t, h = t[np.isfinite(h)], h[np.isfinite(h)]
+    if len(h) < ENOUGH_FOR_A_SLOPE:
+        return []
+    x = t - t.mean()
+    slope = x @ h / (x @ x)
+    rest = h - h.mean() - slope * x
+    uncertain = np.sqrt(rest @ rest / ((len(h) - 2) * (x @ x)))
+    return [
+        ("Jacobi integral", f"mean {h.mean():.12g}, varies by {np.ptp(rest) / 2:.1e}, "
+         f"drifts by {slope:.1e} ± {uncertain:.1e} per unit of time")
+    ]  # fmt: skip
+
+
 def _not_estimated(traj):
     if traj.error is None or is_among(traj.error.result, ENDED_WELL):
         return []
     return [("error", message(traj.error.result))]
+
+
+def _lengths(traj):
+    """What chose the steps."""
+    if traj.static.how.steps == "fixed":
+        return f"steps of {float(traj.asked.dt0):.6g}"
+    return f"rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"
 
 
 def _pair(tolerance):

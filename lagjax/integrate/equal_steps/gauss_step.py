@@ -1,0 +1,248 @@
+"""One step of the variational integrator by Gauss' quadrature (`numerics/methods/gauss.py`).
+
+The unknowns of a step are the velocities V_i at its nodes, the multipliers λ_j of constraints on positions at Lobatto's
+nodes but the last, and those of velocity constraints, μ_i, at Gauss' nodes. They are found by iteration. With what the
+momenta at node i, the positions and the velocities still lack, R_i, r_i, each node has the same small system with the
+matrices at the start of the step:
+
+    [M  -Aᵀ] [δV_i]   [R_i]
+    [A   0 ] [δκ_i] = [r_i]        κ = h ã λ, or h a μ: what the multipliers add to the momenta at the nodes
+
+The last multipliers of a step are those with which its velocity at the end satisfies the constraints. Positions and
+momenta carry what is lost when a step is added to them (compensated summation).
+
+Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VIII.6.1 (iteration), §VIII.5 (round-off).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from lagjax.jaxtools import stop_gradient
+from lagjax.mechanics import applied_force, mass_and_forcing
+from lagjax.numerics import Tableau, dense
+from lagjax.system import Model, constraints
+
+MOST_ITERATIONS = 60
+# A few iterations are made even if corrections grow at first.
+AT_LEAST = 4
+# A step is solved if the last correction is below this power of the round-off, in kinetic energy.
+SOLVED = 1.2
+# Or if it is below so many round-offs of positions, over the length of the step.
+ROUND_OFFS = 100
+# The corrections that make first and second derivatives right.
+CORRECTIONS = 2
+
+
+class Unknown(NamedTuple):
+    """V, and the multipliers of all constraints, of velocities at Gauss' nodes and of positions at Lobatto's."""
+
+    velocities: Float[Array, "s n"]
+    multipliers: Float[Array, "s m"]
+
+
+class Way(NamedTuple):
+    """The state between two steps.
+
+    `x_rest`, `p_rest`: what is to be added to x and p; `inverse`: of the matrix above; `round_off`: that of x, squared,
+    in the metric of M.
+    """
+
+    x: Float[Array, " n"]
+    x_rest: Float[Array, " n"]
+    p: Float[Array, " n"]
+    p_rest: Float[Array, " n"]
+    stages: Unknown
+    inverse: Float[Array, "nm nm"]
+    round_off: Float[Array, ""]
+    unsolved: Bool[Array, ""]
+
+
+class GaussStep(NamedTuple):
+    """Steps of a model. `newton`: solved by Newton's method; `differentiated`: whether derivatives will be taken."""
+
+    model: Model
+    tableau: Tableau
+    newton: bool
+    differentiated: bool
+
+    def first(self, t: Array, x: Array, u: Array) -> Way:
+        """The state at the start."""
+        s, none = len(self.tableau.nodes), jnp.zeros_like(x)
+        stages = Unknown(jnp.tile(u, (s, 1)), jnp.zeros((s, self.model.m), x.dtype))
+        return Way(x, none, self._momentum(t, x, u), none, stages, *self._matrices(t, x, u), jnp.asarray(False))
+
+    def advanced(self, way: Way, t: Array, h: Array) -> Way:
+        """The state after a step from t to t + h."""
+        tab, guess = self.tableau, way.stages
+        guess = Unknown(tab.ahead.astype(h.dtype) @ guess.velocities, guess.multipliers)
+        found, solved = self._solved(stop_gradient(way), *stop_gradient((t, h, guess)))
+        if self.differentiated:
+            found = self._with_derivatives(way, t, h, found)
+        at = self._at_nodes(way, t, h, found)
+        x, x_rest = added(way.x, way.x_rest + jnp.sum(at.moves, axis=0))
+        dp = way.p_rest + jnp.sum(at.kicks, axis=0) + jnp.sum(at.impulses, axis=0)
+        u = tab.at_end.astype(h.dtype) @ found.velocities
+        inverse, round_off = self._matrices(t + h, x, u)
+        if self.model.m:
+            u, dp = self._at_end(t + h, x, way.p, dp, u, inverse)
+        p, p_rest = added(way.p, dp)
+        return Way(x, x_rest, p, p_rest, found, inverse, round_off, way.unsolved | ~solved)
+
+    def velocity(self, way: Way, t: Array) -> Float[Array, " n"]:
+        """The velocity that belongs to the momentum."""
+        u = self.tableau.at_end.astype(t.dtype) @ way.stages.velocities
+        return self._at_end(t, way.x, way.p, way.p_rest, u, way.inverse)[0]
+
+    def _at_end(self, t: Array, x: Array, p: Array, dp: Array, u: Array, inverse: Array):
+        """The velocity at x with the momentum p + dp, and dp with the impulse that keeps it on the constraints."""
+        model = self.model
+        rows = constraints.jacobian(model, t, x, u)
+        for _ in range(CORRECTIONS):
+            lacks = dp + (p - self._momentum(t, x, u))
+            change = inverse @ jnp.concatenate([lacks, -constraints.velocity_residual(model, t, x, u)])
+            u, dp = u + change[: model.n], dp + change[model.n :] @ rows
+        return u, dp
+
+    def _momentum(self, t: Array, x: Array, u: Array) -> Array:
+        return jax.grad(self.model.lagrangian, argnums=2)(t, x, u)
+
+    def _momentum_and_push(self, t: Array, x: Array, u: Array) -> tuple[Array, Array]:
+        push, p = jax.grad(self.model.lagrangian, argnums=(1, 2))(t, x, u)
+        return p, push + applied_force(self.model, t, x, u)
+
+    def _matrices(self, t: Array, x: Array, u: Array) -> tuple[Array, Array]:
+        """The inverse of the matrix, and the round-off of x."""
+        t, x, u, model = stop_gradient((t, x, u, self.model))
+        mass = mass_and_forcing(model, t, x, u).mass
+        round_off = jnp.abs(x) @ jnp.abs(mass) @ jnp.abs(x) * jnp.finfo(x.dtype).eps ** 2
+        if not model.m:
+            return dense.inverse(mass), round_off
+        rows = constraints.jacobian(model, t, x, u)
+        matrix = jnp.block([[mass, -rows.T], [rows, jnp.zeros((model.m, model.m), x.dtype)]])
+        return dense.inverse(matrix), round_off
+
+    def _at_nodes(self, way: Way, t: Array, h: Array, z: Unknown) -> "AtNodes":
+        """What the path of these unknowns lacks."""
+        tab, model, dtype = self.tableau, self.model, h.dtype
+        times, parts, mixed = (
+            t + tab.nodes.astype(dtype) * h,
+            h * tab.weights.astype(dtype)[:, None],
+            tab.mixed.astype(dtype),
+        )
+        moves = parts * z.velocities
+        x = way.x[None] + (way.x_rest[None] + mixed @ moves)
+        momenta, pushes = jax.vmap(self._momentum_and_push)(times, x, z.velocities)
+        lacks, impulses = jnp.zeros_like(z.multipliers), jnp.zeros_like(momenta)
+        holonomic = model.holonomic
+        if not holonomic.all():
+            which = ~holonomic
+            rows = jax.vmap(lambda t, x, u: constraints.jacobian(model, t, x, u)[which])(times, x, z.velocities)
+            pushes = pushes + jnp.einsum("sm,smn->sn", z.multipliers[:, which], rows)
+            slopes = jax.vmap(lambda t, x, u: constraints.velocity_residual(model, t, x, u)[which])
+            lacks = lacks.at[:, which].set(-slopes(times, x, z.velocities))
+        kicks = parts * pushes
+        after = mixed @ kicks
+        if holonomic.any():
+            times, to_nodes = t + tab.lobatto_nodes.astype(dtype) * h, tab.to_nodes.astype(dtype)
+            at_ends = way.x[None] + (way.x_rest[None] + to_nodes[1:] @ moves)
+            starts = jnp.concatenate([way.x[None], at_ends[:-1]])
+            rows = jax.vmap(lambda t, x: constraints.jacobian(model, t, x, z.velocities[0])[holonomic])
+            forces = h * tab.lobatto_weights[:-1, None].astype(dtype) * z.multipliers[:, holonomic]
+            impulses = jnp.einsum("sm,smn->sn", forces, rows(times[:-1], starts))
+            after = after + (1 - to_nodes[:-1].T) @ impulses
+            gaps = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times[1:], at_ends)
+            lacks = lacks.at[:, holonomic].set(-_inverted(tab.inner_to_nodes, dtype) @ gaps / h)
+        short = way.p[None] + (way.p_rest[None] + after) - momenta
+        return AtNodes(momenta, moves, kicks, impulses, short, lacks)
+
+    def _solved(self, way: Way, t: Array, h: Array, guess: Unknown) -> tuple[Unknown, Bool[Array, ""]]:
+        """The unknowns, by iteration with the matrices at the start; and whether that came to an end."""
+        step = self._replace(model=stop_gradient(self.model))
+        small = jnp.finfo(h.dtype).eps
+        inverse = step._whole_inverse(way, t, h, guess) if self.newton else None
+
+        def better(state: tuple) -> tuple:
+            z, before, _, _, count = state
+            at = step._at_nodes(way, t, h, z)
+            du, dm, dk = step._change(way, h, at, inverse)
+            # In the metric of M: M δV = R + Aᵀ δκ, where forces change little.
+            size = jnp.abs(jnp.sum(du * at.short)) + jnp.abs(jnp.sum(dk * at.lacks))
+            motion = jnp.abs(jnp.sum(z.velocities * at.momenta))
+            return Unknown(z.velocities + du, z.multipliers + dm), size, before, motion, count + 1
+
+        def goes_on(state: tuple) -> Array:
+            _, size, before, motion, count = state
+            closer = (size < before) | (count < AT_LEAST)
+            return (size > small**2 * motion) & closer & (count < MOST_ITERATIONS)
+
+        infinite = jnp.asarray(jnp.inf, h.dtype)
+        start = better((guess, infinite, infinite, infinite, jnp.asarray(0)))
+        z, size, _, motion, _ = lax.while_loop(goes_on, better, start)
+        return z, size <= small**SOLVED * motion + ROUND_OFFS**2 * way.round_off / h**2
+
+    def _change(self, way: Way, h: Array, at: "AtNodes", inverse: Array | None) -> tuple[Array, Array, Array]:
+        """The changes of V and of the multipliers that give what is lacking, and δκ."""
+        n, lacks = self.model.n, jnp.concatenate([at.short, at.lacks], axis=1)
+        if inverse is None:
+            change = lacks @ way.inverse.T
+            return change[:, :n], self._multipliers(change[:, n:], h), change[:, n:]
+        s, m = at.lacks.shape
+        change = -inverse @ jnp.concatenate([at.short.ravel(), at.lacks.ravel()])
+        dm = change[s * n :].reshape(s, m)
+        return change[: s * n].reshape(s, n), dm, h * dm
+
+    def _multipliers(self, impulses: Array, h: Array) -> Array:
+        """The multipliers whose impulses at the nodes are these."""
+        if not self.model.m:
+            return impulses
+        tab, holonomic = self.tableau, self.model.holonomic
+        of_positions = _inverted(tab.of_forces, h.dtype) @ impulses / h
+        of_velocities = _inverted(tab.inner, h.dtype) @ impulses / h
+        return jnp.where(holonomic[None], of_positions, of_velocities)
+
+    def _whole_inverse(self, way: Way, t: Array, h: Array, found: Unknown) -> Array:
+        """The inverse of the derivative of all that is lacking by all unknowns."""
+        flat, unflatten = ravel_pytree(found)
+        return dense.inverse(jax.jacfwd(lambda flat: self._lacks(way, t, h, unflatten(flat)))(flat))
+
+    def _lacks(self, way: Way, t: Array, h: Array, z: Unknown) -> Array:
+        at = self._at_nodes(way, t, h, z)
+        return jnp.concatenate([at.short.ravel(), at.lacks.ravel()])
+
+    def _with_derivatives(self, way: Way, t: Array, h: Array, found: Unknown) -> Unknown:
+        """The same unknowns as a function of the state and the parameters: by Newton's method, which moves them by
+        round-off, and makes one more derivative right in each correction."""
+        still = self._replace(model=stop_gradient(self.model))
+        inverse = still._whole_inverse(*stop_gradient((way, t, h)), found)
+        flat, unflatten = ravel_pytree(found)
+        for _ in range(CORRECTIONS):
+            flat = flat - inverse @ self._lacks(way, t, h, unflatten(flat))
+        return unflatten(flat)
+
+
+class AtNodes(NamedTuple):
+    """Momenta at the nodes, the parts of the step, h b V and h b F, the impulses of constraints on positions, and what
+    momenta and constraints lack."""
+
+    momenta: Float[Array, "s n"]
+    moves: Float[Array, "s n"]
+    kicks: Float[Array, "s n"]
+    impulses: Float[Array, "s n"]
+    short: Float[Array, "s n"]
+    lacks: Float[Array, "s m"]
+
+
+def added(x: Array, dx: Array) -> tuple[Array, Array]:
+    """x + dx, and what is lost (Kahan's compensated summation)."""
+    new = x + dx
+    return new, dx - (new - x)
+
+
+def _inverted(matrix, dtype) -> Array:
+    return np.linalg.inv(matrix).astype(dtype)

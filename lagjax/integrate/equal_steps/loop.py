@@ -1,0 +1,88 @@
+"""The steps of a motion, all of one length between two outputs.
+
+An interval between two outputs is divided into the fewest equal steps that are no longer than `dt0`. Only outputs are
+kept. In reverse mode an interval is run again, from the state at its start, with the states of some of its steps.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.integrate.equal_steps.gauss_step import GaussStep
+from lagjax.integrate.equal_steps.splitting_step import SplittingStep
+from lagjax.jaxtools import one_function, where
+from lagjax.numerics import EqualSteps, Gauss, Splitting, tableau
+from lagjax.system import Model
+
+# Part of a step by which an interval may be longer than so many steps: outputs are rounded.
+ROUNDED = 1e-6
+# The states kept in reverse mode within an interval.
+CHECKPOINTS = 64
+
+
+def stepped(
+    model: Model, method: EqualSteps, q: PyTree, v: PyTree, ts: Float[Array, " T"], dt: Float[Array, ""], adjoint: Any,
+    differentiated: bool,
+):  # fmt: skip
+    """The states (q, v) at `ts`, which of these were reached, the number of steps, the last time and state (1,), and
+    the result."""
+    forward = isinstance(adjoint, diffrax.ForwardMode)
+
+    def steps(model: Model, q: PyTree, v: PyTree, ts: Array, dt: Array):
+        x, u = model.vectors(q, v)
+        step = _step_of(method, model, ts[0], x, u, differentiated)
+
+        def interval(way: Any, row: tuple[Array, Array]):
+            t0, t1 = row
+            count = jnp.ceil((t1 - t0) / dt - ROUNDED).astype(int)
+            count = jnp.where(way.unsolved, 0, jnp.where(t1 > t0, jnp.maximum(count, 1), 0))
+            h = (t1 - t0) / jnp.maximum(count, 1)
+
+            def goes_on(state: tuple) -> Array:
+                k, way = state
+                return (k < count) & ~way.unsolved
+
+            def one(state: tuple) -> tuple:
+                k, way = state
+                new = step.advanced(way, t0 + k * h, h)
+                # A step that was not solved is where the motion ends.
+                before = way._replace(unsolved=jnp.asarray(True))
+                return jnp.where(new.unsolved, k, k + 1), where(new.unsolved, before, new)
+
+            start = jnp.asarray(0), way
+            if forward:
+                k, way = lax.while_loop(goes_on, one, start)
+            else:
+                k, way = eqxi.while_loop(goes_on, one, start, kind="checkpointed", checkpoints=CHECKPOINTS)
+            t = jnp.where(way.unsolved, jnp.minimum(t0 + k * h, t1), t1)
+            return way, (t, way.x, step.velocity(way, t), way.unsolved, k)
+
+        if not forward:
+            interval = jax.checkpoint(interval, prevent_cse=False)
+        first = step.first(ts[0], x, u)
+        _, (times, xs, us, unsolved, counts) = lax.scan(interval, first, (ts[:-1], ts[1:]))
+        states = jax.tree.map(
+            lambda first, rows: jnp.concatenate([first[None], rows]), (q, v), (model.tree(xs), model.tree(us))
+        )
+        reached = jnp.concatenate([jnp.ones(1, bool), ~unsolved])
+        last = jnp.minimum(jnp.sum(reached), ts.size - 1)[None]
+        end = jnp.concatenate([ts[:1], times])[last], jax.tree.map(lambda x: x[last], states)
+        return states, reached, jnp.sum(counts), end
+
+    arguments = model, q, v, ts, dt
+    states, reached, count, end = one_function(steps, *arguments) if forward else steps(*arguments)
+    diverged = diffrax.RESULTS.nonlinear_divergence
+    result = diffrax.RESULTS.where(jnp.all(reached), diffrax.RESULTS.successful, diverged)
+    return states, reached, count, end, result
+
+
+def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, differentiated: bool):
+    if isinstance(method, Splitting):
+        return SplittingStep.of(model, method.order, t, x, u)
+    assert isinstance(method, Gauss)
+    return GaussStep(model, tableau(method.stages), method.newton, differentiated)

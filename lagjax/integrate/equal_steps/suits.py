@@ -1,0 +1,34 @@
+"""Whether a system can be stepped by a method of equal steps."""
+
+from lagjax.mechanics import is_free_of_velocities, structure, with_first_order
+from lagjax.numerics import EqualSteps, Splitting
+from lagjax.system import Model
+
+
+def check_can_be_stepped(method: EqualSteps, model: Model):
+    """Raise unless the method is made for systems like this one."""
+    first = with_first_order(model).form.first_order
+    if first is not None:
+        names = ", ".join(f"'{name}'" for name, is_first in zip(model.names, first.mask(model.n)) if is_first)
+        raise ValueError(
+            f"lj.{method.label} steps coordinates with a mass, and {names} have none: they are of first order.\n"
+            "Fix: leave method out."
+        )
+    if model.reacts:
+        raise ValueError(f"lj.{method.label} does not solve for forces that take multipliers.\nFix: leave method out.")
+    if isinstance(method, Splitting):
+        _check_can_be_split(model)
+
+
+def _check_can_be_split(model: Model):
+    """Raise unless L = T(v) - V(q), and forces do not depend on velocities."""
+    found = structure(model) if not model.m else None
+    depends = "" if found is None else ", ".join(found.mass_depends_on)
+    if model.m or depends or not is_free_of_velocities(model):
+        why = "there are constraints" if model.m else f"the mass matrix depends on {depends}" if depends else "they do"
+        raise ValueError(
+            "lj.Splitting is for L = T(v) - V(q) with a constant mass matrix and forces that do not depend on "
+            f"velocities, and {why}.\n"
+            "Usual cause: polar coordinates, joint angles, friction, a magnetic field, a rotating frame.\n"
+            "Fix: method=lj.Gauss(3), which takes any L."
+        )

@@ -1,0 +1,104 @@
+"""Explicit symplectic methods: the motion is split into drifts, x += a h v, and kicks, v += b h F(x)/M.
+
+    order 2     Störmer and Verlet
+    order 4, 6  Runge-Kutta-Nyström splittings with 6 and 11 kicks per step, made for F that does not depend on v
+    order 8     17 steps of order 2 after each other
+
+Each is symmetric, begins and ends with a kick, whose force serves two steps. The cost is that of its kicks.
+
+Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, Table 3 (orders 4 and 6); Kahan & Li, Math. Comput. 66
+(1997) 1089, s17odr8a (order 8).
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from lagjax.numerics.methods.gauss import EqualSteps
+
+# The first coefficients, kicks and drifts; the others follow from symmetry, those in the middle from their sums, 1.
+KICKS = {
+    2: (),
+    4: (0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+    6: (
+        0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807, -0.0115113874206879
+    ),
+}  # fmt: skip
+DRIFTS = {
+    2: (),
+    4: (0.245298957184271, 0.604872665711080),
+    6: (
+        0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928
+    ),
+}  # fmt: skip
+STEPS = (
+    0.13020248308889008087881763, 0.56116298177510838456196441, -0.38947496264484728640807860,
+    0.15884190655515560089621075, -0.39590389413323757733623154, 0.18453964097831570709183254,
+    0.25837438768632204729397911, 0.29501172360931029887096624,
+)  # fmt: skip
+ORDERS = 2, 4, 6, 8
+
+
+class Splitting(EqualSteps):
+    """An explicit symplectic method of order 2, 4, 6 or 8, for L = T(v) - V(q) with a constant mass matrix.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + 1.0 / jnp.sqrt(jnp.sum(q**2)))
+    >>> ts = 2 * jnp.pi * jnp.arange(0.0, 101.0, 10.0)
+    >>> traj = lj.integrate(kepler, jnp.array([0.8, 0.0]), jnp.array([0.0, 1.5**0.5]), ts=ts, method=Splitting(6), dt0=0.1)
+    >>> print(bool(jnp.max(jnp.abs(traj.jacobi_integral() + 0.5)) < 1e-6))
+    True
+
+    It keeps the energy to about the error of one step, however long the motion is, and momenta of linear symmetries to
+    round-off. `dt0` is the length of its steps, as for `lj.Gauss`. Forces may depend on time.
+
+    **Arguments:** `order`: 2, 4, 6 or 8, with 1, 6, 11 or 17 forces per step.
+
+    Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313; Kahan & Li, Math. Comput. 66 (1997) 1089.
+    """
+
+    order: int = eqx.field(static=True, default=4)
+
+    @property
+    def label(self) -> str:
+        return f"Splitting({self.order})"
+
+    def __check_init__(self):
+        if self.order not in ORDERS:
+            raise ValueError(f"order must be one of {ORDERS}, not {self.order!r}.\nFix: lj.Splitting(4).")
+
+    def error_order(self, terms: Any = None) -> int:
+        """The order."""
+        return self.order
+
+
+class Sequence(NamedTuple):
+    """What a step is made of: a kick, a drift, a kick, ..., a kick."""
+
+    kicks: np.ndarray
+    drifts: np.ndarray
+
+
+def sequence(order: int) -> Sequence:
+    """The kicks and drifts of a step.
+
+    >>> [(len(x.kicks), float(x.kicks.sum().round(12)), float(x.drifts.sum().round(12))) for x in map(sequence, ORDERS)]
+    [(2, 1.0, 1.0), (7, 1.0, 1.0), (12, 1.0, 1.0), (18, 1.0, 1.0)]
+    """
+    if order == 8:
+        drifts = np.array([*STEPS, 1 - 2 * sum(STEPS), *STEPS[::-1]])
+        return Sequence((np.append(0.0, drifts) + np.append(drifts, 0.0)) / 2, drifts)
+    kicks, drifts = KICKS[order], DRIFTS[order]
+    if order == 2:
+        return Sequence(np.array([0.5, 0.5]), np.array([1.0]))
+    if len(kicks) > len(drifts):
+        # A kick in the middle.
+        middle = 1 - 2 * sum(kicks)
+        drift = 0.5 - sum(drifts)
+        return Sequence(
+            np.array([*kicks, middle, *kicks[::-1]]), np.array([*drifts, drift, drift, *drifts[::-1]])
+        )  # fmt: skip
+    kick, drift = 0.5 - sum(kicks), 1 - 2 * sum(drifts)
+    return Sequence(np.array([*kicks, kick, kick, *kicks[::-1]]), np.array([*drifts, drift, *drifts[::-1]]))
