@@ -176,6 +176,7 @@ def _of_controller(trajectory: Trajectory, settings: Settings):
 
 def _of_equal_steps(trajectory: Trajectory, settings: Settings):
     """The fix for equal steps, one of which was not solved: a shorter one that is."""
+    assert settings.dt0 is not None
     end, longest = trajectory.end, float(settings.dt0)
     ts = end.t + np.sign(float(trajectory.t[-1] - end.t)) * np.array([0.0, longest], np.asarray(end.t).dtype)
     newton = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else ""

@@ -169,8 +169,8 @@ def integrate(
     if isinstance(method, EqualSteps):
         fixed = isinstance(stepsize_controller, diffrax.ConstantStepSize)
         arguments.check_equal_steps(
-            method, dt0, system, stepsize_controller=None if fixed else stepsize_controller, max_step=max_step, jump_ts=jump_ts,
-            events=events, event=event, adjoint=adjoint, outputs=outputs, start=start,
+            method, dt0, system, stepsize_controller=None if fixed else stepsize_controller, max_step=max_step,
+            jump_ts=jump_ts, events=events, event=event, adjoint=adjoint, outputs=outputs, start=start,
             drift=None if drift == "project" else drift,
         )  # fmt: skip
         stepsize_controller = diffrax.ConstantStepSize()

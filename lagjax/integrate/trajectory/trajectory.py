@@ -25,7 +25,6 @@ from lagjax.jaxtools import compiled, is_traced, jitted
 from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
 from lagjax.system import Model, System, UnknownSystem, known_system, model_of
 
-
 # A line through fewer outputs says nothing of a drift.
 ENOUGH_FOR_A_SLOPE = 8
 

@@ -55,8 +55,8 @@ class Gauss(EqualSteps):
     >>> print(bool(jnp.max(jnp.abs(traj.jacobi_integral() - traj.jacobi_integral()[0])) < 1e-7))
     True
 
-    It is symplectic and symmetric, keeps momenta of symmetries that are linear or quadratic, and the energy to about the
-    error of one step, however long the motion is. `dt0` is the length of its steps; those between two outputs are
+    It is symplectic and symmetric, keeps momenta of symmetries that are linear or quadratic, and the energy to about
+    the error of one step, however long the motion is. `dt0` is the length of its steps; those between two outputs are
     equally long, the fewest that are no longer than `dt0`. Constraints on positions hold at the ends of all steps to
     round-off; forces, dissipation and velocity constraints act by the principle of Lagrange and d'Alembert.
 
@@ -80,8 +80,8 @@ class Gauss(EqualSteps):
     def __check_init__(self):
         if not (isinstance(self.stages, int) and 1 <= self.stages <= MOST_STAGES):
             raise ValueError(
-                f"stages must be a whole number from 1 to {MOST_STAGES}, not {self.stages!r}: the order is twice that.\n"
-                "Fix: lj.Gauss(3) for order 6."
+                f"stages must be a whole number from 1 to {MOST_STAGES}, not {self.stages!r}: the order is twice "
+                "that.\nFix: lj.Gauss(3) for order 6."
             )
 
     def error_order(self, terms: Any = None) -> int:

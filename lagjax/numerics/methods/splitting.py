@@ -47,7 +47,8 @@ class Splitting(EqualSteps):
     >>> import lagjax as lj
     >>> kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + 1.0 / jnp.sqrt(jnp.sum(q**2)))
     >>> ts = 2 * jnp.pi * jnp.arange(0.0, 101.0, 10.0)
-    >>> traj = lj.integrate(kepler, jnp.array([0.8, 0.0]), jnp.array([0.0, 1.5**0.5]), ts=ts, method=Splitting(6), dt0=0.1)
+    >>> start = jnp.array([0.8, 0.0]), jnp.array([0.0, 1.5**0.5])
+    >>> traj = lj.integrate(kepler, *start, ts=ts, method=Splitting(6), dt0=0.1)
     >>> print(bool(jnp.max(jnp.abs(traj.jacobi_integral() + 0.5)) < 1e-6))
     True
 
