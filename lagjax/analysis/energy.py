@@ -23,11 +23,32 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import plots as plot
-from lagjax.integrate import ENDED_WELL, HybridTrajectory, Trajectory, integrate, is_among, message
+from lagjax.integrate import (
+    ENDED_WELL,
+    HybridTrajectory,
+    Masked,
+    Trajectory,
+    WithElements,
+    integrate,
+    is_among,
+    message,
+    traced_phases,
+)
 from lagjax.jaxtools import compiled, is_traced
 from lagjax.mechanics import of_states, sees_time
 from lagjax.numerics import quadrature
-from lagjax.system import Hybrid, Model, System, check_system, constraints, coordinates, model_of
+from lagjax.system import (
+    Hybrid,
+    InModes,
+    Model,
+    State,
+    System,
+    check_system,
+    constraints,
+    coordinates,
+    given_in,
+    model_of,
+)
 
 FORCE, DISSIPATION, STATES, TIME = "force", "dissipation", "states", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.
@@ -48,12 +69,19 @@ class Work(NamedTuple):
     total: Float[Array, " T"]
 
 
+class InPhases(NamedTuple):
+    """In which phase each row is, and the modes of elements as functions take them; None without elements."""
+
+    phase: np.ndarray
+    given: InModes | None = None
+
+
 class Motion:
     """One computed motion, in NumPy arrays: its instants, the phase of each, and the instants of its switches.
 
-    `t`, `q`, `v`, `multipliers`, `phase`: at the outputs, and at the end if it lies `beyond` them. `systems`: those
+    `t`, `q`, `v`, `multipliers`, `where`: at the outputs, and at the end if it lies `beyond` them. `systems`: those
     whose forces are accounted for, one per phase; `forward`: 1, or -1 if time decreases. `sources`: by name the size
-    of each power. `switch_times` (S,), and `entered` (S + 1,): the phases in their order.
+    of each power. `switch_times` (S,), and `entered` (S + 1,): the phases, with modes of elements, in their order.
     """
 
     def __init__(self, trajectory: Trajectory, accounted):
@@ -74,17 +102,20 @@ class Motion:
         if self.beyond:
             last = {"t": end.t, "q": end.q, "v": end.v, "multipliers": end.multipliers}
             if isinstance(trajectory, HybridTrajectory):
-                last["phase"] = np.int32(trajectory.last_phase())
+                last |= {"phase": np.int32(trajectory.last_phase()), "modes": trajectory.modes_entered()[-1]}
             rows = jax.tree.map(lambda x, y: np.concatenate([x, y[None].astype(x.dtype)]), rows, last)
         self.t, self.q, self.v, self.multipliers = (rows[name] for name in ("t", "q", "v", "multipliers"))
-        self.phase = rows.get("phase", np.zeros(len(self.t), int))
-        self.switches, self.switch_times, self.entered = None, np.zeros(0), np.zeros(1, int)
+        self.where = InPhases(rows.get("phase", np.zeros(len(self.t), int)))
+        self.switches, self.switch_times, self.entered = None, np.zeros(0), InPhases(np.zeros(1, int))
         if isinstance(trajectory, HybridTrajectory):
             self.switches, count = trajectory.switches, len(trajectory.switches)
             self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
-            self.entered = np.array([int(trajectory.system.first), *to])
+            self.entered = InPhases(np.array([int(trajectory.system.first), *to]))
+            if trajectory.modes is not None:
+                self.where = self.where._replace(given=_given(accounted, rows["modes"]))
+                self.entered = self.entered._replace(given=_given(accounted, trajectory.modes_entered()))
         self.sources: dict[str, int] = {}
-        self.models = [model_of(system, *self._at(0), self.params) for system in self.systems]
+        self.models = model_of(accounted, *self._at(0), self.params).phases
         for model in self.models:
             self.sources |= _sources(model)
 
@@ -93,7 +124,7 @@ class Motion:
 
     def energies(self) -> "Energies":
         """The energies at each instant, by the system of its phase."""
-        return self._energies(self.phase, self.t, self.q, self.v)
+        return self._energies(self.where.phase, self.t, self.q, self.v)
 
     def _energies(self, phase, *state):
         found = Energies(*(np.full(len(phase), np.nan, self.t.dtype) for _ in Energies._fields))
@@ -104,19 +135,19 @@ class Motion:
 
     def works(self, allowed) -> tuple[dict[str, Work], float]:
         """The work of each source, and the sum of the estimated errors of the integrals, which may exceed `allowed`."""
-        powers = self._powers(self.phase, self.t, self.q, self.v, self.multipliers)
+        powers = self._powers(self.where, self.t, self.q, self.v, self.multipliers)
         works, error = self._integrated(allowed) if len(self.t) > 1 and self.sources else (powers, 0.0)
         return {name: self._work(name, powers[name], works[name]) for name in self.sources}, error
 
-    def _powers(self, phase, t, q: PyTree, v: PyTree, multipliers: PyTree):
+    def _powers(self, where: InPhases, t, q: PyTree, v: PyTree, multipliers: PyTree):
         """The powers by source, (rows, n)."""
         powers = {name: np.zeros((len(t), size), self.t.dtype) for name, size in self.sources.items()}
-        for i in np.unique(phase):
+        for i in np.unique(where.phase):
             model = self.models[i]
             # Other phases have other multipliers.
             of_phase = {name: multipliers[name] for name in model.zero_multipliers()}
-            for name, power in _powers(model, t, q, v, of_phase).items():
-                powers[name] = np.where((phase == i)[:, None], power, powers[name])
+            for name, power in _powers(model, t, q, v, of_phase, where.given).items():
+                powers[name] = np.where((where.phase == i)[:, None], power, powers[name])
         return powers
 
     def _integrated(self, allowed):
@@ -183,7 +214,7 @@ class Motion:
         return np.concatenate([c[:-1] for c in cuts]), np.concatenate([c[1:] for c in cuts])
 
     def again(self, a, b):
-        """The phases, times, positions, velocities and multipliers at the nodes of intervals, integrated again."""
+        """Where they are, times, positions, velocities and multipliers at the nodes of intervals, integrated again."""
         t = quadrature.nodes(a, b).ravel()
         ts = self._with_others(t)
         traj, first = self.trajectory, self._at(0)[1:]
@@ -191,8 +222,8 @@ class Motion:
         settings = traj.asked._asdict() | {"rtol": tuple(rtol), "atol": None if atol.ndim == 2 else tuple(atol)}
         if traj.asked.stepsize_controller is not None:
             del settings["max_step"], settings["jump_ts"]
-        if isinstance(traj, HybridTrajectory):
-            settings["start"] = traj.system.names[self.entered[0]]
+        if isinstance(traj, HybridTrajectory) and traj.modes is None:
+            settings["start"] = traj.system.names[self.entered.phase[0]]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             again = integrate(traj.system, *first, traj.params, ts=ts, throw=False, estimate_error=False, **settings)
@@ -203,8 +234,8 @@ class Motion:
             )
         rows, place = again.rows(), np.searchsorted(self.forward * ts, self.forward * t)
         rows = jax.tree.map(lambda x: np.asarray(x)[place], {name: rows[name] for name in ("q", "v", "multipliers")})
-        phase = self._phase_of(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
-        return phase, t, rows["q"], rows["v"], rows["multipliers"]
+        where = self._where(np.repeat(0.5 * (a + b), len(quadrature.NODES)))
+        return where, t, rows["q"], rows["v"], rows["multipliers"]
 
     def _with_others(self, t):
         """These times in order, the first and last instant, and others: up to a length that one program serves."""
@@ -212,9 +243,10 @@ class Motion:
         others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
         return self.forward * np.unique(self.forward * np.concatenate([t, others]))
 
-    def _phase_of(self, t):
-        """The phase at times other than those of switches."""
-        return self.entered[np.searchsorted(self.switch_times, t, side="right")]
+    def _where(self, t) -> InPhases:
+        """The phase and modes at times other than those of switches."""
+        place = np.searchsorted(self.switch_times, t, side="right")
+        return jax.tree.map(lambda x: x[place], self.entered)
 
     def switches_until(self, row: int) -> int:
         """How many switches precede an instant: an output at the time of a switch is before it, an end after it."""
@@ -227,13 +259,30 @@ class Motion:
             return np.zeros(0, self.t.dtype)
         s = self.switches
         before, after = jax.tree.map(lambda x: np.asarray(x)[: len(s)], ((s.q, s.v), (s.q_after, s.v_after)))
-        h_before = self._energies(self.entered[:-1], self.switch_times, *before).h
-        return self._energies(self.entered[1:], self.switch_times, *after).h - h_before
+        phase = self.entered.phase
+        h_before = self._energies(phase[:-1], self.switch_times, *before).h
+        return self._energies(phase[1:], self.switch_times, *after).h - h_before
 
     def ways(self) -> tuple[str, ...]:
         """The phase before and after each switch, in words."""
-        names = () if self.switches is None else [self.switches.names[i] for i in self.entered]
+        if self.switches is None:
+            return ()
+        if self.entered.given is not None:
+            return tuple(self.switches.ways[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)])
+        names = [self.switches.names[i] for i in self.entered.phase]
         return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
+
+    def elements(self) -> tuple[str, ...]:
+        """The names of the modes of elements, those of a vector once."""
+        laws = getattr(self.trajectory.system, "laws", None)
+        return () if laws is None else tuple(law.name for law in (*laws.normals, *laws.tangents, *laws.compliant))
+
+    def element_of_switches(self) -> list[str]:
+        """The element whose mode ended at each switch, a contact's friction counted to the contact."""
+        if self.switches is None or self.entered.given is None:
+            return []
+        elements = self.trajectory.system.element_of_modes()
+        return [elements[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)]]
 
     def _work(self, name: str, power, work):
         total = np.sum(work, axis=1)
@@ -265,24 +314,47 @@ def _energies(model: Model, t, q: PyTree, v: PyTree):
     return jax.vmap(at)(t, q, v)
 
 
+def _given(accounted: Hybrid, modes: np.ndarray) -> InModes:
+    return jax.tree.map(np.asarray, accounted.given(None, modes))
+
+
 def _sources(model: Model) -> dict[str, int]:
     """The sources of work in a system, and the size of each power."""
     system, n = model.system, model.n
-    found = {FORCE: n} if system.force is not None else {}
+    own = system.force.force if isinstance(system.force, WithElements) else system.force
+    found = {FORCE: n} if own is not None else {}
     found |= {DISSIPATION: n} if system.dissipation is not None else {}
     found |= {STATES: n} if system.states else {}
     found |= {TIME: 1} if sees_time(system.lagrangian, model) else {}
-    return found | {constraint_in_words(name): n for name in system.constraints}
+    if isinstance(system.force, WithElements):
+        found |= {element_in_words(law.name): n for law in (*system.force.tangents, *system.force.compliant)}
+    return found | {_held_by(system, name): n for name in system.constraints}
+
+
+def _held_by(system: System, name: str) -> str:
+    """The name of a constraint among the sources."""
+    return element_in_words(name) if _is_element(system, name) else constraint_in_words(name)
+
+
+def _is_element(system: System, name: str) -> bool:
+    return isinstance(system.constraints[name].function, Masked)
 
 
 @compiled
-def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree):
+def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree, given: InModes | None):
     """The power of each source at each of a batch of states, (rows, n)."""
     system, timed = model.system, sees_time(model.system.lagrangian, model)
+    of_all, is_split = model, isinstance(system.force, WithElements)
 
-    def at(t, q: PyTree, v: PyTree, multipliers: PyTree):
+    def at(t, q: PyTree, v: PyTree, multipliers: PyTree, row: InModes | None):
+        model = of_all if row is None else of_all.of(given_in(row, of_all.params.params))
         (x, u), stacked, powers = model.vectors(q, v), model.stacked(multipliers), {}
-        if system.force is not None:
+        if is_split:
+            if system.force.force is not None:
+                powers[FORCE] = model.vector(system.force.force(t, q, v, model.params.params)) * u
+            for name, force in system.force.by_element(t, q, v, multipliers, model.params).items():
+                powers[element_in_words(name)] = model.vector(force) * u
+        elif system.force is not None:
             powers[FORCE] = model.force(t, x, u, stacked) * u
         if system.dissipation is not None:
             powers[DISSIPATION] = -jax.grad(model.dissipation, argnums=2)(t, x, u) * u
@@ -294,15 +366,21 @@ def _powers(model: Model, t, q: PyTree, v: PyTree, multipliers: PyTree):
             powers[TIME] = -jax.grad(model.lagrangian)(t, x, u)[None]
         rows = constraints.jacobian(model, t, x, u)
         for name in system.constraints:
-            powers[constraint_in_words(name)] = (jnp.where(model.belongs_to(name), stacked, 0.0) @ rows) * u
+            key, held = _held_by(system, name), jnp.where(model.belongs_to(name), stacked, 0.0) @ rows
+            powers[key] = powers.get(key, 0.0) + held * u
         return powers
 
-    return jax.vmap(at)(t, q, v, multipliers)
+    return jax.vmap(at)(t, q, v, multipliers, given)
 
 
 def constraint_in_words(name: str) -> str:
     """The name of a constraint among the sources."""
     return f"constraint '{name}'"
+
+
+def element_in_words(name: str) -> str:
+    """The name of the force of an element among the sources."""
+    return f"element '{name}'"
 
 
 # Quadrature may be wrong by this many tolerances of the largest energy.
@@ -323,8 +401,11 @@ class EnergyLedger(eqx.Module):
       "explicit time", as far as the system has them.
     - `constraints`: by name a `Work`, of the force Aᵀ λ. Summed over all coordinates, the work of a constraint that
       neither moves nor is inhomogeneous in v is zero.
-    - `impacts` (S,): the jump of h at each switch of a `lj.Hybrid`, at the times `impact_times`; `switches`: from
-      which phase to which; `impact_total` (T,): the sum of the jumps until each output.
+    - `elements`: by the name of its mode (`traj.switches.ways`) a `Work`, of the force of each element: of a contact's
+      normal force, zero unless the gap moves; and of friction, whether it slides or sticks.
+    - `impacts` (S,): the jump of h at each switch, at the times `impact_times`; `switches`: from which phase to which,
+      or which mode ended; `impact_total` (T,): the sum of the jumps until each output. `element_impacts`: of that the
+      part of each element; where several are struck at once, it is the one whose mode ended there.
     - `closure` (T,): the change of h less all works and jumps, `[L]`; `scale`: the largest energy, to which it is
       compared; `allowed`: 100 tolerances.
     - `quadrature`: the estimated error of the works by quadrature, relative to `scale`.
@@ -347,6 +428,8 @@ class EnergyLedger(eqx.Module):
     scale: float
     allowed: float
     quadrature: float
+    elements: dict[str, Work]
+    element_impacts: dict[str, np.ndarray]
 
     @property
     def relative_closure(self) -> float:
@@ -362,6 +445,14 @@ class EnergyLedger(eqx.Module):
         """Yield all sources of work, with their names in words."""
         yield from self.works.items()
         yield from ((constraint_in_words(name), work) for name, work in self.constraints.items())
+        yield from ((element_in_words(name), work) for name, work in self.elements.items())
+
+    def _jumps(self) -> dict[str, np.ndarray]:
+        """The jumps until each output, by what they are called."""
+        if self.element_impacts:
+            words = {name: "impacts" if name in self.elements else "steps" for name in self.element_impacts}
+            return {f"{words[name]} of '{name}'": jumps for name, jumps in self.element_impacts.items()}
+        return {_count(len(self.impacts), "switch"): self.impact_total} if len(self.impacts) else {}
 
     def plot(self):
         """Draw the work of each source and the jumps, stacked, against time, with the change of the Jacobi integral.
@@ -369,8 +460,7 @@ class EnergyLedger(eqx.Module):
         **Returns:** a matplotlib `Figure`. **Raises:** `ImportError` without matplotlib.
         """
         stacked = {name: work.total for name, work in self.sources()}
-        if len(self.impacts):
-            stacked["impacts"] = self.impact_total
+        stacked |= self._jumps() if self.element_impacts else {"impacts": x for x in self._jumps().values()}
         return plot.stacked(self.t, stacked, self.jacobi_integral - self.jacobi_integral[0], "change of h")
 
     def __repr__(self):
@@ -386,8 +476,7 @@ class EnergyLedger(eqx.Module):
             names = names if name == TIME else coordinates.names(last)
             parts = [] if name == TIME or len(names) == 1 else coordinates.flatten(last)[0]
             rows.append((name, [work.total[-1], *parts]))
-        if len(self.impacts):
-            rows.append((_count(len(self.impacts), "switch"), [np.sum(self.impacts)]))
+        rows += [(name, [jumps[-1]]) for name, jumps in self._jumps().items()]
         heads = ["change", *(f"by {name}" for name in names)] if len(names) > 1 else ["change"]
         cells = [[self._number(x) for x in numbers] for _, numbers in rows]
         widths = [max(len(row[i]) for row in [heads, *cells] if i < len(row)) for i in range(len(heads))]
@@ -457,10 +546,15 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
             "Fix: lj.energy_ledger(jax.tree.map(lambda x: x[0], traj))."
         )
     accounted = trajectory.system if system is None else system
-    check_system(accounted, phases=True)
-    if accounted.in_phases != isinstance(trajectory, HybridTrajectory):
+    check_system(accounted, phases=True, elements=True)
+    if accounted.elements is not None:
+        first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+        accounted = traced_phases(accounted, State(*first, trajectory.params))
+    modes = trajectory.modes if isinstance(trajectory, HybridTrajectory) else None
+    if accounted.in_phases != trajectory.in_phases or (accounted.elements is None) != (modes is None):
         raise TypeError(
-            "a motion in phases is accounted for by a lj.Hybrid, any other one by a lj.System, not "
+            "a motion in phases is accounted for by a lj.Hybrid, one with elements by a lj.System with elements, any "
+            "other one by a lj.System without, not "
             f"{type(accounted).__name__}.\nFix: leave system out, or give one like traj.system."
         )
     return _ledger(Motion(trajectory, accounted))
@@ -473,15 +567,25 @@ def _ledger(motion: Motion) -> EnergyLedger:
     scale = max(float(np.max(size)), np.finfo(float).tiny)
     works, error = motion.works(QUADRATURE * max(rtol, np.finfo(h.dtype).eps) * scale)
     total = sum((work.total for work in works.values()), np.zeros(len(h)))
-    jumped = np.array([np.sum(jumps[: motion.switches_until(row)]) for row in range(len(h))])
+    until = [motion.switches_until(row) for row in range(len(h))]
+
+    def summed(jumps: np.ndarray) -> np.ndarray:
+        return np.array([np.sum(jumps[:count]) for count in until])
+
+    jumped = summed(jumps)
     split = bool(np.all(np.abs(h - kinetic - potential) <= ROUND_OFFS * np.finfo(h.dtype).eps * size))
-    names = {name: constraint_in_words(name) for system in motion.systems for name in system.constraints}
+    names = [(name, system) for system in motion.systems for name in system.constraints]
+    constraint = {name: works[constraint_in_words(name)] for name, of in names if not _is_element(of, name)}
+    by = np.array(motion.element_of_switches())
+    jumped_there = np.abs(jumps[: len(by)]) > ROUND_OFFS * np.finfo(h.dtype).eps * scale
     return EnergyLedger(
         t=motion.t, jacobi_integral=h, kinetic=kinetic if split else None, potential=potential if split else None,
         works={name: works[name] for name in (FORCE, DISSIPATION, STATES, TIME) if name in works},
-        constraints={name: works[words] for name, words in names.items()},
+        constraints=constraint,
         impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
         closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,
+        elements={name: works[words] for name in motion.elements() if (words := element_in_words(name)) in works},
+        element_impacts={str(name): summed(np.where(by == name, jumps, 0.0)) for name in sorted(set(by[jumped_there]))},
     )  # fmt: skip
 
 

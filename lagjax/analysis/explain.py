@@ -1,6 +1,7 @@
 """`explain`: what a system amounts to at one state, in words and numbers; a motion in phases as a graph of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import NamedTuple, overload
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jaxtyping import PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate import found as jumps_found
-from lagjax.integrate import nystrom_for
+from lagjax.integrate import modes_at, nystrom_for, traced_phases
 from lagjax.mechanics import (
     Structure,
     accelerations,
@@ -30,7 +31,18 @@ from lagjax.mechanics import (
     within,
 )
 from lagjax.numerics import independent_rows
-from lagjax.system import Hybrid, Model, State, System, check_system, coordinates, model_of, traced_system, with_rates
+from lagjax.system import (
+    Hybrid,
+    Model,
+    State,
+    System,
+    check_system,
+    constraints,
+    coordinates,
+    model_of,
+    traced_system,
+    with_rates,
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,6 +136,8 @@ class Explanation:
     - `dependent`: each dependent equation, followed by those of which it is a combination.
     - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
     - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
+    - `modes`: of a system with elements, by name the mode that fits the state: "open", "closed", "free", "slides" or
+      "sticks". The other fields are those with all gaps open and no friction.
     """
 
     coordinates: tuple[str, ...]
@@ -135,6 +149,7 @@ class Explanation:
     structure: Structure | None
     problem: str | None
     rows: tuple[tuple[str, str], ...]
+    modes: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self):
         width = max(len(label) for label, _ in self.rows)
@@ -174,17 +189,57 @@ def explain(system, t, q: PyTree, v: PyTree, params: PyTree = None):
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it. A state off the constraints is first
     moved onto them, as dependent constraints agree only there; the result says so if it was not near.
 
-    **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph.
+    **Returns:** an `Explanation`; of a `Hybrid` a `HybridExplanation`: its phases, each explained, and its graph. Of a
+    system with elements it says in which modes they are there, and which forces are solved together.
 
     **Raises:** `TypeError`, `ValueError` for a state of the wrong shape or dtype, or an L that is not scalar.
 
     Source: García de Jalón & Bayo, *Kinematic and Dynamic Simulation of Multibody Systems*, §3.2 (rank and freedoms).
     """
-    check_system(system, t, q, v, params, phases=True)
+    check_system(system, t, q, v, params, phases=True, elements=True)
     s = coordinates.state(t, q, with_rates(system, q, v), params)
     if system.in_phases:
         return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
+    if system.elements is not None:
+        return _with_elements(system, s)
     return _explain(system, s)
+
+
+def _with_elements(system: System, s: coordinates.State) -> Explanation:
+    """The explanation of the system without elements, and of their modes."""
+    assembly, found = traced_phases(system, s), _explain(replace(system, elements=None), s)
+    laws, met = assembly.laws, modes_at(assembly, s)
+    kinds = dict(zip(laws.names, laws.modes_in_words(np.asarray(met.modes))))
+    given = assembly.given(s.params, met.modes)
+    model = model_of(assembly.systems[0], *s[:3], given)
+    values = np.asarray(laws.last(s.t, s.q, met.v, model.zero_multipliers(), given))
+    now = [
+        f"{name} {mode}" + (f" (gap {value:.6g})" if mode == "open" else "")
+        for (name, mode), value in zip_longest(kinds.items(), values)
+    ]
+    both, state = (given, assembly.given(s.params)), (s.t, *model.vectors(s.q, met.v))
+    held = [constraints.jacobian(model.of(modes), *state) for modes in both]
+    here, open_rank = (int(np.linalg.matrix_rank(np.asarray(rows))) for rows in held)
+    free = found.degrees_of_freedom - here + open_rank
+    at_once = "one after the other" if laws.impacts == "sequential" else "all at once"
+    gaps, slips = laws.count
+    together = f"up to {gaps + slips} forces of contacts that touch, as a complementarity problem"
+    many = {"gap": gaps, "sliding velocity": slips, "spring": laws.kinds["springs"], "control": laws.kinds["controls"]}
+    counted = ", ".join(f"{name}: {count}" for name, count in many.items() if count)
+    rows = [
+        ("elements", ", ".join(f"'{name}' ({type(x).__name__})" for name, x in assembly.user.elements.items())),
+        ("modes", f"{laws.size} ({counted}); here {', '.join(now)}"),
+        ("in these modes", f"{free} degree{'' if free == 1 else 's'} of freedom"),
+        *([("solved together", together)] if gaps + slips else []),
+        *([("impacts", f"of contacts that are struck together: {at_once}")] if gaps > 1 else []),
+    ]
+    problem = found.problem
+    if not bool(met.found):
+        problem = "no forces of these contacts obey their laws (Painlevé's paradox)"
+        rows.append(("problem", problem))
+    # Of the equations without elements.
+    kept = [row for row in found.rows if row[0] not in ("solved", "velocities", "network")]
+    return replace(found, rows=(*kept, *rows), modes=tuple(kinds.items()), problem=problem)
 
 
 def _explain(system: System, s: coordinates.State) -> Explanation:

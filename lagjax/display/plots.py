@@ -70,14 +70,20 @@ def style(i: int) -> dict:
 
 
 @names_as_they_are()
-def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
-    """Draw curves against time, one panel per key of `panels`, one curve per name in it.
+def time_series(
+    t, panels: dict[str, dict[str, np.ndarray]], strips: dict[str, list[tuple[float, float, str]]] | None = None
+):
+    """Draw curves against time, one panel per key of `panels`, one curve per name in it; strips below them.
 
-    **Arguments:** `t` (T,); `panels` by axis label, curves (T,) by name.
+    **Arguments:** `t` (T,); `panels` by axis label, curves (T,) by name; `strips`: by name, what holds from when until
+    when, in a word that has a colour.
 
     **Returns:** a matplotlib `Figure`.
     """
-    fig, axes = figure(len(panels), 1, size=(6.4, 2.2), sharex=True)
+    strips = strips or {}
+    tall, row = 2.2, 0.24 * len(strips) + 0.35
+    ratios = [tall] * len(panels) + ([row] if strips else [])
+    fig, axes = figure(len(ratios), 1, (6.4, sum(ratios) / len(ratios)), sharex=True, height_ratios=ratios)
     for axis, (label, curves) in zip(axes[:, 0], panels.items()):
         for i, (name, values) in enumerate(curves.items()):
             axis.plot(t, values, label=name, **style(i))
@@ -85,8 +91,34 @@ def time_series(t, panels: dict[str, dict[str, np.ndarray]]):
         axis.set_ylabel(label if len(curves) > 1 or first == "q" else f"{label}: {first}")
         if len(curves) > 1:
             axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    if strips:
+        _draw_strips(axes[-1, 0], strips)
     axes[-1, 0].set_xlabel("t")
     return fig
+
+
+# Of modes; what has no colour here gets the next of the others.
+NOTHING = "#E6E6E6"
+STRIP_COLOURS = {"open": NOTHING, "free": NOTHING, "apart": NOTHING, "closed": COLOURS[0], "pressed": COLOURS[5]}
+STRIP_COLOURS |= {"slides": COLOURS[1], "sticks": COLOURS[2], "holds its output": COLOURS[3]}
+
+
+def _draw_strips(axis, strips: dict[str, list[tuple[float, float, str]]]):
+    """One thin row for each name, the first at the top, and a legend of the words."""
+    from matplotlib.patches import Patch
+
+    words = list(dict.fromkeys(word for row in strips.values() for _, _, word in row))
+    others = iter(COLOURS * len(words))
+    colours = {word: STRIP_COLOURS.get(word) or next(others) for word in words}
+    for i, row in enumerate(strips.values()):
+        for start, end, word in row:
+            axis.broken_barh([(start, end - start)], (i - 0.36, 0.72), color=colours[word], linewidth=0)
+    axis.set_yticks(range(len(strips)), list(strips), fontsize=8)
+    axis.set_ylim(len(strips) - 0.4, -0.6)
+    axis.grid(False)
+    shown = {colours[word]: ", ".join(w for w in words if colours[w] == colours[word]) for word in words}
+    handles = [Patch(color=colour, label=label) for colour, label in shown.items()]
+    axis.legend(handles=handles, fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 @names_as_they_are()

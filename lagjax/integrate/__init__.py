@@ -4,12 +4,14 @@ from lagjax.integrate import arguments
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
+from lagjax.integrate.elements.laws import Masked, WithElements
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning, crossings_of, traced_guard
 from lagjax.integrate.in_turn import in_turn
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.jumps.find import found
 from lagjax.integrate.load import check_is_system, described_system, load_trajectory, same_system, trajectory_from
 from lagjax.integrate.settings import PATIENCE
+from lagjax.integrate.solve.assembly import modes_at
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.solve.harvest import Report, reported, reporting, watched

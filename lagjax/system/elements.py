@@ -86,8 +86,8 @@ class Contact(eqx.Module):
     - `gap`: `gap(t, q, params)`, above zero as long as nothing touches, a length where there is friction: a number,
       or (k,) for k gaps, such as those of a row of balls. The constraint `gap = 0` has the element's name, and its
       multiplier is the normal force.
-    - `restitution`: the speed at which a gap opens after an impact over that at which it closed, 0 to 1: a number, or
-      a function of the closing speed.
+    - `restitution`: the speed at which a gap opens after an impact over that at which it closed, 0 to 1: a number, a
+      function of `params`, or `e(speed, params)` of the closing speed.
     - `friction`, `static`: Coulomb's coefficients of sliding and of sticking, as for `lj.Friction`; the normal force
       is that of the contact. None: the contact is smooth.
     - `sliding`: `sliding(t, q, v, params)`, the sliding velocity, `[gap]/[t]`, of the shape of the gap.

@@ -288,4 +288,4 @@ def _count(n: int, word: str, plural: str):
 
 def replace_fields(hybrid: Hybrid, **fields) -> Hybrid:
     """Replace some fields of a hybrid without checking them again."""
-    return without_init(Hybrid, vars(hybrid) | fields)
+    return without_init(type(hybrid), vars(hybrid) | fields)

@@ -200,8 +200,8 @@ class System(eqx.Module):
 
     @property
     def first_phase(self) -> "System":
-        """The system itself."""
-        return self
+        """The system itself, without its elements."""
+        return self if self.elements is None else unchecked(*(getattr(self, name) for name in FIELDS[:-1]))
 
     def starting(self, start) -> "System":
         """The system itself; raise if `start` names a phase."""

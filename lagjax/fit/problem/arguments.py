@@ -43,9 +43,14 @@ def problem_of(
     weak: bool = True,
 ) -> FitProblem:
     """Check all arguments and make arrays of them; `weak`: with weak priors for the weights of networks."""
-    check_system(system, records, params, phases=True)
+    check_system(system, records, params, phases=True, elements=True)
     # A motion in phases starts in that of `start=`, which is no option of the motions.
     system = system.starting(options.pop("start", None))
+    if system.elements is not None and window is not None:
+        raise ValueError(
+            "window= cuts records into windows with free starts, and a start of a system with elements may be inside a "
+            "contact.\nFix: leave window out; or a lj.Record for each part, with its start."
+        )
     if system.in_phases and window is not None:
         raise ValueError(
             "window= cuts records into windows, but for a lj.Hybrid the phase in which each window would start is not "

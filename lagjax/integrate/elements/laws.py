@@ -27,6 +27,7 @@ from lagjax.integrate.elements.coefficients import coefficient, takes_of_coeffic
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
 from lagjax.integrate.jumps.find import OfParams
+from lagjax.integrate.trajectory.parts import mode_in_words
 from lagjax.jaxtools import depends, is_traced, stop_gradient
 from lagjax.system import (
     OF_POSITION,
@@ -69,10 +70,9 @@ class Normal(eqx.Module):
         """The gaps as a vector."""
         return jnp.ravel(self.gap(t, q, params))
 
-    def returned(self, closing: Float[Array, " k"]) -> Float[Array, " k"]:
+    def returned(self, closing: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """The restitution at these speeds."""
-        e = self.restitution
-        return jnp.broadcast_to(jax.vmap(e)(closing) if callable(e) else e, closing.shape).astype(closing.dtype)
+        return coefficient(self.restitution, closing, params)
 
 
 class Tangent(eqx.Module):
@@ -204,6 +204,22 @@ class Laws(eqx.Module):
         )
         return guarded + tuple(law.name for law in self.sampled)
 
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The name of each mode's element: a contact's friction belongs to the contact."""
+        gaps = [law.name for law in self.normals for _ in range(law.at[1] - law.at[0])]
+        slips = [
+            law.source if law.name == f"{law.source} friction" else law.name
+            for law in self.tangents
+            for _ in range(law.at[1] - law.at[0])
+        ]
+        springs = [law.name for law in self.compliant for _ in range(law.at[1] - law.at[0])]
+        return *gaps, *slips, *springs, *(law.name for law in self.sampled)
+
+    def modes_in_words(self, modes) -> list[str]:
+        """Each of these modes in a word."""
+        return [mode_in_words(i, int(mode), self.size, **self.kinds) for i, mode in enumerate(modes)]
+
     def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " kNT"]:
         """Which of the normals and tangents are constraints in these modes."""
         of_rows = modes[..., : len(self.rows)]
@@ -242,7 +258,9 @@ class Laws(eqx.Module):
         for law in self.normals:
             ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
             slower = jnp.broadcast_to(jnp.asarray(law.slower_than, ones.dtype), ones.shape)
-            found[f"the restitution of '{law.name}'"] = jnp.concatenate([law.returned(ones), law.returned(2 * ones)])
+            found[f"the restitution of '{law.name}'"] = jnp.concatenate(
+                [law.returned(ones, state.params), law.returned(2 * ones, state.params)]
+            )
             found[f"slower_than of '{law.name}'"] = slower
         for law in self.tangents:
             ones = jnp.ones(law.at[1] - law.at[0], state.t.dtype)
@@ -393,7 +411,7 @@ def _laws(elements: Elements, plain: System, start: State):
         if not isinstance(contact, Contact):
             continue
         gap = gaps[name]
-        e, size = traced(name, "restitution", contact.restitution, ("speed",), ()), _size(gap)
+        (e,), size = coefficients(name, "speed", restitution=contact.restitution), _size(gap)
         normals.append(Normal(name, gap, e, contact.slower_than, (place, place + size)))
         place += size
     for name, element in elements.items():

@@ -188,7 +188,7 @@ class Meeting(eqx.Module):
             return closed & (stop_gradient(c[:normals]) < -still)
 
         def restitution(closing: Array) -> Array:
-            return jnp.concatenate([law.returned(closing[slice(*law.at)]) for law in laws.normals])
+            return jnp.concatenate([law.returned(closing[slice(*law.at)], given.params) for law in laws.normals])
 
         def at_once(c: Array, bounce: Array) -> Array:
             """The impulses of all closed contacts together; `bounce`: e γ."""

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from lagjax.integrate.elements.laws import Laws, OneGuard, in_modes
-from lagjax.integrate.elements.meeting import Meeting
+from lagjax.integrate.elements.meeting import Meeting, Met
 from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.integrate.solve.segments import Phase
-from lagjax.jaxtools import without_init
+from lagjax.jaxtools import compiled, without_init
 from lagjax.system import Elements, Hybrid, InModes, State, System
 
 MOTION = "motion"
@@ -34,6 +34,15 @@ class InElements(Hybrid):
         if isinstance(params, InModes):
             return params
         return self.laws.given(params, jnp.zeros(self.laws.size, int) if modes is None else modes)
+
+    @property
+    def first_phase(self) -> System:
+        """The user's system without its elements."""
+        return self.user.first_phase
+
+    def element_of_modes(self) -> tuple[str, ...]:
+        """The name of the element of each mode."""
+        return self.laws.elements
 
     def cases(self, params: PyTree) -> dict[str, PyTree]:
         """The parameters where every contact holds, and where every one that can slide does."""
@@ -68,3 +77,9 @@ def only_phase(assembly: InElements, start: State, events: Mapping[str, Crossing
     guards = Guards(functions, (modes,) * guarded + recorded.kinds) if functions else None
     meeting = Meeting(assembly.systems[0], laws)
     return Phase(guards, (0,) * guarded, np.zeros((1, 2), np.int32), (), tuple(events), meeting)
+
+
+@compiled
+def modes_at(assembly: InElements, start: State) -> Met:
+    """The modes that fit a state, and the velocities on what holds in them."""
+    return Meeting(assembly.systems[0], assembly.laws).first(*start)[1]

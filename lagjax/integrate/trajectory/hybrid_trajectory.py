@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
-from lagjax.integrate.trajectory.parts import NO_PHASE
+from lagjax.integrate.trajectory.parts import mode_in_words
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
@@ -96,14 +96,7 @@ class Switches(eqx.Module):
 
     def mode_in_words(self, way: int, mode: int) -> str:
         """A mode in a word; `way`: its place among the modes."""
-        if way < self.gaps:
-            return "closed" if mode else "open"
-        from_end = len(self.ways) - way
-        if from_end <= self.controls:
-            return "holds its output"
-        if from_end <= self.controls + self.springs:
-            return "pressed" if mode else "apart"
-        return {0: "free", 2: "sticks"}.get(mode, "slides")
+        return mode_in_words(way, mode, len(self.ways), self.gaps, self.springs, self.controls)
 
 
 class HybridTrajectory(Trajectory):
@@ -148,6 +141,12 @@ class HybridTrajectory(Trajectory):
         count = len(self.switches)
         return int(self.switches.to[count - 1] if count else self.system.first)
 
+    def modes_entered(self) -> Any:
+        """The modes of elements at the start and after each switch, (S + 1, k); None without elements. Not traced."""
+        if self.modes is None:
+            return None
+        return np.concatenate([np.asarray(self.modes)[:1], np.asarray(self.switches.modes)[: len(self.switches)]])
+
     def jacobi_integral(self) -> Float[Array, " T"]:
         """The Jacobi integral of the phase at every output, (T,), `[L]`. Not for batched trajectories."""
         return _of_phases(_integral, self)
@@ -165,15 +164,27 @@ class HybridTrajectory(Trajectory):
     def plot(self, charges: Any = False):
         """Plot coordinates, velocities and multipliers against time, with the switches; returns a matplotlib `Figure`.
 
-        Switches stand at their own times; else what happens between two outputs is not seen.
+        A strip below shows the phases; with elements, in a row each, when a gap is closed, and when what slides slides
+        or sticks. Switches stand at their own times; else what happens between two outputs is not seen.
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory.
         """
         fig = super().plot(charges)
-        for axis in fig.axes:
+        for axis in fig.axes[:-1]:
             for t in np.asarray(self.switches.t)[: len(self.switches)]:
                 axis.axvline(t, color=plot.COLOURS[-1], linewidth=0.6, linestyle=":", zorder=0)
         return fig
+
+    def _strips(self) -> dict[str, list[tuple[float, float, str]]]:
+        s = self.switches
+        edges = np.array([self.t[0], *np.asarray(s.t)[: len(s)], self.end.t])
+        if self.modes is None:
+            first = np.asarray(self.phase)[0]
+            rows = {"phase": [s.names[i] for i in (first, *np.asarray(s.to)[: len(s)])]}
+        else:
+            rows = {name: [s.mode_in_words(i, int(mode)) for mode in self.modes_entered()[:, i]]
+                    for i, name in enumerate(s.ways)}  # fmt: skip
+        return {name: _merged(edges, words) for name, words in rows.items()}
 
     def rows(self) -> dict:
         return super().rows() | {"phase": self.phase, "modes": self.modes}
@@ -197,12 +208,21 @@ class HybridTrajectory(Trajectory):
 
     def _of_phases(self) -> tuple[str, str]:
         if self.modes is not None:
-            s, reached = self.switches, np.asarray(self.modes)[np.asarray(self.phase) != NO_PHASE]
-            last = [*reached, *np.asarray(s.modes)[len(s) - 1 : len(s)]][-1] if len(reached) else []
+            s, last = self.switches, self.modes_entered()[-1]
             words = [f"{name} {s.mode_in_words(i, int(mode))}" for i, (name, mode) in enumerate(zip(s.ways, last))]
             return "modes", f"at the end: {', '.join(words)}"
         names, counts = np.unique(self.named_phases(), return_counts=True)
         return "phases", "outputs: " + ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
+
+
+def _merged(edges: np.ndarray, words: list[str]) -> list[tuple[float, float, str]]:
+    """From when until when each word holds, (start, end, word), with equal neighbours as one."""
+    found: list[tuple[float, float, str]] = []
+    for start, end, word in zip(edges, edges[1:], words):
+        if found and found[-1][2] == word:
+            start = found.pop()[0]
+        found.append((float(start), float(end), word))
+    return found
 
 
 def _integral(model: Model, t: Array, q: PyTree, v: PyTree):

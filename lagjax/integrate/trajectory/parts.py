@@ -13,6 +13,17 @@ from lagjax.numerics import EqualSteps
 NO_PHASE = -1
 
 
+def mode_in_words(way: int, mode: int, count: int, gaps: int, springs: int, controls: int) -> str:
+    """A mode in a word; `way`: its place among `count` modes: of gaps, of sliding velocities, of springs, of controls."""
+    if way < gaps:
+        return "closed" if mode else "open"
+    if way >= count - controls:
+        return "holds its output"
+    if way >= count - controls - springs:
+        return "pressed" if mode else "apart"
+    return {0: "free", 2: "sticks"}.get(mode, "slides")
+
+
 class Snapshot(NamedTuple):
     """One instant of a motion."""
 

@@ -189,7 +189,11 @@ class Trajectory(eqx.Module):
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batched trajectory, or without any charges.
         """
         self._check_alone("plot()")
-        return plot.time_series(np.asarray(self.t), panels(self, charges))
+        return plot.time_series(np.asarray(self.t), panels(self, charges), self._strips())
+
+    def _strips(self) -> dict[str, list[tuple[float, float, str]]]:
+        """What holds from when until when, by name: nothing without phases."""
+        return {}
 
     def phase_portrait(self):
         """Plot velocities against coordinates, one panel per coordinate; returns a matplotlib `Figure`.

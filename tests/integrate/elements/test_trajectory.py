@@ -78,6 +78,91 @@ def test_as_a_dataset():
     assert modes.dims == ("t", "mode") and modes.sel(mode="floor friction").values.tolist() == [0, 0, 2]
 
 
+@pytest.mark.slow
+def test_energy_by_element():
+    """Friction takes what is left at rest, impacts the rest of the energy, and the sum closes. Twin: it does not with
+    another friction."""
+    traj = computed()
+    ledger = lj.energy_ledger(traj)
+    assert ledger.closes and ledger.relative_closure < 1e-9
+    np.testing.assert_allclose(ledger.elements["floor friction"].total[-1], -(SPEED**2) / 2, rtol=1e-6)
+    np.testing.assert_allclose(ledger.element_impacts["floor"][-1], -(THROWN**2 - SPEED**2) / 2 - G, rtol=1e-6)
+    np.testing.assert_allclose(ledger.elements["floor"].total, 0.0, atol=1e-10)
+    assert "impacts of 'floor'" in repr(ledger) and set(ledger.switches) == {"floor", "floor friction"}
+    rougher = lj.Contact(floor.gap, E, friction=2 * MU, sliding=floor.sliding)
+    assert not lj.energy_ledger(traj, lj.System(block.lagrangian, elements={"floor": rougher})).closes
+    with pytest.raises(TypeError, match="with elements by a lj.System with elements"):
+        lj.energy_ledger(traj, lj.System(block.lagrangian))
+
+
+@pytest.mark.exhaustive
+def test_energy_of_what_moves():
+    """A table that goes up and down does work on what lies on it, and a belt on what it carries."""
+    table = lj.Contact(lambda t, q, p: q - 0.1 * jnp.sin(t))
+    lifted = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, elements={"table": table})
+    traj = lj.integrate(lifted, 0.0, 0.1, ts=np.array([0.0, 1.0]), estimate_error=False)
+    work = lj.energy_ledger(traj).elements["table"].total[-1]
+    np.testing.assert_allclose(work, np.sin(1.0) + 0.005 * (np.cos(1.0) ** 2 - 1), rtol=1e-8)
+    belt = lj.Friction(lambda t, q, v, p: v - 1.0, 0.5, normal=10.0)
+    carried = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, elements={"belt": belt})
+    traj = lj.integrate(carried, 0.0, 0.0, ts=np.array([0.0, 1.0]), estimate_error=False)
+    ledger = lj.energy_ledger(traj)
+    h = 0.5 * (traj.v**2 + traj.q**2)
+    np.testing.assert_allclose(ledger.elements["belt"].total[-1], h[-1] - h[0], rtol=1e-8)
+    assert np.asarray(traj.modes)[:, 0].tolist() == [-1, 2]
+
+
+def test_explained():
+    """The modes at a state, and how free it is in them, in words and as a dict."""
+    rows = []
+    for q, v, modes, free in (
+        ([0.0, 1.0], [0.0, 0.0], ("open", "free"), 2),
+        ([0.0, 0.0], [1.0, 0.0], ("closed", "slides"), 1),
+        ([0.0, 0.0], [0.0, 0.0], ("closed", "sticks"), 0),
+    ):
+        found = lj.explain(block, 0.0, np.array(q), np.array(v), PARAMS)
+        assert dict(found.modes) == dict(zip(("floor", "floor friction"), modes))
+        rows.append(dict(found.rows))
+        assert rows[-1]["in these modes"].startswith(f"{free} degree")
+    assert (
+        "2 (gap: 1, sliding velocity: 1); here floor open (gap 1), floor friction free" in rows[0]["modes"]
+        and "up to 2 forces" in rows[0]["solved together"]
+    )
+
+
+@pytest.mark.slow
+def test_drawn():
+    """Under the curves a strip shows from when until when it slides and sticks."""
+    pytest.importorskip("matplotlib")
+    traj = computed()
+    strips = traj._strips()
+    assert [word for *_, word in strips["floor"]] == ["open", "closed"]
+    (_, _, free), (start, end, slides), (_, last, sticks) = strips["floor friction"]
+    assert (free, slides, sticks) == ("free", "slides", "sticks")
+    np.testing.assert_allclose([start, end, last], [RESTS, STOPS, 5.0], atol=1e-5)
+    strip = traj.plot().axes[-1]
+    assert [label.get_text() for label in strip.get_yticklabels()] == ["floor", "floor friction"]
+    assert [text.get_text() for text in strip.get_legend().get_texts()] == ["open, free", "closed", "slides", "sticks"]
+
+
+@pytest.mark.exhaustive
+def test_fitted():
+    """Friction and restitution from positions; with windows it is refused in words."""
+    bounces = lj.Contact(floor.gap, lambda p: p["e"], friction=floor.friction, sliding=floor.sliding)
+    system = lj.System(block.lagrangian, elements={"floor": bounces})
+    t = np.linspace(0.0, 3.0, 31)
+    record = lj.Record(
+        t, q=np.asarray(thrown(ts=tuple(t)).q), q0=np.array([0.0, 1.0]), v0=np.array([THROWN, 0.0]), hold_q=True,
+        hold_v=True,
+    )  # fmt: skip
+    guess = PARAMS | {"mu": 0.13, "e": 0.45}
+    found = lj.fit(system, record, guess, free=["mu", "e"], progress=False)
+    assert found.converged
+    np.testing.assert_allclose([found.params["mu"], found.params["e"]], [MU, E], atol=1e-8)
+    with pytest.raises(ValueError, match="may be inside a contact"):
+        lj.fit(system, record, guess, free=["mu", "e"], window=0.5)
+
+
 @pytest.mark.exhaustive
 def test_a_lane_of_a_batch(tmp_path):
     """A lane of a batch, which has its own modes, continues, before and after it was in a file."""
