@@ -14,7 +14,7 @@ NO_PHASE = -1
 
 
 def mode_in_words(way: int, mode: int, count: int, gaps: int, springs: int, controls: int) -> str:
-    """A mode in a word; `way`: its place among `count` modes: of gaps, of sliding velocities, of springs, of controls."""
+    """A mode in a word; `way`: its place among `count` modes: of gaps, of what slides, of springs, of controls."""
     if way < gaps:
         return "closed" if mode else "open"
     if way >= count - controls:
