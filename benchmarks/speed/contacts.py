@@ -1,0 +1,286 @@
+"""Contacts and dry friction from elements: error over time, beside MuJoCo and a time-stepping scheme in NumPy.
+
+    cradle   a ball strikes four others, 0.01 apart; the last one goes on with its speed, the others rest
+    stack    a block is thrown onto four that lie on each other, slides, and stops; the four stay
+    spring   a block on a spring and a rough floor stops after four swings
+
+Each has a closed form, and the error is that of the final positions. lagjax is called with rtol 1e-10, MuJoCo and the
+time-stepping scheme with several steps; contacts of MuJoCo are stiffer for shorter steps, so that they converge. The
+scheme is that of Moreau and Jean, with projected Gauss-Seidel; most of its time is that of Python, so it says what its
+steps reach, and not how fast they could be.
+
+First answers are processor time in a new process, without importing. Lanes are blocks on springs that stop, each with
+another coefficient of friction, beside as many without friction.
+
+Source: Todorov, ICRA 2014 (MuJoCo); Jean, Comput. Methods Appl. Mech. Eng. 177 (1999) 235; Acary & Brogliato, §10.
+
+    python -m benchmarks.speed.contacts [--json FILE] [--only TEXT] [--processor-time]
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax as lj
+from benchmarks.measure import CLOCK, in_new_process, in_turn, main, row, skipped
+
+try:
+    import mujoco
+except ImportError:
+    mujoco = None
+
+jax.config.update("jax_enable_x64", True)
+G, MU, K, D, APART = 9.81, 0.3, 100.0, 0.1, 0.01
+LANES, STEPS, COARSE = 1000, (1e-3, 1e-4, 1e-5), (1e-2, 1e-3)
+# A contact of MuJoCo lasts so many steps.
+LASTS = 20
+
+
+class Example(NamedTuple):
+    """A motion until `until`, its final positions, and how each tool is told of it.
+
+    `rows` (k, n): ∂gap/∂q, then ∂sliding velocity/∂v; `gaps` at q = 0; `pairs`: for each sliding velocity its gap, or
+    None where the normal force is constant.
+    """
+
+    system: lj.System
+    q0: np.ndarray
+    v0: np.ndarray
+    until: float
+    exact: np.ndarray
+    xml: Callable
+    rows: np.ndarray
+    gaps: np.ndarray
+    pairs: tuple
+    restitution: float
+    force: Callable
+
+
+def cradle() -> Example:
+    """Five balls of diameter D."""
+    gaps = lj.Contact(lambda t, q, p: q[1:] - q[:-1] - D, restitution=1.0)
+    system = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), elements={"balls": gaps})
+    q0, v0 = (D + APART) * np.arange(5.0), np.eye(5)[0]
+    # The ball that moves covers four gaps, and goes on in the place of the next.
+    exact = q0 + APART
+    exact[-1] = q0[-1] + (1.0 - 4 * APART)
+
+    def xml(step):
+        balls = [f'<body pos="{x} 0 0"><joint type="slide" axis="1 0 0"/><geom size="{D / 2}" mass="1"/></body>' for x in q0]
+        stiff = (np.pi / (LASTS * step)) ** 2
+        return f'<geom condim="1" solref="{-stiff} 0" solimp="0.9999 0.9999 1"/>', 0.0, "".join(balls)
+
+    rows, zero = np.diff(np.eye(5), axis=0), lambda q: 0 * q
+    return Example(system, q0, v0, 1.0, exact, xml, rows, np.full(4, -D), (), 1.0, zero)
+
+
+def stack() -> Example:
+    """Five blocks of height 1; coordinates are the places, then the heights. The highest one is thrown."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * jnp.sum(v**2) - G * jnp.sum(q[5:])
+
+    under = lambda x, ground: x - jnp.concatenate([jnp.array([ground]), x[:-1]])
+    blocks = lj.Contact(
+        lambda t, q, p: under(q[5:], -0.5) - 1.0, friction=MU, sliding=lambda t, q, v, p: under(v[:5], 0.0)
+    )
+    q0, v0, drop, speed = np.append(np.zeros(5), np.arange(5) + 0.5), np.zeros(10), 0.2, 2.0
+    q0[-1], v0[4] = q0[-1] + drop, speed
+    fall = np.sqrt(2 * drop / G)
+    exact = np.append(np.zeros(5), np.arange(5) + 0.5)
+    exact[4] = speed * fall + (speed - MU * G * fall) ** 2 / (2 * MU * G)
+    body = (
+        '<body pos="0 0 {}"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+        '<geom type="box" size="0.5 0.5 0.5" mass="1"/></body>'
+    )
+
+    def xml(step):
+        ground = '<geom type="plane" size="9 9 1"/>'
+        return (
+            f'<geom condim="3" friction="{MU} 0 0" solref="{2 * step} 1" solimp="0.99 0.99 1"/>',
+            G,
+            ground + "".join(body.format(z) for z in q0[5:]),
+        )
+
+    differences = np.eye(5) - np.eye(5, k=-1)
+    rows = np.kron(np.eye(2)[::-1], differences)
+    system, gaps = lj.System(lagrangian, elements={"blocks": blocks}), np.append(-0.5, -np.ones(4))
+    weight = -G * np.append(np.zeros(5), np.ones(5))
+    return Example(system, q0, v0, 1.5, exact, xml, rows, gaps, tuple(range(5)), 0.0, lambda q: weight)
+
+
+def spring() -> Example:
+    """The block is let go at 0.5, swings with ω = 10, and loses 2 μ g / K in each half swing."""
+    floor = lj.Friction(lambda t, q, v, p: v, MU, normal=G)
+    system = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 0.5 * K * jnp.sum(q**2), elements={"floor": floor})
+
+    def xml(step):
+        joint = f'<joint type="slide" stiffness="{K}" frictionloss="{MU * G}" solreffriction="{2 * step} 1"/>'
+        return "<geom/>", 0.0, f'<body>{joint}<geom size="0.1" mass="1"/></body>'
+
+    rests, q0 = np.array([0.5 - 16 * MU * G / K]), np.array([0.5])
+    return Example(system, q0, 0 * q0, 3.0, rests, xml, np.eye(1), np.zeros(0), (None,), 0.0, lambda q: -K * q)
+
+
+def by_lagjax(of: Example):
+    """The final positions as a function without arguments."""
+    ts = jnp.array([0.0, of.until])
+    return lambda: lj.integrate(of.system, of.q0, of.v0, ts=ts, rtol=1e-10, estimate_error=False).q[-1]
+
+
+def by_mujoco(of: Example, step: float):
+    """The same from MuJoCo; its coordinates are measured from the start, body by body."""
+    defaults, gravity, bodies = of.xml(step)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="{step}" gravity="0 0 {-gravity}" integrator="implicitfast" cone="elliptic"/>'
+        f"<default>{defaults}</default><worldbody>{bodies}</worldbody></mujoco>"
+    )
+    data, count = mujoco.MjData(model), round(of.until / step)
+    start = np.zeros_like(of.q0) if model.ngeom > 1 else of.q0
+
+    def order(x):
+        """Ours to MuJoCo's."""
+        return x.reshape(2, -1).T.ravel() if x.size == 10 else x
+
+    def solve():
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = order(start), order(of.v0)
+        for _ in range(count):
+            mujoco.mj_step(model, data)
+        moved = data.qpos.reshape(-1, 2).T.ravel() if of.q0.size == 10 else data.qpos
+        return of.q0 - start + moved
+
+    return solve
+
+
+def by_time_stepping(of: Example, step: float, sweeps: int = 50):
+    """The same from the scheme of Moreau and Jean, θ = 1/2, unit masses."""
+    normals, rows = len(of.gaps), of.rows
+    own, count = np.sum(rows**2, axis=1), round(of.until / step)
+
+    def solve():
+        q, v = of.q0.copy(), of.v0.copy()
+        for _ in range(count):
+            middle = q + 0.5 * step * v
+            closed = rows[:normals] @ middle + of.gaps <= 0
+            before, v = rows @ v, v + step * of.force(middle)
+            impulses = np.zeros(len(rows))
+            for _ in range(sweeps if np.any(closed) or normals < len(rows) else 0):
+                last = impulses.copy()
+                for i in np.flatnonzero(closed):
+                    wanted = rows[i] @ v + of.restitution * min(before[i], 0.0)
+                    new = max(0.0, impulses[i] - wanted / own[i])
+                    v, impulses[i] = v + rows[i] * (new - impulses[i]), new
+                for j, pair in enumerate(of.pairs):
+                    i = normals + j
+                    most = MU * (step * G if pair is None else impulses[pair])
+                    new = np.clip(impulses[i] - rows[i] @ v / own[i], -most, most)
+                    v, impulses[i] = v + rows[i] * (new - impulses[i]), new
+                if np.max(np.abs(impulses - last)) <= 1e-14:
+                    break
+            q = middle + 0.5 * step * v
+        return q
+
+    return solve
+
+
+def compared(name: str, of: Example, wanted):
+    """Rows of one example."""
+
+    def error(q) -> float:
+        return float(np.max(np.abs(np.asarray(q) - of.exact)))
+
+    if not wanted(name):
+        return
+    ours = by_lagjax(of)
+    started = CLOCK["seconds"]()
+    off = error(ours())
+    first, ours_s = CLOCK["seconds"]() - started, in_turn(ours).medians[0]
+    yield row(f"{name}: lagjax, s a call", ours_s, error=off, first_answer_s=first)
+    for tool, prepare, steps in (("MuJoCo", by_mujoco, STEPS), ("time-stepping", by_time_stepping, COARSE)):
+        if tool == "MuJoCo" and mujoco is None:
+            yield skipped(f"{name}: {tool}", "mujoco is not installed")
+            continue
+        for step in steps:
+            theirs = prepare(of, step)
+            reached = error(theirs())
+            times = in_turn(ours, theirs, repeats=3)
+            target = 1.0 if tool == "MuJoCo" and step == steps[-1] and name != "spring" else None
+            what = f"{name}: lagjax / {tool}, step {step:g}"
+            yield row(what, times.ratio()[0], target, seconds=times.medians[1], error=reached)
+
+
+def lanes(wanted):
+    """1,000 blocks that stop, beside 1,000 without friction."""
+    what = f"{LANES} lanes of the block on a spring: with dry friction / without"
+    if not wanted(what):
+        return
+
+    def lagrangian(t, q, v, mu):
+        return 0.5 * v**2 - 0.5 * K * q**2
+
+    rough = lj.System(lagrangian, elements={"floor": lj.Friction(lambda t, q, v, mu: v, lambda mu: mu, normal=G)})
+
+    def batch(system):
+        ts, settings = jnp.array([0.0, 3.0]), {"estimate_error": False, "throw": False}
+        return jax.jit(jax.vmap(lambda mu: lj.integrate(system, 0.5, 0.0, mu, ts=ts, **settings).q[-1]))
+
+    mu = jnp.linspace(0.2, 0.4, LANES)
+    with_friction, without = batch(rough), batch(lj.System(lagrangian))
+    times = in_turn(lambda: with_friction(mu), lambda: without(mu), repeats=7)
+    turns = np.ceil(0.5 * K / (2 * np.asarray(mu) * G) - 0.5)
+    rests = (-1.0) ** turns * (0.5 - turns * 2 * np.asarray(mu) * G / K)
+    off = float(np.max(np.abs(np.asarray(with_friction(mu)) - rests)))
+    yield row(what, times.ratio()[0], 2, seconds=times.medians[0], without_s=times.medians[1], error=off)
+
+
+START = """
+import json, time
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+import lagjax as lj
+from lagjax.scenes import rolling_hoop, slipping_hoop
+two, ts = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 9.81 * q[1], np.array([0.0, 1.0, 2.0])
+floor, wall = lj.Contact(lambda t, q, p: q[1], 0.5), lj.Contact(lambda t, q, p: 1.0 - q[0], 0.5)
+rough = lj.Contact(lambda t, q, p: q[1], 0.5, 0.1, lambda t, q, v, p: v[0])
+hoop = lj.Contact(rolling_hoop.contact, friction=lambda p: p["mu"], sliding=rolling_hoop.rolling)
+swing, still = lambda t, q, v, p: 0.5 * v["x"] ** 2 - 0.5 * q["x"] ** 2, {"x": 0.0}
+q0, v0, params = np.array([0.0, 1.0]), np.array([0.7, 0.0]), slipping_hoop.PARAMS
+"""
+HOOP = "rolling_hoop.start(params, 1.5, rolling_hoop.exact_rate(params, 1.5, rolling_hoop.TOP))"
+ANSWERS = {
+    "a ball": ("lj.System(two, elements={'floor': floor})", "(q0, v0)"),
+    "a block with friction": ("lj.System(two, elements={'floor': rough})", "(q0, v0)"),
+    "two contacts": ("lj.System(two, elements={'floor': floor, 'wall': wall})", "(q0, v0)"),
+    "a state beside": ("lj.System(swing, states={'z': lambda t, q, v, p: v['x'] ** 2})", "({'x': 1.0, 'z': 0.0}, still)"),
+    "the hoop": ("lj.System(rolling_hoop.lagrangian, elements={'cylinder': hoop, "
+                 "'ground': lj.Contact(slipping_hoop.height)})", HOOP),
+}  # fmt: skip
+
+
+def first_answers(wanted):
+    """Processor time until the first answer, in a new process."""
+    for name, (system, start) in ANSWERS.items():
+        what = f"first answer, {name}, s"
+        if not wanted(what):
+            continue
+        source = (
+            f"{START}\nsystem, (q0, v0) = {system}, {start}\nstarted = time.process_time()\n"
+            "lj.integrate(system, q0, v0, params, ts=ts)\nprint(json.dumps(time.process_time() - started))"
+        )
+        yield row(what, in_new_process(source), 6.0 if name == "the hoop" else None)
+
+
+def rows(wanted):
+    """Examples, lanes, first answers."""
+    for name, example in (("cradle", cradle), ("stack", stack), ("spring", spring)):
+        yield from compared(name, example(), wanted)
+    yield from lanes(wanted)
+    yield from first_answers(wanted)
+
+
+if __name__ == "__main__":
+    main(rows, __doc__)
