@@ -9,7 +9,7 @@ import numpy as np
 from lagjax.integrate.events.event import EventWarning, Guards
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, HybridTrajectory
 from lagjax.integrate.trajectory.results import RESULTS, is_among
-from lagjax.mechanics import describe
+from lagjax.mechanics import describe, listed
 from lagjax.system import State, warn
 
 # Outputs at which guards are evaluated; a change by the last digit that is no round-off, as a share of the guard, and
@@ -85,6 +85,9 @@ def rejected_by_guards(guards: str, stats: Mapping, without: float) -> str:
 
 def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:
     """The guard of an event, or that of a switch, that cannot be followed; why, with a number, or ""; and the fix."""
+    shifted = "shift the level of the guard a little; or make the motion take shorter steps, max_step="
+    if trajectory.system.elements is not None:
+        return (f"the modes {listed(trajectory.switches.ways)}" if name == SWITCHES else f"event '{name}'"), "", shifted
     instants, step = _instants(trajectory), _step(trajectory)
     candidates = [
         (i, kind.name.partition(", number ")[0] if name == SWITCHES else name, guard, kind.takes_multipliers)
@@ -97,7 +100,7 @@ def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:
         if found:
             return _called(of, name), *found
     names = " or ".join(dict.fromkeys(_called(of, name) for _, of, _, _ in candidates))
-    return names, "", "shift the level of the guard a little; or make the motion take shorter steps, max_step="
+    return names, "", shifted
 
 
 def _called(of, name: str):

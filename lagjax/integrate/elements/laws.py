@@ -300,7 +300,7 @@ class Laws(eqx.Module):
             own, reach = law.after(t, q, v, given, fired[slice(*law.at)], sizes)
             modes = modes.at[slice(*law.at)].set(own.astype(modes.dtype))
             slack.append(reach)
-        return self.given(given.params, modes), jnp.concatenate(slack)
+        return self.given(given.params, modes, given.slack), jnp.concatenate(slack)
 
     def forces(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> dict[str, Array]:
         """F of what is compliant, by name."""

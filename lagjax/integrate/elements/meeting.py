@@ -275,7 +275,9 @@ class Meeting(eqx.Module):
         free = rows.jacobian @ a - every.gamma[mine]
         slopes = self._slopes(model, t, x, u)
         eps = jnp.finfo(x.dtype).eps
-        still = STILL_BELOW * eps * scale[:, 1]
+        # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
+        slid = jnp.where(jnp.abs(given.modes) == 1, given.slack, 0.0)[: slopes.size].at[:normals].set(0.0)
+        still = STILL_BELOW * jnp.maximum(eps * scale[:, 1], slid / CLOSED_BELOW)
         slower = jnp.concatenate(
             [*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)]
         )

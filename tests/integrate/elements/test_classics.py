@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.slipping_hoop import FIRST, PARAMS, exact, height
-from tests.integrate.elements.test_motions import moved
+from tests.integrate.elements.test_motions import MU, K, moved, rubbed
 from tests.system.test_hybrid import G
 
 
@@ -213,3 +214,72 @@ def test_a_start_inside():
         in_contact(gap, 0.5)
     with pytest.raises(ValueError, match="(?s)constraints 'rail' fix the gap 'floor' = -0.5.*leave out the contact"):
         in_contact(lambda t, q, p: q["y"] - 1.0, 0.5, lambda t, q, p: q["y"] - 0.5)
+
+
+@pytest.mark.exhaustive
+def test_a_block_that_stops_where_nothing_pulls():
+    """It stops after seven swings where its spring is slack, and where that pulls as much as friction holds, but for
+    1e-6; its velocity is zero whenever modes change, and only the motion between says how fast it was."""
+    lost = MU * G / K
+    for swings, off in ((7, 1e-6), (7, -1e-6), (7, 1 - 1e-6)):
+        traj = moved(rubbed(), (2 * swings + off) * lost, 0.0, MU, ts=np.array([0.0, 4.0]), rtol=1e-11)
+        assert len(traj.switches) == swings
+        np.testing.assert_allclose(traj.q[-1], (-1) ** swings * off * lost, atol=1e-10)
+
+
+def on_a_belt(coefficient) -> lj.System:
+    """A block on a spring, and on a belt that moves with p["belt"]; μ g = 1 at rest."""
+    spring = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2
+    belt = lj.Friction(lambda t, q, v, p: v - p["belt"], coefficient, normal=1.0, static=1.0)
+    return lj.System(spring, elements={"belt": belt})
+
+
+@pytest.mark.slow
+def test_stick_slip_on_a_belt():
+    """The period of the cycle of sticking and slipping, static friction 1 and kinetic 0.4: closed form to 1e-10.
+    Twin: without the difference it slips once, and touches the speed of the belt no more than within round-off."""
+    system, ts = on_a_belt(lambda p: p["mu"]), np.array([0.0, 20.0])
+
+    def switches(mu, belt=0.2):
+        return moved(system, 0.9, belt, {"mu": mu, "belt": belt}, ts=ts, rtol=1e-11).switches
+
+    def period(mu: float, belt=0.2) -> float:
+        """It slips from 1 about mu with v = belt, and sticks again at the mirror image of that, 2 mu - 1."""
+        return 2 * (1 - mu) / belt + 2 * np.pi - 2 * np.arctan((1 - mu) / belt)
+
+    found = switches(0.4)
+    np.testing.assert_allclose(found.t[0], 0.1 / 0.2, rtol=1e-10)
+    np.testing.assert_allclose(found.t[2] - found.t[0], period(0.4), rtol=1e-10)
+    np.testing.assert_allclose(found.q[:3], [1.0, -0.2, 1.0], rtol=1e-10)
+    assert np.asarray(found.modes)[:4, 0].tolist() == [-1, 2, -1, 2]
+    with pytest.warns(lj.EventWarning, match="(?s)modes 'belt' may be missing.*Fix"):
+        found = switches(1.0)
+    assert found.t[2] - found.t[1] < 1e-4
+
+
+@pytest.mark.exhaustive
+def test_stick_slip_by_stribeck():
+    """With friction that falls with speed, from 1 to 0.4: the period against SciPy, to 1e-9. Twin: it is not that of
+    friction which falls at once."""
+    params = {"mu": 0.4, "belt": 0.2}
+    falls = lambda speed, p: p["mu"] + (1 - p["mu"]) * jnp.exp(-speed / 0.1)
+    traj = moved(on_a_belt(falls), 0.9, 0.2, params, ts=np.array([0.0, 20.0]), rtol=1e-11)
+
+    def rate(t, y):
+        return [y[1], 0.4 + 0.6 * np.exp((y[1] - 0.2) / 0.1) - y[0]]
+
+    def as_fast_as_the_belt(t, y):
+        return y[1] - 0.2
+
+    # It begins to slip as t³, from the limit of sticking on.
+    h = 1e-3
+    as_fast_as_the_belt.terminal, as_fast_as_the_belt.direction = True, 1
+    start = solve_ivp(rate, (0.0, h), [1.0, 0.2], method="DOP853", rtol=1e-13, atol=1e-15)
+    slip = solve_ivp(
+        rate, (h, 20.0), start.y[:, -1], method="DOP853", rtol=1e-13, atol=1e-15, events=as_fast_as_the_belt
+    )
+    period = slip.t[-1] + (1.0 - slip.y[0, -1]) / 0.2
+    times = traj.switches.t
+    np.testing.assert_allclose(times[2] - times[0], period, rtol=1e-9)
+    at_once = 2 * 0.6 / 0.2 + 2 * np.pi - 2 * np.arctan(0.6 / 0.2)
+    assert abs(period - at_once) > 0.1
