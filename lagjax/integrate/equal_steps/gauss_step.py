@@ -3,7 +3,7 @@
 The unknowns of a step are the velocities V_i at its nodes, the multipliers λ_j of constraints on positions at Lobatto's
 nodes but the last, and those of velocity constraints, μ_i, at Gauss' nodes. They are found by iteration. With what the
 momenta at node i, the positions and the velocities still lack, R_i, r_i, each node has the same small system with the
-matrices at the start of the step:
+matrices in the middle of the step:
 
     [M  -Aᵀ] [δV_i]   [R_i]
     [A   0 ] [δκ_i] = [r_i]        κ = h ã λ, or h a μ: what the multipliers add to the momenta at the nodes
@@ -33,6 +33,8 @@ MOST_ITERATIONS = 60
 AT_LEAST = 4
 # A step is solved if the last correction is below this power of the round-off, in kinetic energy.
 SOLVED = 1.2
+# Iteration ends where less than this part of a round-off is missing.
+ENOUGH = 0.1
 # Or if it is below so many round-offs of positions, over the length of the step.
 ROUND_OFFS = 100
 # The corrections that make first and second derivatives right.
@@ -49,17 +51,16 @@ class Unknown(NamedTuple):
 class Way(NamedTuple):
     """The state between two steps.
 
-    `x_rest`, `p_rest`: what is to be added to x and p; `inverse`: of the matrix above; `round_off`: that of x, squared,
-    in the metric of M.
+    `x_rest`, `p_rest`: what is to be added to x and p; `velocities`, `multipliers`: at the nodes of the last two steps,
+    and of the last one.
     """
 
     x: Float[Array, " n"]
     x_rest: Float[Array, " n"]
     p: Float[Array, " n"]
     p_rest: Float[Array, " n"]
-    stages: Unknown
-    inverse: Float[Array, "nm nm"]
-    round_off: Float[Array, ""]
+    velocities: Float[Array, "2s n"]
+    multipliers: Float[Array, "s m"]
     unsolved: Bool[Array, ""]
 
 
@@ -74,34 +75,36 @@ class GaussStep(NamedTuple):
     def first(self, t: Array, x: Array, u: Array) -> Way:
         """The state at the start."""
         s, none = len(self.tableau.nodes), jnp.zeros_like(x)
-        stages = Unknown(jnp.tile(u, (s, 1)), jnp.zeros((s, self.model.m), x.dtype))
-        return Way(x, none, self._momentum(t, x, u), none, stages, *self._matrices(t, x, u), jnp.asarray(False))
+        multipliers = jnp.zeros((s, self.model.m), x.dtype)
+        p = self._momentum(t, x, u)
+        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, jnp.asarray(False))
 
     def advanced(self, way: Way, t: Array, h: Array) -> Way:
         """The state after a step from t to t + h."""
-        tab, guess = self.tableau, way.stages
-        guess = Unknown(tab.ahead.astype(h.dtype) @ guess.velocities, guess.multipliers)
+        s, dtype = len(self.tableau.nodes), h.dtype
+        # Beyond steps that are longer than an oscillation a polynomial through them leads nowhere.
+        ahead = np.repeat([[0.0, 1 / s]], s, axis=1).repeat(s, axis=0) if self.newton else self.tableau.ahead
+        guess = Unknown(ahead.astype(dtype) @ way.velocities, way.multipliers)
         found, solved = self._solved(stop_gradient(way), *stop_gradient((t, h, guess)))
         if self.differentiated:
             found = self._with_derivatives(way, t, h, found)
         at = self._at_nodes(way, t, h, found)
         x, x_rest = added(way.x, way.x_rest + jnp.sum(at.moves, axis=0))
         dp = way.p_rest + jnp.sum(at.kicks, axis=0) + jnp.sum(at.impulses, axis=0)
-        u = tab.at_end.astype(h.dtype) @ found.velocities
-        inverse, round_off = self._matrices(t + h, x, u)
         if self.model.m:
-            u, dp = self._at_end(t + h, x, way.p, dp, u, inverse)
+            _, dp = self._at_end(t + h, x, way.p, dp, self.tableau.at_end.astype(dtype) @ found.velocities)
         p, p_rest = added(way.p, dp)
-        return Way(x, x_rest, p, p_rest, found, inverse, round_off, way.unsolved | ~solved)
+        velocities = jnp.concatenate([way.velocities[s:], found.velocities])
+        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, way.unsolved | ~solved)
 
     def velocity(self, way: Way, t: Array) -> Float[Array, " n"]:
         """The velocity that belongs to the momentum."""
-        u = self.tableau.at_end.astype(t.dtype) @ way.stages.velocities
-        return self._at_end(t, way.x, way.p, way.p_rest, u, way.inverse)[0]
+        u = self.tableau.at_end.astype(t.dtype) @ way.velocities[len(self.tableau.nodes) :]
+        return self._at_end(t, way.x, way.p, way.p_rest, u)[0]
 
-    def _at_end(self, t: Array, x: Array, p: Array, dp: Array, u: Array, inverse: Array):
+    def _at_end(self, t: Array, x: Array, p: Array, dp: Array, u: Array):
         """The velocity at x with the momentum p + dp, and dp with the impulse that keeps it on the constraints."""
-        model = self.model
+        model, (inverse, _) = self.model, self._matrices(t, x, u)
         rows = constraints.jacobian(model, t, x, u)
         for _ in range(CORRECTIONS):
             lacks = dp + (p - self._momentum(t, x, u))
@@ -162,15 +165,17 @@ class GaussStep(NamedTuple):
         return AtNodes(momenta, moves, kicks, impulses, short, lacks)
 
     def _solved(self, way: Way, t: Array, h: Array, guess: Unknown) -> tuple[Unknown, Bool[Array, ""]]:
-        """The unknowns, by iteration with the matrices at the start; and whether that came to an end."""
+        """The unknowns, by iteration, and whether that came to an end."""
         step = self._replace(model=stop_gradient(self.model))
         small = jnp.finfo(h.dtype).eps
-        inverse = step._whole_inverse(way, t, h, guess) if self.newton else None
+        middle = way.x + h * (self.tableau.to_middle.astype(h.dtype) @ guess.velocities)
+        at_nodes, round_off = step._matrices(t + h / 2, middle, jnp.mean(guess.velocities, axis=0))
+        whole = step._whole_inverse(way, t, h, guess) if self.newton else None
 
         def better(state: tuple) -> tuple:
             z, before, _, _, count = state
             at = step._at_nodes(way, t, h, z)
-            du, dm, dk = step._change(way, h, at, inverse)
+            du, dm, dk = step._change(h, at, at_nodes, whole)
             # In the metric of M: M δV = R + Aᵀ δκ, where forces change little.
             size = jnp.abs(jnp.sum(du * at.short)) + jnp.abs(jnp.sum(dk * at.lacks))
             motion = jnp.abs(jnp.sum(z.velocities * at.momenta))
@@ -179,21 +184,23 @@ class GaussStep(NamedTuple):
         def goes_on(state: tuple) -> Array:
             _, size, before, motion, count = state
             closer = (size < before) | (count < AT_LEAST)
-            return (size > small**2 * motion) & closer & (count < MOST_ITERATIONS)
+            # What is still missing, at the rate of the last two corrections.
+            missing = size * jnp.where(jnp.isfinite(before) & (before > 0), jnp.minimum(size / before, 1.0), 1.0)
+            return (missing > (ENOUGH * small) ** 2 * motion) & closer & (count < MOST_ITERATIONS)
 
         infinite = jnp.asarray(jnp.inf, h.dtype)
         start = better((guess, infinite, infinite, infinite, jnp.asarray(0)))
         z, size, _, motion, _ = lax.while_loop(goes_on, better, start)
-        return z, size <= small**SOLVED * motion + ROUND_OFFS**2 * way.round_off / h**2
+        return z, size <= small**SOLVED * motion + ROUND_OFFS**2 * round_off / h**2
 
-    def _change(self, way: Way, h: Array, at: "AtNodes", inverse: Array | None) -> tuple[Array, Array, Array]:
+    def _change(self, h: Array, at: "AtNodes", at_nodes: Array, whole: Array | None) -> tuple[Array, Array, Array]:
         """The changes of V and of the multipliers that give what is lacking, and δκ."""
         n, lacks = self.model.n, jnp.concatenate([at.short, at.lacks], axis=1)
-        if inverse is None:
-            change = lacks @ way.inverse.T
+        if whole is None:
+            change = lacks @ at_nodes.T
             return change[:, :n], self._multipliers(change[:, n:], h), change[:, n:]
         s, m = at.lacks.shape
-        change = -inverse @ jnp.concatenate([at.short.ravel(), at.lacks.ravel()])
+        change = -whole @ jnp.concatenate([at.short.ravel(), at.lacks.ravel()])
         dm = change[s * n :].reshape(s, m)
         return change[: s * n].reshape(s, n), dm, h * dm
 

@@ -93,8 +93,9 @@ class Tableau(NamedTuple):
     """The coefficients of the method with s stages, as in the text above.
 
     `nodes`, `weights` (s,): c, b; `mixed` (s, s): μ; `lobatto_nodes`, `lobatto_weights` (s + 1,): c̃, b̃; `to_nodes`
-    (s + 1, s): ν. `ahead` (s, s): from values at the nodes of a step to those of the polynomial through them at the
-    nodes of the next one; `at_end` (s,): to its value at the end.
+    (s + 1, s): ν. From values at the nodes of two steps, `ahead` (s, 2 s) leads to those of the polynomial through them
+    at the nodes of the next step; from values at the nodes of a step, `at_end` (s,) to that at its end, and `to_middle`
+    (s,) from velocities to half the way.
     """
 
     nodes: np.ndarray
@@ -105,6 +106,7 @@ class Tableau(NamedTuple):
     to_nodes: np.ndarray
     ahead: np.ndarray
     at_end: np.ndarray
+    to_middle: np.ndarray
 
     @property
     def inner(self) -> np.ndarray:
@@ -134,7 +136,7 @@ def tableau(stages: int) -> Tableau:
     last = legendre.Legendre.basis(stages)
     ends = np.concatenate([[-1.0], np.sort(np.real(last.deriv().roots())), [1.0]])
     lobatto = (ends + 1) / 2
-    basis = [_lagrange(nodes, j) for j in range(stages)]
+    basis, both = [_lagrange(nodes, j) for j in range(stages)], np.concatenate([nodes - 1, nodes])
     integrals = [ell.integ(lbnd=0.0) for ell in basis]
     mixed = np.stack([p(nodes) for p in integrals], axis=1) / weights
     lower = np.tril_indices(stages, -1)
@@ -143,7 +145,8 @@ def tableau(stages: int) -> Tableau:
     return Tableau(
         nodes, weights, mixed, lobatto, 1 / (stages * (stages + 1) * last(ends) ** 2),
         to_nodes=np.stack([p(lobatto) for p in integrals], axis=1) / weights,
-        ahead=np.stack([ell(1 + nodes) for ell in basis], axis=1), at_end=np.array([ell(1.0) for ell in basis]),
+        ahead=np.stack([_lagrange(both, j)(1 + nodes) for j in range(2 * stages)], axis=1),
+        at_end=np.array([ell(1.0) for ell in basis]), to_middle=np.array([p(0.5) for p in integrals]),
     )  # fmt: skip
 
 
