@@ -58,7 +58,8 @@ def of_elements(trajectory, start: State) -> Exception:
         return _against_constraints(laws, user, s) or RuntimeError(
             f"there were {count} changes of modes until {when}, the last ones of {listed(last)}, and that is all there "
             "is room for.\n"
-            "Usual cause: very many impacts before a contact rests; a force that pulls a contact to and fro.\n"
+            "Usual cause: very many impacts before a contact rests; a force that pulls a contact to and fro; the "
+            "instants of a sampled control.\n"
             "Fix: elements=lj.Elements({...}, most_switches=1000); slower_than= of the contact."
         )
     if is_among(result, [RESULTS.guard_below_zero]):

@@ -179,7 +179,7 @@ def integrate(
     ts = arguments.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, with_rates(system, q0, v0), params)
     dtype = state.t.dtype
-    system = traced_phases(system if start is None else system.starting(start), state, ts[-1])
+    system = traced_phases(system if start is None else system.starting(start), state, ts)
     for phase in system.phases:
         given = state._replace(params=system.given(state.params)) if system.in_phases else state
         warn_of_odd_dissipation(phase.dissipation, given)

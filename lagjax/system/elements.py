@@ -192,7 +192,7 @@ class CompliantContact(eqx.Module):
       Crossley's damping `lambda depth, params: params["c"] * depth**1.5`.
     - `friction`, `sliding`, `static`: as for `lj.Contact`, with F as the normal force.
 
-    F is `traj.multipliers` of the element's name.
+    F is `traj.multipliers` of the element's name. A restitution is not given: it follows from k and c.
 
     **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a stiffness that is
     not above zero, a damping below zero, and for friction without a sliding velocity.

@@ -35,6 +35,32 @@ def test_bad_elements():
     np.testing.assert_allclose(lj.Stop(above, -1.0, 1.0).gap(0.0, 0.25, None), [1.25, 0.75])
 
 
+def test_bad_springs_and_controls():
+    """Signs, kinds, shapes and names of compliant contacts and sampled controls."""
+    with pytest.raises(ValueError, match="stiffness = -1.0 is not above zero"):
+        lj.CompliantContact(above, -1.0)
+    with pytest.raises(ValueError, match="damping = -1.0 is below zero"):
+        lj.CompliantContact(above, 1.0, -1.0)
+    with pytest.raises(TypeError, match="restitution"):
+        lj.CompliantContact(above, 1.0, restitution=0.5)  # pyright: ignore
+    with pytest.raises(ValueError, match="sliding is given, but friction is not"):
+        lj.CompliantContact(above, 1.0, sliding=sliding)
+    with pytest.raises(ValueError, match=r"(?s)every = 0.0 is not above zero.*Fix: every=1.0"):
+        lj.SampledControl(sliding, 0.0)
+    with pytest.raises(TypeError, match="controller must be a function"):
+        lj.SampledControl(1.0, 0.1)  # pyright: ignore
+    servo = lj.SampledControl(lambda t, q, v, p: -v["x"], 0.1)
+    energy = lambda t, q, v, p: 0.5 * v["x"] ** 2 + q["x"] * q["u"].sum()
+    cart = lj.System(energy, elements={"u": servo})
+    assert repr(cart) == "System(<lambda>; elements: u (SampledControl))" and list(cart.states) == ["u"]
+    with pytest.raises(ValueError, match=r"(?s)q0 has no entry 'u'.*Fix: q0 = \{..., 'u': 0.0\}"):
+        lj.integrate(cart, {"x": 0.0}, {"x": 0.0}, ts=[0.0, 1.0])
+    with pytest.raises(ValueError, match=r"controller\(t, q, v, params\) of element 'u' must return .* shape \(\)"):
+        lj.integrate(cart, {"x": 0.0, "u": np.zeros(2)}, {"x": 0.0}, ts=[0.0, 1.0])
+    with pytest.raises(ValueError, match="'u' is the name of a state and of a lj.SampledControl"):
+        lj.System(energy, states={"u": lambda t, q, v, p: 0.0}, elements={"u": servo})
+
+
 def test_bad_systems():
     """Names that clash or do not exist, shapes that differ; functions that take one form of equations refuse them."""
     floor = lj.Contact(above)

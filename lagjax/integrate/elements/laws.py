@@ -15,6 +15,7 @@ Sampled controls (`sampled.py`) have the number of their next instant as a mode,
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -312,14 +313,19 @@ class Laws(eqx.Module):
         for law in self.sampled:
             k = modes[law.place]
             acts = law.acts(k, t, given.params)
-            new[law.name] = jnp.where(acts, law.controller(t, q, v, given.params), q[law.name])
+            new[law.name] = jnp.where(acts, law.controller(t, q, v, given.params), q[law.name]).astype(
+                q[law.name].dtype
+            )
             modes = modes.at[law.place].add(acts)
         return ({**q, **new} if new else q), self.given(given.params, modes, given.slack)
 
-    def instants(self, start: Array, end: Array, params: PyTree) -> int:
-        """How many instants there are from the start to the end; zero where that is not known while JAX is tracing."""
-        counted = [law.first(end, params) - law.first(start, params) for law in self.sampled]
-        return 0 if is_traced(counted) else int(sum(counted))
+    def instants(self, ts: Array | np.ndarray, params: PyTree) -> int:
+        """How many instants there are between the first and the last time; zero where JAX is tracing what says so."""
+        # While JAX traces something else, numbers that it does not trace can still be counted.
+        with jax.ensure_compile_time_eval():
+            ends = jnp.asarray(ts[0]), jnp.asarray(ts[-1])
+            counted = [law.first(ends[1], params) - law.first(ends[0], params) for law in self.sampled]
+        return 0 if is_traced(counted) else sum(map(int, counted))
 
     def next_instant(self, modes: Int[Array, " k"], ts: Float[Array, " T"], params: PyTree) -> Float[Array, ""]:
         """The first of the next instants; infinite where none comes before the end. One that is an output, within
@@ -453,7 +459,8 @@ def _laws(elements: Elements, plain: System, start: State):
     for name, element in elements.items():
         if isinstance(element, SampledControl):
             every, offset = coefficients(name, "speed", every=element.every, offset=element.offset)
-            controller = traced(name, "controller", element.controller, OF_STATE, jnp.shape(start.q[name]))
+            acts = Call("controller", element.controller, OF_STATE, f" of element '{name}'")
+            controller = traced_call(acts, given, partial(_check_output, like=start.q[name]))
             sampled.append(Sampled(name, controller, every, offset, place))
             place += 1
     return tuple(normals), tuple(tangents), tuple(owners), tuple(compliant), tuple(sampled)
@@ -491,6 +498,17 @@ def _check_name(name: str, plain: System):
         raise ValueError(
             f"'{name}' is the name of an element and of a constraint, whose multipliers would have one name.\n"
             "Fix: another name for one of them; a contact that always holds is a lj.Holonomic and no element."
+        )
+
+
+def _check_output(call: Call, value, like: Array):
+    found = getattr(value, "shape", () if isinstance(value, float | int) else None)
+    if found != like.shape:
+        raise ValueError(
+            f"{call} must return its output in the shape of its entry in q0, {like.shape}, and returned "
+            f"{f'a {type(value).__name__}' if found is None else f'shape {found}'}.\n"
+            "Usual cause: several outputs of one controller, or a missing return.\n"
+            "Fix: an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each."
         )
 
 

@@ -56,12 +56,12 @@ class InElements(Hybrid):
         return repr(self.user)
 
 
-def assembled(system: System, start: State, until: Array | None) -> InElements:
-    """The assembly for a motion until then, with all functions checked and traced."""
+def assembled(system: System, start: State, ts: Array | np.ndarray | None) -> InElements:
+    """The assembly for a motion over these times, with all functions checked and traced."""
     assert system.elements is not None
     masked, laws = in_modes(system, start)
     most = system.elements.most_switches
-    if until is not None and (instants := laws.instants(start.t, until, start.params)):
+    if ts is not None and (instants := laws.instants(ts, start.params)):
         # A power of two, so that a few instants more do not compile again.
         most = 1 << (most + instants - 1).bit_length()
     hybrid = Hybrid({MOTION: masked}, most_switches=most)

@@ -68,15 +68,15 @@ class Reset(eqx.Module):
         return jtu.tree_map(lambda new, old: new + 0 * old, found, (q, v))
 
 
-def traced_phases(system: System | Hybrid, start: State, until: Array | None = None) -> Any:
+def traced_phases(system: System | Hybrid, start: State, ts: Array | np.ndarray | None = None) -> Any:
     """The system, or hybrid with its switches, with all its functions checked and traced for such states.
 
-    `until`: the end of the motion, so that there is room for the instants of sampled controls.
+    `ts`: the times of the motion, so that there is room for the instants of sampled controls.
     """
     if isinstance(system, InElements):
-        return assembled(system.user, start, until)
+        return assembled(system.user, start, ts)
     if not system.in_phases:
-        return traced_system(system, start) if system.elements is None else assembled(system, start, until)
+        return traced_system(system, start) if system.elements is None else assembled(system, start, ts)
     hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))
     return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
 

@@ -1,0 +1,204 @@
+"""Contacts with springs and dampers against closed forms and SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+from scipy.special import gamma
+
+import lagjax as lj
+from tests.integrate.elements.test_motions import moved
+
+K, G, MU = 1000.0, 9.81, 0.2
+
+
+def mat(**friction) -> lj.CompliantContact:
+    """A spring k and a damper c under q."""
+    return lj.CompliantContact(lambda t, q, p: q, lambda p: p["k"], lambda p: p["c"], **friction)
+
+
+thrown = lj.System(lambda t, q, v, p: 0.5 * v**2, elements={"mat": mat()})
+
+
+def returned(k, c):
+    """The speed after an impact of speed 1."""
+    ts = np.array([0.0, 3.0])
+    return lj.integrate(thrown, 1.0, -1.0, {"k": k, "c": c}, ts=ts, rtol=1e-12, estimate_error=False).v[-1]
+
+
+def restitution(k, c):
+    """Schwager & Pöschel 2007: the contact ends where its force does, at ω t = π - arctan2(2 β ω, ω² - β²)."""
+    b, w = c / 2, jnp.sqrt(k - c**2 / 4)
+    return jnp.exp(-b / w * (jnp.pi - jnp.arctan2(2 * b * w, w**2 - b**2)))
+
+
+@pytest.mark.slow
+def test_restitution():
+    """Impacts of four dampings at once, up to heavy ones. Twin: contacts that pull until the gap opens return less."""
+    c = np.array([0.0, 8.0, 40.0, 60.0])
+    found = jax.vmap(lambda c: returned(K, c))(c)
+    np.testing.assert_allclose(found, restitution(K, c), atol=1e-12)
+    assert np.all(found[1:] > np.exp(-np.pi * c / 2 / np.sqrt(K - c**2 / 4))[1:] + 1e-3)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_restitution():
+    """By stiffness and damping, in both modes."""
+    wanted = jax.grad(restitution, (0, 1))(K, 8.0)
+    np.testing.assert_allclose(jax.grad(returned, (0, 1))(K, 8.0), wanted, rtol=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(returned, (0, 1))(K, 8.0), wanted, rtol=1e-9)
+
+
+def bounces(k, c, ts):
+    """A ball let go at 0.5 above the mat, by SciPy, one leg after the other."""
+
+    def force(y):
+        return -k * y[0] - c * y[1]
+
+    def ends(f, direction):
+        event = lambda t, y: f(y)
+        event.terminal, event.direction = True, direction
+        return event
+
+    touch = [ends(lambda y: y[0], -1)]
+    leave = [ends(force, -1), ends(lambda y: y[0], 1)]
+    found, switches, t, y, pressed = np.zeros((len(ts), 2)), [], 0.0, [0.5, 0.0], False
+    while True:
+        rate = lambda t, y, on=pressed: [y[1], on * force(y) - G]
+        leg = solve_ivp(
+            rate, (t, ts[-1]), y, "DOP853", events=leave if pressed else touch, rtol=1e-13, atol=1e-15,
+            dense_output=True,
+        )  # fmt: skip
+        inside = (ts >= t) & (ts <= leg.t[-1])
+        found[inside] = leg.sol(ts[inside]).T
+        if leg.status != 1:
+            return found, np.array(switches)
+        t, y, pressed = leg.t[-1], leg.y[:, -1], not pressed
+        switches.append(t)
+
+
+@pytest.mark.exhaustive
+def test_a_damped_bounce():
+    """A ball bounces, lets go below the mat's surface each time, and comes to rest on it."""
+    ts, p = np.array([0.0, 0.5, 1.0, 2.0, 5.0]), {"k": K, "c": 8.0}
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - G * q, elements={"mat": mat()})
+    run = lambda p: moved(system, 0.5, 0.0, p, ts=ts, rtol=1e-12)
+    traj, (states, switches) = run(p), bounces(K, 8.0, ts)
+    np.testing.assert_allclose(np.stack([traj.q, traj.v], 1), states, atol=1e-10)
+    assert len(traj.switches) == len(switches) == 9
+    np.testing.assert_allclose(traj.switches.t[:9], switches, atol=1e-11)
+    assert np.all(traj.switches.q[1:8:2] < -1e-3)
+    pushes = np.asarray(traj.modes)[:, 0] * (-K * states[:, 0] - 8.0 * states[:, 1])
+    np.testing.assert_allclose(traj.multipliers["mat"], pushes, atol=1e-8)
+    np.testing.assert_allclose(run(p | {"k": K * 1.01}).switches.t[0], np.sqrt(1 / G), rtol=1e-12)
+
+
+def landed(element: bool):
+    """A block that slides on a mat with friction, as one element or two."""
+    sliding = lambda t, q, v, p: v["x"]
+    gap = lambda t, q, p: q["y"]
+    if element:
+        elements = {"mat": lj.CompliantContact(gap, K, 20.0, friction=lambda p: p, sliding=sliding)}
+    else:
+        elements = {"mat": lj.CompliantContact(gap, K, 20.0), "rub": lj.Friction(sliding, lambda p: p, normal="mat")}
+    system = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"], elements=elements)
+    ts = np.array([0.0, 0.1, 3.0])
+    return moved(system, {"x": 0.0, "y": 0.0}, {"x": 2.0, "y": -1.0}, MU, ts=ts, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "element", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
+)
+def test_friction_on_a_spring(element):
+    """A block falls on a mat and slides until μ times the push, added up, has taken its speed: the time in closed form.
+    Twin: the friction of its weight alone stops it at another time."""
+    traj = landed(element)
+    w = np.sqrt(K - 100.0)
+    of_speed = np.linalg.solve([[1, 0], [-10.0, w]], [G / K, -1.0])
+
+    def speed(t):
+        swing = np.exp(-10.0 * t) * np.array([np.cos(w * t), np.sin(w * t)])
+        turned = np.array([-10.0 * swing[0] - w * swing[1], -10.0 * swing[1] + w * swing[0]])
+        return 2.0 - MU * (of_speed @ turned + 1.0 + G * t)
+
+    stops = float(np.asarray(brentq(speed, 0.5, 1.5, xtol=1e-14)))
+    assert len(traj.switches) == 1 and np.asarray(traj.modes).tolist() == [[1, 1], [1, 1], [2, 1]]
+    np.testing.assert_allclose(traj.switches.t[0], stops, rtol=1e-11)
+    np.testing.assert_allclose(traj.v["x"][1:], [speed(0.1), 0.0], atol=1e-11)
+    np.testing.assert_allclose(traj.multipliers["mat"][-1], G, rtol=1e-9)
+    assert abs(stops - 2.0 / (MU * G)) > 0.05
+
+
+@pytest.mark.exhaustive
+def test_hertz():
+    """Hertz's impact takes 4√π Γ(2/5)/(5 Γ(9/10)) times its depth over its speed; Hunt and Crossley's, by SciPy."""
+    ball = lj.CompliantContact(lambda t, q, p: q, lambda d, p: 200.0 * d**0.5, lambda d, p: p * d**1.5)
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2, elements={"ball": ball})
+    run = lambda c: moved(system, 1.0, -1.0, c, ts=np.array([0.0, 3.0]), rtol=1e-12)
+    smooth = run(0.0)
+    lasts = 4 * np.sqrt(np.pi) * gamma(0.4) / (5 * gamma(0.9)) * (5 / 800.0) ** 0.4
+    np.testing.assert_allclose(smooth.switches.t[1] - smooth.switches.t[0], lasts, rtol=1e-11)
+    np.testing.assert_allclose(smooth.v[-1], 1.0, atol=1e-11)
+    out = lambda t, y: y[0] + 1e-30
+    rate = lambda t, y: [y[1], max(-y[0], 0.0) ** 1.5 * (200.0 - 60.0 * y[1])]
+    leaves = solve_ivp(rate, (0.0, 3.0), [0.0, -1.0], "DOP853", rtol=1e-12, atol=1e-15, events=out)
+    np.testing.assert_allclose(run(60.0).v[-1], leaves.y[1, -1], atol=1e-9)
+    last = lambda c: run(c).v[-1]
+    slope = (last(60.01) - last(59.99)) / 0.02
+    np.testing.assert_allclose([jax.jacfwd(last)(60.0), jax.grad(last)(60.0)], slope, rtol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_a_row_of_soft_balls():
+    """Two balls in a row of three soft gaps, one of them a wall: momentum and energy are those at the start."""
+    row = lj.CompliantContact(lambda t, q, d: q[1:] - q[:-1] - d, 1e4)
+    system = lj.System(lambda t, q, v, d: 0.5 * jnp.sum(v**2), elements={"row": row})
+    traj = moved(system, np.array([-1.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 0.1, ts=np.array([0.0, 1.02, 3.0]))
+    assert traj.multipliers["row"].shape == (3, 2) and traj.multipliers["row"][1, 0] > 1.0
+    np.testing.assert_allclose([traj.v[-1].sum(), (traj.v[-1] ** 2).sum()], 1.0, atol=1e-9)
+    # Soft balls are between a row of rigid ones that strike in turn and those that strike together.
+    assert np.all(np.diff(np.asarray(traj.v[-1])) > 0.0) and traj.v[-1, 0] < 0.0
+
+
+@pytest.mark.exhaustive
+def test_single_precision_and_both_modes_in_lanes():
+    """Lanes that fly, and that are pressed, in float32."""
+    start = jnp.array([1.0, -0.01], jnp.float32)
+    speed = jnp.array([0.5, 0.0], jnp.float32)
+    ts = np.array([0.0, 0.02], np.float32)
+    p = {"k": np.float32(K), "c": np.float32(0.0)}
+    found = jax.vmap(lambda q, v: lj.integrate(thrown, q, v, p, ts=ts))(start, speed)
+    w = np.sqrt(K)
+    np.testing.assert_allclose(found.q[:, -1], [1.01, -0.01 * np.cos(0.02 * w)], atol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_backlash_in_a_drive():
+    """A motor turns a load through a play with elastic flanks, to and fro: by SciPy in small steps. Twin: without play
+    the load goes elsewhere."""
+    play, k, c = 0.05, 400.0, 2.0
+    flanks = lambda t, q, p: p + jnp.stack([q["motor"] - q["load"], q["load"] - q["motor"]])
+    drive = lj.System(
+        lambda t, q, v, p: 0.5 * v["motor"] ** 2 + v["load"] ** 2,
+        force=lambda t, q, v, p: {"motor": jnp.cos(3.0 * t), "load": 0.0},
+        elements={"teeth": lj.CompliantContact(flanks, k, c)},
+    )
+    ts, still = np.array([0.0, 1.5, 3.0]), {"motor": 0.0, "load": 0.0}
+    traj = moved(drive, still, still, play, ts=ts, rtol=1e-11)
+
+    def rate(t, y, play):
+        turn, speed = y[0] - y[1], y[2] - y[3]
+        depth = abs(turn) - play
+        push = np.sign(turn) * max(0.0, k * depth + c * np.sign(turn) * speed) if depth > 0 else 0.0
+        return [y[2], y[3], np.cos(3.0 * t) - push, push / 2]
+
+    end, tight = (
+        solve_ivp(rate, (0.0, 3.0), np.zeros(4), "DOP853", args=(b,), rtol=1e-11, atol=1e-13, max_step=0.01).y[:, -1]
+        for b in (play, 0.0)
+    )
+    found = [traj.q["motor"][-1], traj.q["load"][-1], traj.v["motor"][-1], traj.v["load"][-1]]
+    np.testing.assert_allclose(found, end, atol=1e-8)
+    assert {traj.switches.ways[i] for i in traj.switches.way[: len(traj.switches)]} == {"teeth[0]", "teeth[1]"}
+    assert abs(tight[1] - end[1]) > 1e-3
