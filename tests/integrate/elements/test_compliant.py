@@ -72,7 +72,7 @@ def bounces(k, c, ts):
             dense_output=True,
         )  # fmt: skip
         inside = (ts >= t) & (ts <= leg.t[-1])
-        found[inside] = leg.sol(ts[inside]).T
+        found[inside] = leg.sol(np.append(ts[inside], t)).T[:-1]
         if leg.status != 1:
             return found, np.array(switches)
         t, y, pressed = leg.t[-1], leg.y[:, -1], not pressed
