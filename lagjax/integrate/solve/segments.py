@@ -212,7 +212,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
         modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
-        **({} if modes is None else phase.meeting.laws.kinds),
+        **({} if phase.meeting is None else phase.meeting.laws.kinds),
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
@@ -280,6 +280,7 @@ def _leg(
     known = known | (way.switches.count == 0) & (ts <= way.t)
     of_modes = None if way.modes is None else way.modes.modes[None]
     if phase.has_instants:
+        assert phase.meeting is not None and after.modes is not None
         # Outputs at instants have the new values.
         new = instant & onward & (ts == until)
         of_modes = jnp.where(phase.meeting.laws.is_sampled[None] & new[:, None], after.modes.modes[None], of_modes)
@@ -311,14 +312,14 @@ class PhaseEnding(NamedTuple):
 
 
 def _ending(
-    phase: Phase, result, end: Snapshot, when: tuple[Array, Array], in_phase: Array, instant: Array, way: PhaseWay,
+    phase: Phase, result, end: Snapshot, times: tuple[Array, Array], in_phase: Array, instant: Array, way: PhaseWay,
     params: PyTree, resolution: Array, rtol: Array,
 ) -> PhaseEnding:  # fmt: skip
-    """Find out what ends a leg; `when`: the times at which its guards, and events that end the motion, cross, infinite
-    for those that do not; `instant`: whether it ends at one of a sampled control."""
+    """Find out what ends a leg; `times`: those at which its guards, and events that end the motion, cross, infinite for
+    those that do not; `instant`: whether it ends at one of a sampled control."""
     at_one_time, at_start = AT_ONCE * resolution, way.switches.count == 0
     # An event that ends the motion at the time of a switch comes first.
-    when, of_events = when
+    when, of_events = times
     by_event = jnp.any(of_events <= jnp.min(when) + at_one_time)
     switched = in_phase & ((result == RESULTS.event_occurred) & ~by_event | instant)
     at_once = switched & (end.t - way.t <= at_one_time)

@@ -1,5 +1,7 @@
 """Contacts with springs and dampers against closed forms and SciPy."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +60,7 @@ def bounces(k, c, ts):
         return -k * y[0] - c * y[1]
 
     def ends(f, direction):
-        event = lambda t, y: f(y)
+        event: Any = lambda t, y: f(y)
         event.terminal, event.direction = True, direction
         return event
 
@@ -159,7 +161,7 @@ def test_a_row_of_soft_balls():
     assert traj.multipliers["row"].shape == (3, 2) and traj.multipliers["row"][1, 0] > 1.0
     np.testing.assert_allclose([traj.v[-1].sum(), (traj.v[-1] ** 2).sum()], 1.0, atol=1e-9)
     # Soft balls are between a row of rigid ones that strike in turn and those that strike together.
-    assert np.all(np.diff(np.asarray(traj.v[-1])) > 0.0) and traj.v[-1, 0] < 0.0
+    assert jnp.all(jnp.diff(traj.v[-1]) > 0.0) and traj.v[-1, 0] < 0.0
 
 
 @pytest.mark.exhaustive

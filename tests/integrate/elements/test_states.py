@@ -1,5 +1,7 @@
 """States of first order beside elements: actuators, running costs and bristles, with stops, friction and contacts."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,7 @@ def test_an_actuator_with_a_stop():
     run = lambda w: moved(drive, {"x": 0.0, "z": 0.0, "cost": 0.0}, {"x": 0.0}, w, ts=np.array([0.0, 2.5]), rtol=1e-12)
 
     def struck(w: float):
-        end = lambda t, y: y[0] - 1.0
+        end: Any = lambda t, y: y[0] - 1.0
         end.terminal, end.direction = True, 1
         rate = lambda t, y: [y[1], y[2], (w - y[2]) / LAG, 1e6 * y[1] ** 2]
         first = solve_ivp(rate, (0.0, 2.5), np.zeros(4), "DOP853", events=end, rtol=1e-13, atol=1e-13)
