@@ -154,7 +154,7 @@ def test_hertz():
 
 @pytest.mark.exhaustive
 def test_a_row_of_soft_balls():
-    """Two balls in a row of three soft gaps, one of them a wall: momentum and energy are those at the start."""
+    """One ball strikes two that touch, all of them soft: momentum and energy are those at the start."""
     row = lj.CompliantContact(lambda t, q, d: q[1:] - q[:-1] - d, 1e4)
     system = lj.System(lambda t, q, v, d: 0.5 * jnp.sum(v**2), elements={"row": row})
     traj = moved(system, np.array([-1.0, 0.1, 0.2]), np.array([1.0, 0.0, 0.0]), 0.1, ts=np.array([0.0, 1.02, 3.0]))
