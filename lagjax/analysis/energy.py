@@ -14,7 +14,7 @@ Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7; Piessens
 
 import warnings
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -112,8 +112,8 @@ class Motion:
             self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
             self.entered = InPhases(np.array([int(trajectory.system.first), *to]))
             if trajectory.modes is not None:
-                self.where = self.where._replace(given=_given(accounted, rows["modes"]))
-                self.entered = self.entered._replace(given=_given(accounted, trajectory.modes_entered()))
+                self.where = self.where._replace(given=accounted.given(None, rows["modes"]))
+                self.entered = self.entered._replace(given=accounted.given(None, trajectory.modes_entered()))
         self.sources: dict[str, int] = {}
         self.models = model_of(accounted, *self._at(0), self.params).phases
         for model in self.models:
@@ -246,7 +246,7 @@ class Motion:
     def _where(self, t) -> InPhases:
         """The phase and modes at times other than those of switches."""
         place = np.searchsorted(self.switch_times, t, side="right")
-        return jax.tree.map(lambda x: x[place], self.entered)
+        return jax.tree.map(lambda x: np.asarray(x)[place], self.entered)
 
     def switches_until(self, row: int) -> int:
         """How many switches precede an instant: an output at the time of a switch is before it, an end after it."""
@@ -274,15 +274,19 @@ class Motion:
 
     def elements(self) -> tuple[str, ...]:
         """The names of the modes of elements, those of a vector once."""
-        laws = getattr(self.trajectory.system, "laws", None)
+        laws = self.laws
         return () if laws is None else tuple(law.name for law in (*laws.normals, *laws.tangents, *laws.compliant))
+
+    @property
+    def laws(self) -> Any:
+        """The laws of the elements, if there are any."""
+        return getattr(self.trajectory.system, "laws", None)
 
     def element_of_switches(self) -> list[str]:
         """The element whose mode ended at each switch, a contact's friction counted to the contact."""
-        if self.switches is None or self.entered.given is None:
+        if self.switches is None or self.laws is None:
             return []
-        elements = self.trajectory.system.element_of_modes()
-        return [elements[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)]]
+        return [self.laws.elements[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)]]
 
     def _work(self, name: str, power, work):
         total = np.sum(work, axis=1)
@@ -312,10 +316,6 @@ def _energies(model: Model, t, q: PyTree, v: PyTree):
         return power - value, 0.5 * u @ (p - p_at_rest), -rest, abs(power) + abs(value)
 
     return jax.vmap(at)(t, q, v)
-
-
-def _given(accounted: Hybrid, modes: np.ndarray) -> InModes:
-    return jax.tree.map(np.asarray, accounted.given(None, modes))
 
 
 def _sources(model: Model) -> dict[str, int]:

@@ -230,11 +230,15 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
         ("elements", ", ".join(f"'{name}' ({type(x).__name__})" for name, x in assembly.user.elements.items())),
         ("modes", f"{laws.size} ({counted}); here {', '.join(now)}"),
         ("in these modes", f"{free} degree{'' if free == 1 else 's'} of freedom"),
-        *([("solved together", together)] if gaps + slips else []),
+        *([("solved together", together)] if gaps + slips > 1 else []),
         *([("impacts", f"of contacts that are struck together: {at_once}")] if gaps > 1 else []),
     ]
     problem = found.problem
-    if not bool(met.found):
+    inside = [name for name, value, slack in zip(laws.names[:gaps], values, met.slack) if value < -slack]
+    if inside and not problem:
+        problem = f"inside a contact: {', '.join(f'the gap {name!r} is below zero' for name in inside)}"
+        rows.append(("problem", problem))
+    elif not bool(met.found):
         problem = "no forces of these contacts obey their laws (Painlevé's paradox)"
         rows.append(("problem", problem))
     # Of the equations without elements.

@@ -40,10 +40,6 @@ class InElements(Hybrid):
         """The user's system without its elements."""
         return self.user.first_phase
 
-    def element_of_modes(self) -> tuple[str, ...]:
-        """The name of the element of each mode."""
-        return self.laws.elements
-
     def cases(self, params: PyTree) -> dict[str, PyTree]:
         """The parameters where every contact holds, and where every one that can slide does."""
         return {f" {words}": self.laws.given(params, modes) for words, modes in self.laws.all_closed().items()}

@@ -106,6 +106,7 @@ def test_energy_of_what_moves():
     belt = lj.Friction(lambda t, q, v, p: v - 1.0, 0.5, normal=10.0)
     carried = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, elements={"belt": belt})
     traj = lj.integrate(carried, 0.0, 0.0, ts=np.array([0.0, 1.0]), estimate_error=False)
+    assert isinstance(traj, lj.HybridTrajectory)
     ledger = lj.energy_ledger(traj)
     h = 0.5 * (traj.v**2 + traj.q**2)
     np.testing.assert_allclose(ledger.elements["belt"].total[-1], h[-1] - h[0], rtol=1e-8)
@@ -128,6 +129,8 @@ def test_explained():
         "2 (gap: 1, sliding velocity: 1); here floor open (gap 1), floor friction free" in rows[0]["modes"]
         and "up to 2 forces" in rows[0]["solved together"]
     )
+    inside = lj.explain(block, 0.0, np.array([0.0, -0.1]), np.zeros(2), PARAMS)
+    assert "the gap 'floor' is below zero" in str(inside.problem)
 
 
 @pytest.mark.slow
