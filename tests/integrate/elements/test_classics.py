@@ -273,7 +273,7 @@ def test_stick_slip_by_stribeck():
 
     # It begins to slip as t³, from the limit of sticking on.
     h = 1e-3
-    as_fast_as_the_belt.terminal, as_fast_as_the_belt.direction = True, 1
+    vars(as_fast_as_the_belt).update(terminal=True, direction=1)
     start = solve_ivp(rate, (0.0, h), [1.0, 0.2], method="DOP853", rtol=1e-13, atol=1e-15)
     slip = solve_ivp(
         rate, (h, 20.0), start.y[:, -1], method="DOP853", rtol=1e-13, atol=1e-15, events=as_fast_as_the_belt
