@@ -96,6 +96,9 @@ def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:
         if kind.name == name or name == SWITCHES and kind.holds
     ]
     for i, of, guard, takes in candidates:
+        # The modes that its guard depends on are not known at outputs.
+        if not isinstance(guards, Guards) and guards[i].meeting is not None and name == SWITCHES:
+            continue
         found = _cause(guard, takes, [x for x in instants if x.phase == i], step)
         if found:
             return _called(of, name), *found

@@ -36,14 +36,20 @@ class Friction(eqx.Module):
 
     **Arguments:**
 
-    - `sliding`: `sliding(t, q, v, params)`, the sliding velocity, linear in v: a number, or (k,) for k of them, each
-      with friction of its own. The force acts along `∂sliding/∂v`.
-    - `coefficient`: μ of sliding: a number, a function of `params`, or `mu(speed, params)` (Stribeck's law).
+    - `sliding`: `sliding(t, q, v, params)`, the sliding velocity s, linear in v, of the shape of its normal force: a
+      number, or (k,) for k lines with k normal forces. With (2,) behind that shape it is a velocity in a plane, where
+      the force is -μ N s/|s|: (2,) with one normal force, (k, 2) with k of them. The force acts along `∂sliding/∂v`.
+    - `coefficient`: μ of sliding: a number, a function of `params`, or `mu(speed, params)` (Stribeck's law), with the
+      speed |s|.
     - `normal`: the normal force N: a number, a function of (t, q, v, params), or the name of a constraint whose
       multiplier it is, above zero where it presses, or of a contact among the elements.
     - `static`: μ of sticking, a number or a function of `params`; by default `coefficient`, at speed zero.
 
-    **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force.
+    **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force; `ValueError`
+    for a sliding velocity of another shape.
+
+    Sliding in a plane ends at 3e-8 of the velocities in the motion (1e-4 in float32), where s/|s| is lost in round-off:
+    its time is early by as much of them over μ N, and the place of rest by the square.
 
     Source: Glocker, *Set-Valued Force Laws*, §5.3.
     """
@@ -90,7 +96,8 @@ class Contact(eqx.Module):
       function of `params`, or `e(speed, params)` of the closing speed.
     - `friction`, `static`: Coulomb's coefficients of sliding and of sticking, as for `lj.Friction`; the normal force
       is that of the contact. None: the contact is smooth.
-    - `sliding`: `sliding(t, q, v, params)`, the sliding velocity, `[gap]/[t]`, of the shape of the gap.
+    - `sliding`: `sliding(t, q, v, params)`, the sliding velocity, `[gap]/[t]`, of the shape of the gap: along a line;
+      or of that shape with (2,) behind: in a plane, as for `lj.Friction`.
     - `slower_than`: a contact that opens more slowly than this after an impact stays closed, `[gap]/[t]`: this ends
       infinitely many impacts in finite time. The part of the motion left out is of the size of its square.
 

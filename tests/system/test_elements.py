@@ -81,9 +81,14 @@ def test_bad_systems():
         both = lj.System(lagrangian, clash.get("constraints"), elements={"floor": rough, **clash.get("elements", {})})
         with pytest.raises(ValueError, match="'floor friction' is the name of"):
             lj.integrate(both, 0.0, 0.0, ts=[0.0, 1.0])
-    two = lj.Contact(above, friction=0.1, sliding=lambda t, q, v, p: np.ones(2) * v)
+    three = lambda t, q, v, p: np.ones(3) * v
     with pytest.raises(ValueError, match=r"sliding\(t, q, v, params\) of element 'floor' must return a number"):
-        lj.integrate(lj.System(lagrangian, elements={"floor": two}), 0.0, 0.0, ts=[0.0, 1.0])
+        lj.integrate(
+            lj.System(lagrangian, elements={"floor": lj.Contact(above, friction=0.1, sliding=three)}),
+            0.0, 0.0, ts=[0.0, 1.0],
+        )  # fmt: skip
+    with pytest.raises(ValueError, match=r"(?s)a number, as its normal force, or \(2,\) for .*jnp.full\(k, N\)"):
+        lj.integrate(lj.System(lagrangian, elements={"brake": lj.Friction(three, 0.1, 1.0)}), 0.0, 0.0, ts=[0.0, 1.0])
     speed = lj.System(lagrangian, elements={"brake": lj.Friction(lambda t, q, v, p: abs(v), 0.1, 1.0)})
     with pytest.raises(ValueError, match="linear in v, but its slope depends on v"):
         lj.integrate(speed, 0.0, 0.0, ts=[0.0, 1.0])

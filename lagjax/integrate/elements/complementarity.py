@@ -2,9 +2,10 @@
 
 With the forces λ of all contacts, normal ones and tangential ones, their accelerations are W λ + b. For each contact
 
-    0 ≤ λ_N ⊥ a_N ≥ 0,        |λ_T| ≤ μ N,  against a_T:  a_T > 0 only where λ_T = -μ N, and < 0 only where it is μ N
+    0 ≤ λ_N ⊥ a_N ≥ 0,        |λ_T| ≤ μ N,        a_T = 0 or λ_T = -μ N a_T / |a_T|
 
-which is the root of λ - proj(λ - r (W λ + b)), with the projection onto λ_N ≥ 0 and onto |λ_T| ≤ μ N, for any r > 0.
+where a_T and λ_T are numbers along a line, or two components in a plane. This is the root of λ - proj(λ - r (W λ + b)),
+with the projection onto λ_N ≥ 0 and onto |λ_T| ≤ μ N, for any r > 0 that both components of a plane share.
 It is found by Gauss-Seidel's relaxation and Newton's method on this piecewise smooth equation; each linear system is
 solved in the sense of least squares, since contacts may depend on each other (a table on four legs).
 
@@ -29,6 +30,22 @@ SMALL = {np.dtype("float64"): 1e-11, np.dtype("float32"): 1e-4}
 DEPENDENT = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
+def lengths(x: Float[Array, " k"], partners: np.ndarray) -> Float[Array, " k"]:
+    """|x|: of each number by itself, or of both components of a plane; the derivative at zero is zero."""
+    in_plane = partners != np.arange(x.size)
+    if not in_plane.any():
+        return jnp.abs(x)
+    square = x**2 + x[partners] ** 2
+    root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return jnp.where(in_plane, root, jnp.abs(x))
+
+
+def directions(x: Float[Array, " k"], partners: np.ndarray) -> Float[Array, " k"]:
+    """x / |x|: the sign of a number, the direction in a plane; zero at zero."""
+    size = lengths(x, partners)
+    return x / jnp.where(size > 0, size, 1.0)
+
+
 class ContactProblem(NamedTuple):
     """The problem of k_N normal forces and k_T tangential ones, stacked: k = k_N + k_T.
 
@@ -36,7 +53,9 @@ class ContactProblem(NamedTuple):
     - `may_push` (k_N,): which contacts there are; the forces of the others are zero.
     - `of_forces`, `constant`: the normal force of each tangential one is `constant + of_forces @ λ`.
     - `coefficient`: μ; zero where there is no friction.
-    - `slides` (k_T,): 1 or -1 where the sliding is given, and with it λ_T = -slides μ N; else 0.
+    - `slides` (k_T,): 1 or -1 where the sliding is given, or in a plane its direction, and with it λ_T = -slides μ N;
+      else 0.
+    - `partners` (k_T,): for each tangential force the other component of its plane; itself, along a line.
     """
 
     matrix: Float[Array, "k k"]
@@ -46,11 +65,13 @@ class ContactProblem(NamedTuple):
     constant: Float[Array, " kT"]
     coefficient: Float[Array, " kT"]
     slides: Float[Array, " kT"]
+    partners: np.ndarray
 
     @property
     def step(self) -> Float[Array, " k"]:
         """r of each force."""
-        own = jnp.diag(self.matrix)
+        own, count = jnp.diag(self.matrix), self.may_push.size
+        own = jnp.concatenate([own[:count], jnp.maximum(own[count:], own[count:][self.partners])])
         return 1 / jnp.where(own > 0, own, 1.0)
 
     def projected(self, forces: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -59,8 +80,10 @@ class ContactProblem(NamedTuple):
         z = forces - self.step * (self.matrix @ forces + self.free)
         normal = jnp.where(self.may_push, jnp.maximum(z[:count], 0.0), 0.0)
         most = self.coefficient * jnp.maximum(self.normal_forces(jnp.concatenate([normal, forces[count:]])), 0.0)
-        tangential = jnp.where(self.slides != 0, -self.slides * most, jnp.clip(z[count:], -most, most))
-        return jnp.concatenate([normal, tangential])
+        size = lengths(z[count:], self.partners)
+        within = z[count:] * jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0)
+        given = lengths(self.slides, self.partners) > 0
+        return jnp.concatenate([normal, jnp.where(given, -self.slides * most, within)])
 
     def normal_forces(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
         """N of each tangential force."""
@@ -76,7 +99,7 @@ class Forces(NamedTuple):
 
 def solved(problem: ContactProblem) -> Forces:
     """The forces of contacts that are solved together; the first derivative is that of the solution's own case."""
-    still = stop_gradient(problem)
+    still = stop_gradient(problem)._replace(partners=problem.partners)
 
     def residual(problem: ContactProblem, forces: Array) -> Array:
         return forces - problem.projected(forces)

@@ -5,9 +5,13 @@ side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constrain
 pressed (1), with a force (`compliant.py`). The functions of the system take `InModes` in place of the parameters, so
 that one program serves all modes; constraints that do not hold are off.
 
+A sliding velocity in a plane is two rows with one mode: it slides (1) with a force -μ N s/|s|, which has no limit at
+s = 0. Its sliding ends at a speed δ, the slack of its mode, and begins with 2 δ in the direction of the acceleration: a
+step that passes zero and meets the opposite force is then longer than what the method's tolerance lets through.
+
 The guard of a mode is above zero as long as it lasts:
 
-    open: the gap        closed: λ_N        slides: ± the sliding velocity        sticks: μ N - |λ_T|
+    open: the gap        closed: λ_N        slides: ± the sliding velocity, or |s| - δ        sticks: μ N - |λ_T|
     apart: -m            pressed: m
 
 Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
@@ -25,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
+from lagjax.integrate.elements.complementarity import lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
 from lagjax.integrate.jumps.find import OfParams
@@ -79,7 +84,8 @@ class Normal(eqx.Module):
 class Tangent(eqx.Module):
     """The sliding velocities of an element, and its friction; `name`: that of the constraint while it sticks.
 
-    `source`: the constraint or contact whose multiplier is the normal force; if empty, `normal` is that.
+    `source`: the constraint or contact whose multiplier is the normal force; if empty, `normal` is that. `plane`:
+    whether each two of the sliding velocities are components in a plane, with one normal force.
     """
 
     name: str = eqx.field(static=True)
@@ -89,6 +95,17 @@ class Tangent(eqx.Module):
     normal: Any
     source: str = eqx.field(static=True)
     at: tuple[int, int] = eqx.field(static=True)
+    plane: bool = eqx.field(static=True)
+
+    @property
+    def partners(self) -> np.ndarray:
+        """For each sliding velocity the other component of its plane; itself, along a line."""
+        place = np.arange(self.at[1] - self.at[0])
+        return place ^ 1 if self.plane else place
+
+    def speeds(self, slips: Float[Array, " k"]) -> Float[Array, " k"]:
+        """|s| in each plane, in both of its rows; without a branch, and above zero."""
+        return jnp.sqrt(slips**2 + slips[self.partners] ** 2 + jnp.finfo(slips.dtype).tiny)
 
     def slips(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, " k"]:
         """The sliding velocities as a vector."""
@@ -96,11 +113,11 @@ class Tangent(eqx.Module):
 
     def normal_forces(self, t: Array, q: PyTree, v: PyTree, forces: dict, params: PyTree) -> Float[Array, " k"]:
         """N of each; `forces`: multipliers, and what is compliant, by name."""
-        count = self.at[1] - self.at[0]
         if self.source:
-            return jnp.broadcast_to(jnp.ravel(forces[self.source]), (count,))
-        found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
-        return jnp.broadcast_to(jnp.ravel(jnp.asarray(found, t.dtype)), (count,))
+            found = forces[self.source]
+        else:
+            found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
+        return jnp.repeat(jnp.ravel(jnp.asarray(found, t.dtype)), 2 if self.plane else 1)
 
     def kinetic(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """μ while it slides with this speed."""
@@ -149,7 +166,9 @@ class WithElements(eqx.Module):
             mode = given.modes[slice(*law.at)]
             side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
-            size = law.kinetic(side * slip, params) * law.normal_forces(t, q, v, forces, params)
+            speed = law.speeds(slip) if law.plane else side * slip
+            side = side * slip / speed if law.plane else side
+            size = law.kinetic(speed, params) * law.normal_forces(t, q, v, forces, params)
             found[law.name] = back(-side * size)[0]
         return found
 
@@ -206,6 +225,17 @@ class Laws(eqx.Module):
         return guarded + tuple(law.name for law in self.sampled)
 
     @property
+    def partners(self) -> np.ndarray:
+        """For each sliding velocity the other component of its plane; itself, along a line."""
+        normals = self.count[0]
+        return np.concatenate([np.zeros(0, int), *(law.at[0] - normals + law.partners for law in self.tangents)])
+
+    @property
+    def in_planes(self) -> np.ndarray:
+        """Which sliding velocities are components in a plane."""
+        return self.partners != np.arange(self.count[1])
+
+    @property
     def elements(self) -> tuple[str, ...]:
         """The name of each mode's element: a contact's friction belongs to the contact."""
         gaps = [law.name for law in self.normals for _ in range(law.at[1] - law.at[0])]
@@ -229,7 +259,12 @@ class Laws(eqx.Module):
     def rubs(self, modes: Int[Array, " k"]) -> Bool[Array, " kT"]:
         """Which sliding velocities are not free for that the spring that presses them is apart."""
         pressed = {law.name: modes[slice(*law.at)] == PRESSED for law in self.compliant}
-        found = [jnp.broadcast_to(pressed.get(law.source, True), (law.at[1] - law.at[0],)) for law in self.tangents]
+        found = [
+            jnp.repeat(pressed[law.source], 1 + law.plane)
+            if law.source in pressed
+            else jnp.ones(law.at[1] - law.at[0], bool)
+            for law in self.tangents
+        ]
         return jnp.concatenate([*found, jnp.zeros(0, bool)])
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
@@ -286,8 +321,9 @@ class Laws(eqx.Module):
         for law in self.tangents:
             mode, slips = given.modes[slice(*law.at)], law.slips(t, q, v, params)
             most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params)
-            holds = most - jnp.abs(jnp.ravel(multipliers[law.name]))
-            found.append(jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, mode * slips)))
+            holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
+            slides = law.speeds(slips) - 2 * given.slack[slice(*law.at)] if law.plane else mode * slips
+            found.append(jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, slides)))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
@@ -426,9 +462,6 @@ def _laws(elements: Elements, plain: System, start: State):
         own = isinstance(element, with_friction)
         mu = element.friction if isinstance(element, with_friction) else element.coefficient
         mu, static = coefficients(name, "speed", coefficient=mu, static=element.static)
-        shape = jnp.shape(gaps[name].program.value) if own else None
-        sliding = traced(name, "sliding", element.sliding, OF_STATE, shape)
-        check_linear(sliding, *start)
         normal = element.normal if isinstance(element, Friction) else None
         source = name if own else normal if isinstance(normal, str) else ""
         if not own:
@@ -440,14 +473,19 @@ def _laws(elements: Elements, plain: System, start: State):
                     "Fix: its name, a number, or a function of (t, q, v, params)."
                 )
             normal = traced(name, "normal", normal, OF_STATE) if not source else None
-        size = _size(sliding)
+        shape = _shape_of_normal_forces(normal, source, gaps, plain)
+        sliding = traced_call(
+            Call("sliding", element.sliding, OF_STATE, f" of element '{name}'"), given, partial(_check_sliding, shape)
+        )
+        check_linear(sliding, *start)
+        size, plane = _size(sliding), jnp.shape(sliding.program.value) == (*shape, 2)
         key = f"{name} friction" if own else name
         _check_name(key, plain)
         if own and key in elements:
             raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
-        tangents.append(Tangent(key, sliding, mu, static, normal, source, (place, place + size)))
+        tangents.append(Tangent(key, sliding, mu, static, normal, source, (place, place + size), plane))
         source_of = [law for law in normals if law.name == source]
-        owners += [source_of[0].at[0] + i if source_of else -1 for i in range(size)]
+        owners += [source_of[0].at[0] + i // (1 + plane) if source_of else -1 for i in range(size)]
         place += size
     for name, element in elements.items():
         if isinstance(element, CompliantContact):
@@ -493,6 +531,24 @@ def _size(function) -> int:
     return int(np.prod(jnp.shape(function.program.value)))
 
 
+def _shape_of_normal_forces(normal, source: str, gaps: dict[str, Any], plain: System) -> tuple[int, ...]:
+    if source:
+        normal = gaps[source] if source in gaps else plain.constraints[source].function
+    return jnp.shape(normal.program.value if callable(normal) else normal)
+
+
+def _check_sliding(shape: tuple[int, ...], call: Call, value):
+    found = jnp.shape(value)
+    if found == shape or found == (*shape, 2):
+        return
+    raise ValueError(
+        f"{call} must return {f'shape {shape}' if shape else 'a number'}, as its normal force, or {(*shape, 2)} for "
+        f"sliding in a plane, and returned shape {found}.\n"
+        "Usual cause: the velocity of a point in space, or several sliding velocities with one normal force.\n"
+        "Fix: its components along the contact; jnp.full(k, N) for k sliding velocities with N each."
+    )
+
+
 def _check_name(name: str, plain: System):
     if name in plain.constraints:
         raise ValueError(
@@ -514,10 +570,9 @@ def _check_output(call: Call, value, like: Array):
 
 def _check(call: Call, value, shape: tuple | None):
     found = jnp.shape(value)
-    wanted = "a number or a vector" if shape is None else f"shape {shape}, as the gap" if shape else "a number"
     if shape is not None and found != shape or len(found) > 1:
         raise ValueError(
-            f"{call} must return {wanted}, and returned shape {found}.\n"
-            "Usual cause: the velocity of a point in space.\n"
+            f"{call} must return {'a number or a vector' if shape is None else 'a number'}, and returned shape {found}."
+            "\nUsual cause: the velocity of a point in space.\n"
             "Fix: its component along the contact."
         )

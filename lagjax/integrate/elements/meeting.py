@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, solved
+from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, directions, lengths, solved
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
@@ -41,6 +41,11 @@ LIGHT = 1e-6
 NO_FORCE = 500
 # What has let go, by its slack, opens at least by this part of its own response to that.
 LET_GO = 0.01
+# Sliding in a plane ends at this part of the velocities in the motion, or at so many round-offs of them. Below some ten
+# times rtol steps may jump over it: at 1e-9, 400 of them are rejected in place of 40, and at 1e-12 thousands.
+ENDS_AT, ENDS_AT_ROUND_OFFS = 3e-8, 1000
+# That of sliding which begins at rest, with twice this speed.
+BEGINS_AT = 1e-9
 # Impacts one after the other, at most: so many for each pair of gaps, and a few more.
 MORE_IMPACTS = 8
 
@@ -51,6 +56,15 @@ class Met(NamedTuple):
     v: PyTree[Float[Array, "..."]]
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
+    found: Bool[Array, ""]
+
+
+class Decided(NamedTuple):
+    """Which modes follow from the forces; `onto`: the velocities that contacts get; NaN, what they have."""
+
+    modes: Int[Array, " k"]
+    slack: Float[Array, " k"]
+    onto: Float[Array, " k"]
     found: Bool[Array, ""]
 
 
@@ -92,10 +106,11 @@ class Meeting(eqx.Module):
         """What happens at the end of a leg: q, and the first of the modes that end there, or are at an `instant`."""
         guards = self.laws.last(end.t, end.q, end.v, end.multipliers, given)
         size = jnp.where(given.slack > 0, given.slack, 1.0)[: guards.size]
-        least = jnp.argmin(jnp.concatenate([guards / size, jnp.full(1, jnp.inf)]))
+        in_slacks = jnp.concatenate([guards / size, jnp.full(1, jnp.inf)])
+        least = jnp.argmin(in_slacks)
         holds = jnp.concatenate([self.laws.holds(given.modes), jnp.zeros(guards.size - len(self.laws.rows), bool)])
         zero = jnp.where(holds, -given.slack[: guards.size] / 2, 0.0)
-        fired = (guards <= zero) | (jnp.arange(guards.size) == least) & ~instant
+        fired = (guards <= zero) | (in_slacks[:-1] == in_slacks[least]) & ~instant
         q, after = self.laws.acted(end.t, end.q, end.v, given)
         acts = after.modes[guards.size :] != given.modes[guards.size :]
         first = jnp.where(instant, guards.size + jnp.argmax(jnp.append(acts, True)), least)
@@ -121,15 +136,13 @@ class Meeting(eqx.Module):
         if impacts:
             u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
         given, reach = laws.pressed(t, q, model.tree(u), given, fired, rows.sizes(sizes))
-        met = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
-        u = u + self._onto(model, t, x, u, rows, met.modes) @ rows.response
-        by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
-        slack = jnp.where(laws.holds(met.modes), met.slack, by_motion)
-        slack = jnp.concatenate([slack, reach, jnp.zeros(len(laws.sampled), x.dtype)])
+        decided = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
+        u = u + self._onto(model, t, x, u, rows, decided.onto) @ rows.response
+        slack = jnp.concatenate([decided.slack, reach, jnp.zeros(len(laws.sampled), x.dtype)])
         # The rates of states are those of the new velocities.
-        after = laws.in_rows(given, met.modes)
+        after = laws.in_rows(given, decided.modes)
         u = resolved(model.of(after), t, x, u)
-        return Met(model.tree(u), after.modes, stop_gradient(slack), met.found)
+        return Met(model.tree(u), after.modes, stop_gradient(slack), decided.found)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
         """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
@@ -170,7 +183,8 @@ class Meeting(eqx.Module):
         first = self.laws.count[0]
         for law in self.laws.tangents:
             own = slips[law.at[0] - first : law.at[1] - first]
-            parts.append(law.sticking(own, params) if sticking else law.kinetic(jnp.abs(own), params))
+            speeds = lengths(own, law.partners)
+            parts.append(law.sticking(speeds, params) if sticking else law.kinetic(speeds, params))
         return jnp.concatenate([*parts, jnp.zeros(0, t.dtype)])
 
     def _impact(self, model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array) -> Array:
@@ -190,14 +204,20 @@ class Meeting(eqx.Module):
         def restitution(closing: Array) -> Array:
             return jnp.concatenate([law.returned(closing[slice(*law.at)], given.params) for law in laws.normals])
 
-        def at_once(c: Array, bounce: Array) -> Array:
+        def at_once(c: Array, bounce: Array, closed: Array = closed) -> Array:
             """The impulses of all closed contacts together; `bounce`: e γ."""
             free = jnp.concatenate([c[:normals] + bounce, c[normals:]])
             problem = ContactProblem(
                 rows.matrix, free, closed, self._of_contacts(x.dtype), jnp.zeros(tangents, x.dtype),
-                jnp.where(owners >= 0, mu, 0.0), jnp.zeros(tangents, x.dtype),
+                jnp.where(owners >= 0, mu, 0.0), jnp.zeros(tangents, x.dtype), laws.partners,
             )  # fmt: skip
             return solved(problem).forces
+
+        def alone(c: Array, i: Array, bounce: Array) -> Array:
+            """The impulses of gap i."""
+            if laws.in_planes.any():
+                return at_once(c, -bounce, jnp.arange(normals) == i)
+            return self._one(rows.matrix, c, i, bounce[i] - c[i], mu)
 
         if laws.impacts == "simultaneous":
             struck = jnp.any(closing_at(before))
@@ -212,8 +232,7 @@ class Meeting(eqx.Module):
             e = restitution(closing)
             struck = closing_at(c) & (stop_gradient(e) > 0)
             i = jnp.argmax(jnp.where(struck, stop_gradient(closing), 0.0))
-            one = self._one(rows.matrix, c, i, (1 + e[i]) * closing[i], mu)
-            return impulses + jnp.where(jnp.any(struck), one, 0.0), None
+            return impulses + jnp.where(jnp.any(struck), alone(c, i, e * closing), 0.0), None
 
         most = normals * (normals + 1) + MORE_IMPACTS if normals > 1 else 1
         impulses, _ = lax.scan(next_impact, jnp.zeros_like(before), None, length=most)
@@ -258,11 +277,13 @@ class Meeting(eqx.Module):
     def _forces(
         self, model: Model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array, fired: Array,
         scale: Array,
-    ) -> Met:  # fmt: skip
+    ) -> Decided:  # fmt: skip
         """The modes after a meeting, by the forces at accelerations."""
-        laws, (normals, _), count = self.laws, self.laws.count, len(self.laws.rows)
+        laws, (normals, _), partners, in_planes = self.laws, self.laws.count, self.laws.partners, self.laws.in_planes
+        count = len(laws.rows)
         if not count:
-            return Met(model.tree(u), given.modes[:0], jnp.zeros(0, x.dtype), jnp.asarray(True))
+            none = jnp.zeros(0, x.dtype)
+            return Decided(given.modes[:0], none, none, jnp.asarray(True))
         model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
         q, v, params = model.tree(x), model.tree(u), given.params
         every = constraints.acceleration_rows(model, t, x, u)
@@ -283,17 +304,27 @@ class Meeting(eqx.Module):
         )
         touching = closed & (jnp.abs(slopes[:normals]) <= jnp.maximum(slower, still[:normals]))
         slips = slopes[normals:]
-        slides = jnp.where(jnp.abs(slips) > still[normals:], jnp.sign(slips), 0.0)
+        by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
+        # Where sliding in a plane ends, also where nothing has moved yet.
+        ends_at = max(ENDS_AT, ENDS_AT_ROUND_OFFS * eps) * lengths(scale[normals:, 1], partners)
+        ends_at = jnp.where(ends_at > 0, ends_at, ENDS_AT)
+        slid = given.modes[normals:count] == 1
+        slow = 1.5 * jnp.where(slid, jnp.maximum(ends_at, given.slack[normals:count]), ends_at)
+        slow = jnp.where(in_planes, slow, still[normals:])
+        slides = jnp.where(lengths(slips, partners) > slow, directions(slips, partners), 0.0)
+        given_side = lengths(slides, partners) > 0
         constant, of_forces = self._normal_forces(t, q, v, given, model, multipliers, rows, always)
         mu_slides, mu_sticks = (self._coefficients(t, q, v, params, slips, sticking) for sticking in (False, True))
         problem = ContactProblem(
-            rows.matrix, free, touching, of_forces, constant, jnp.where(slides != 0, mu_slides, mu_sticks), slides
-        )
+            rows.matrix, free, touching, of_forces, constant, jnp.where(given_side, mu_slides, mu_sticks), slides,
+            partners,
+        )  # fmt: skip
         forces, found = solved(problem)
         accelerations = rows.matrix @ forces + free
         # The acceleration of a motion of this size and speed.
-        by_motion = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
-        slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + by_motion)
+        faster = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
+        slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + faster)
+        slack = jnp.concatenate([slack[:normals], lengths(slack[normals:], partners)])
         # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
         # may open far more slowly than by its own response, since others stay closed.
         let_go = fired[:count] & laws.holds(given.modes)
@@ -302,16 +333,25 @@ class Meeting(eqx.Module):
         pushes = forces > problem.step * accelerations
         stays = touching & (pushes[:normals] | (accelerations[:normals] <= nothing[:normals]))
         normal_modes = jnp.where(stays, CLOSED, OPEN)
-        pushed = forces[normals:]
+        # The force of friction is larger than its acceleration, and so says more about the direction.
         most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
-        moves = jnp.abs(accelerations[normals:]) > nothing[normals:]
-        starts = jnp.where(moves, jnp.where(most > 0, -jnp.sign(pushed), jnp.sign(accelerations[normals:])), 0.0)
-        side = jnp.where(slides != 0, slides, starts).astype(int)
+        moves = lengths(accelerations[normals:], partners) > nothing[normals:]
+        starts = jnp.where(
+            moves, directions(jnp.where(most > 0, -forces[normals:], accelerations[normals:]), partners), 0.0
+        )
+        side = jnp.where(given_side, slides, starts)
+        one_mode = jnp.where(in_planes, lengths(side, partners) > 0, side).astype(int)
         owners = np.array(laws.owners, int)
         present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], laws.rubs(given.modes))
-        tangent_modes = jnp.where(present, jnp.where(side != 0, side, STICKS), FREE)
+        tangent_modes = jnp.where(present, jnp.where(one_mode != 0, one_mode, STICKS), FREE)
         modes = jnp.concatenate([normal_modes, tangent_modes]).astype(given.modes.dtype)
-        return Met(v, modes, slack, found)
+        begins = in_planes & (tangent_modes == 1) & ~given_side
+        begins_at = max(BEGINS_AT, ENDS_AT_ROUND_OFFS * eps) / max(ENDS_AT, ENDS_AT_ROUND_OFFS * eps)
+        ends_at = jnp.where(begins, begins_at * ends_at, ends_at)
+        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends_at * side, jnp.nan)])
+        onto = jnp.where(laws.holds(modes), 0.0, onto)
+        if_not_held = jnp.concatenate([by_motion[:normals], jnp.where(in_planes, ends_at, by_motion[normals:])])
+        return Decided(modes, jnp.where(laws.holds(modes), slack, if_not_held), onto, found)
 
     def _normal_forces(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, model: Model, multipliers: Array, rows: Rows, always
@@ -321,11 +361,11 @@ class Meeting(eqx.Module):
         names = model.equation_names
         place = {names[i].split("[")[0]: k for k, i in reversed(list(enumerate(always)))}
         for law in self.laws.tangents:
-            count = law.at[1] - law.at[0]
+            count, width = law.at[1] - law.at[0], 1 + law.plane
             if law.source in place:
-                k = place[law.source]
-                constant += [multipliers[k]] * count
-                of_forces += [rows.of_constraints[:, k]] * count
+                first = place[law.source]
+                constant += [multipliers[first + i // width] for i in range(count)]
+                of_forces += [rows.of_constraints[:, first + i // width] for i in range(count)]
                 continue
             gaps = [normal for normal in self.laws.normals if normal.name == law.source]
             if not gaps:
@@ -333,16 +373,18 @@ class Meeting(eqx.Module):
             else:
                 constant += [jnp.zeros((), t.dtype)] * count
             unit = np.eye(len(self.laws.rows))
-            of_forces += [jnp.asarray(unit[gaps[0].at[0] + i] if gaps else 0 * unit[0], t.dtype) for i in range(count)]
+            of_forces += [
+                jnp.asarray(unit[gaps[0].at[0] + i // width] if gaps else 0 * unit[0], t.dtype) for i in range(count)
+            ]
         if not constant:
             return jnp.zeros(0, t.dtype), jnp.zeros((0, len(self.laws.rows)), t.dtype)
         return jnp.stack(constant), jnp.stack(of_forces)
 
-    def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, modes: Array) -> Array:
-        """The impulses that move velocities onto what holds."""
+    def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, wanted: Array) -> Array:
+        """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""
         if not self.laws.rows:
             return jnp.zeros(0, x.dtype)
-        on = self.laws.holds(modes)
-        left = jnp.where(on, self._slopes(model, t, x, u), 0.0)
+        on = jnp.isfinite(wanted)
+        left = jnp.where(on, self._slopes(model, t, x, u) - jnp.where(on, wanted, 0.0), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left

@@ -53,7 +53,8 @@ def problem_of(matrix, free, mu):
     """The problem in which all contacts may push."""
     count = mu.size
     return ContactProblem(
-        matrix, free, jnp.ones(count, bool), jnp.eye(count, 2 * count), jnp.zeros(count), mu, jnp.zeros(count)
+        matrix, free, jnp.ones(count, bool), jnp.eye(count, 2 * count), jnp.zeros(count), mu, jnp.zeros(count),
+        np.arange(count),
     )  # fmt: skip
 
 
@@ -84,7 +85,12 @@ def test_dependent_contacts():
     arms = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [1.0, -1.0, -1.0]])
     empty = np.zeros((0, 4))
     problem = ContactProblem(
-        jnp.asarray(arms @ arms.T), jnp.full(4, -9.81), jnp.ones(4, bool), jnp.asarray(empty), *[jnp.zeros(0)] * 3
+        jnp.asarray(arms @ arms.T),
+        jnp.full(4, -9.81),
+        jnp.ones(4, bool),
+        jnp.asarray(empty),
+        *[jnp.zeros(0)] * 3,
+        np.arange(0),
     )
     forces, well = solved(problem)
     assert well
@@ -96,7 +102,7 @@ def test_no_solution():
     matrix = jnp.array([[1.0, -2.0], [-2.0, 5.0]])
     sliding = ContactProblem(
         matrix, jnp.array([-1.0, 0.0]), jnp.ones(1, bool), jnp.eye(1, 2), jnp.zeros(1), jnp.array([1.0]),
-        jnp.array([-1.0]),
+        jnp.array([-1.0]), np.arange(1),
     )  # fmt: skip
     assert not solved(sliding)[1]
     assert solved(sliding._replace(coefficient=jnp.array([0.3])))[1]

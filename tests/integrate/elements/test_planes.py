@@ -1,0 +1,153 @@
+"""Friction in a plane: a sliding velocity of two components."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import lagjax as lj
+from lagjax.integrate.elements.complementarity import ContactProblem, solved
+
+G, M, R = 9.81, 1.3, 0.4
+INERTIA = 0.4 * M * R**2
+
+
+def random_problems(count: int, lanes: int):
+    """W and b of contacts that slide in planes, normal rows first, one system in each lane."""
+    rng = np.random.default_rng(5)
+    rows = rng.normal(size=(lanes, 3 * count, 3 * count + 1))
+    return rows @ np.swapaxes(rows, 1, 2), rng.normal(size=(lanes, 3 * count))
+
+
+def test_forces_in_planes():
+    """Forces of random contacts obey Coulomb's law in the plane: |λ_T| ≤ μ N, against the acceleration where it slides.
+    Twin: for another μ they do not."""
+    count, mu = 2, 0.8
+    matrix, free = random_problems(count, 60)
+
+    def forces_of(matrix, free):
+        of_forces = jnp.repeat(jnp.eye(count, 3 * count), 2, axis=0)
+        zero = jnp.zeros(2 * count)
+        may_push, partners = jnp.ones(count, bool), np.arange(2 * count) ^ 1
+        return solved(ContactProblem(matrix, free, may_push, of_forces, zero, zero + mu, zero, partners))
+
+    forces, well = jax.vmap(forces_of)(jnp.asarray(matrix), jnp.asarray(free))
+    a = np.einsum("lij,lj->li", matrix, forces) + free
+    normal, along = np.asarray(forces[:, :count]), np.asarray(forces[:, count:]).reshape(-1, count, 2)
+    a_normal, a_along = a[:, :count], a[:, count:].reshape(-1, count, 2)
+    scale = 1 + np.max(np.abs(forces), axis=1, keepdims=True)
+
+    def obeys(mu):
+        size, speed = np.linalg.norm(along, axis=-1), np.linalg.norm(a_along, axis=-1)
+        against = np.linalg.norm(along * speed[..., None] + mu * normal[..., None] * a_along, axis=-1)
+        off = np.minimum(normal, a_normal), np.maximum(size - mu * normal, 0.0), against
+        return np.max(np.abs(off), axis=0).max(axis=1, keepdims=True) / scale**2 < 1e-8
+
+    assert np.mean(well) > 0.8 and np.all(obeys(mu)[well])
+    slides = (np.linalg.norm(a_along, axis=-1) > 1e-6) & (normal > 1e-6)
+    sticks = (np.linalg.norm(a_along, axis=-1) < 1e-9) & (normal > 1e-6)
+    assert slides.sum() > 5 and sticks.sum() > 5
+    assert not np.any(obeys(0.9 * mu)[np.asarray(well)[:, None] & slides.any(axis=1, keepdims=True)])
+
+
+def on_a_tilt():
+    """A block on a tilted plane, uphill along y, with unit mass and g cos α = 9.81."""
+    tilt = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - G * p["tan"] * q[1]
+    floor = lj.Friction(lambda t, q, v, p: v, lambda p: p["mu"], normal=G)
+    return lj.System(tilt, elements={"floor": floor})
+
+
+def by_scipy(v0, mu, tan, until):
+    """Its place at a time, and when it stops, by SciPy."""
+
+    def rates(t, y):
+        return [*y[2:], *(-mu * G * y[2:] / np.hypot(*y[2:]) - [0.0, tan * G])]
+
+    stops = lambda t, y: np.hypot(*y[2:]) - 1e-9
+    stops.terminal = True
+    found = solve_ivp(rates, (0, until), [0, 0, *v0], rtol=1e-12, atol=1e-14, events=stops, method="DOP853")
+    return found.y[:2, -1], found.t[-1]
+
+
+def thrown(v0, mu, tan, system=on_a_tilt()) -> lj.HybridTrajectory:
+    """The block thrown at the origin."""
+    given = {"mu": mu, "tan": jnp.asarray(tan)}
+    ts = jnp.array([0.0, 3.0])
+    traj = lj.integrate(system, jnp.zeros(2), jnp.array(v0), given, ts=ts, rtol=1e-11, estimate_error=False)
+    assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
+    return traj
+
+
+@pytest.mark.slow
+def test_thrown_obliquely_on_a_tilted_plane():
+    """Stops, or turns downhill and slides on, as by SciPy; or slides down from rest. Twin: with another μ it rests
+    somewhere else."""
+    found = {}
+    for v0, mu, tan in (([2.0, 1.5], 0.4, 0.2), ([2.0, 1.5], 0.41, 0.2), ([2.0, 1.5], 0.2, 0.4)):
+        traj = found[mu] = thrown(v0, jnp.asarray(mu), tan)
+        place, when = by_scipy(v0, mu, tan, 3.0)
+        np.testing.assert_allclose(traj.q[-1], place, atol=1e-10)
+        if mu > tan:
+            np.testing.assert_allclose(traj.switches.t[0], when, atol=1e-7)
+    assert [np.asarray(traj.modes)[-1].tolist() for traj in found.values()] == [[2, 2], [2, 2], [1, 1]]
+    assert np.linalg.norm(found[0.41].q[-1] - found[0.4].q[-1]) > 1e-3
+    slid = thrown([0.0, 0.0], jnp.asarray(0.3), 0.4)
+    np.testing.assert_allclose(slid.q[-1], [0.0, -0.5 * 0.1 * G * 9.0], atol=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_a_place_of_rest():
+    """The derivative of the place of rest by μ, in both modes, against differences of SciPy's."""
+    last = lambda mu: thrown([2.0, 1.5], mu, 0.2).q[-1]
+    near = [by_scipy([2.0, 1.5], m, 0.2, 3.0)[0] for m in (0.4 - 1e-5, 0.4 + 1e-5)]
+    slope = (near[1] - near[0]) / 2e-5
+    np.testing.assert_allclose(jax.jvp(last, (jnp.asarray(0.4),), (jnp.asarray(1.0),))[1], slope, atol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(last)(jnp.asarray(0.4)), slope, atol=1e-6)
+
+
+def sphere():
+    """A sphere on a rough table. Its spin is the rates of three coordinates that nothing depends on: for equal moments
+    of inertia the equations of motion are those of angular velocities."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * M * jnp.sum(v["x"] ** 2) + 0.5 * INERTIA * jnp.sum(v["spin"] ** 2) - M * G * q["x"][2]
+
+    def sliding(t, q, v, p):
+        return jnp.stack([v["x"][0] - R * v["spin"][1], v["x"][1] + R * v["spin"][0]])
+
+    table = lj.Contact(
+        lambda t, q, p: q["x"][2] - R, restitution=0.5, friction=lambda p: p["mu"], sliding=sliding, slower_than=1e-3
+    )
+    return lj.System(lagrangian, elements={"table": table})
+
+
+@pytest.mark.slow
+def test_a_sphere_with_spin():
+    """Thrown sliding, it rolls from 2 |s| / (7 μ g) on with v - 2 s/7, and until then moves on a parabola. Dropped, it
+    loses μ of the normal impulse in an impact, or 2 s/7 where that stops the sliding. Twin: another spin, another way.
+    """
+    system, ts = sphere(), jnp.array([0.0, 0.25, 2.0])
+
+    def rolled(height, spin, mu):
+        q, v = {"x": jnp.array([0.0, 0.0, R + height]), "spin": jnp.zeros(3)}, {"x": jnp.array(v0), "spin": spin}
+        traj = lj.integrate(system, q, v, {"mu": jnp.asarray(mu)}, ts=ts, estimate_error=False)
+        assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
+        return traj.q["x"], traj.v["x"], traj.switches.t[0], traj.switches.v_after["x"][0], traj.modes
+
+    v0, w0, mu = np.array([2.0, 0.5, 0.0]), np.array([3.0, -4.0, 1.0]), 0.2
+    lanes = (0.0, w0, mu), (0.5, w0, mu), (0.5, w0, 5.0), (0.0, np.array([3.0, 4.0, -5.0]), mu)
+    x, v, when, after, modes = (np.stack(values) for values in zip(*(rolled(h, jnp.array(w), m) for h, w, m in lanes)))
+    s0 = np.array([v0[0] - R * w0[1], v0[1] + R * w0[0]])
+    rolls, side = 2 * np.linalg.norm(s0) / (7 * mu * G), s0 / np.linalg.norm(s0)
+    np.testing.assert_allclose(when[0], rolls, atol=1e-7)
+    np.testing.assert_allclose(v[0, 2, :2], v0[:2] - 2 / 7 * s0, atol=1e-13)
+    np.testing.assert_allclose(x[0, 1, :2], v0[:2] * 0.25 - 0.5 * mu * G * side * 0.25**2, atol=1e-12)
+    way = v0[:2] * rolls - 0.5 * mu * G * side * rolls**2 + (v0[:2] - 2 / 7 * s0) * (2.0 - rolls)
+    np.testing.assert_allclose(x[0, 2, :2], way, atol=1e-12)
+    assert modes[0].tolist() == [[1, 1, 1], [1, 1, 1], [1, 2, 2]]
+    down = np.sqrt(2 * G * 0.5)
+    np.testing.assert_allclose(when[1:3], down / G, rtol=1e-12)
+    np.testing.assert_allclose(after[1], [*(v0[:2] - mu * 1.5 * down * side), 0.5 * down], atol=1e-12)
+    np.testing.assert_allclose(after[2], [*(v0[:2] - 2 / 7 * s0), 0.5 * down], atol=1e-12)
+    assert np.linalg.norm(v[3, 2] - v[0, 2]) > 0.5
