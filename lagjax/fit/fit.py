@@ -81,7 +81,8 @@ def fit(
 
     **Main arguments:**
 
-    - `system`: also a `Hybrid`, whose records start in one phase (`start=`, the first by default); without windows.
+    - `system`: also a `Hybrid`, whose records start in one phase (`start=`, the first by default), or a system with
+      elements, whose modes fit each start; both without windows.
     - `records`: one `Record` or several, each with its own initial state. Angles must be continuous, not wrapped to one
       turn.
     - `params`: what the Lagrangian takes, with guesses of the numbers to be found; all records share it.

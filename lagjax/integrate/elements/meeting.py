@@ -230,7 +230,8 @@ class Meeting(eqx.Module):
             c = before + rows.matrix @ impulses
             closing = jnp.maximum(-c[:normals], 0.0)
             e = restitution(closing)
-            struck = closing_at(c) & (stop_gradient(e) > 0)
+            # One that is NaN strikes, so that the motion fails.
+            struck = closing_at(c) & ~(stop_gradient(e) <= 0)
             i = jnp.argmax(jnp.where(struck, stop_gradient(closing), 0.0))
             return impulses + jnp.where(jnp.any(struck), alone(c, i, e * closing), 0.0), None
 

@@ -175,3 +175,17 @@ def test_a_lane_of_a_batch(tmp_path):
     for batch in (lanes, lj.load_trajectory(tmp_path / "lanes.npz", block)):
         lane = jax.tree.map(lambda x: x[1], batch)
         np.testing.assert_allclose(lane.at(0.7).v[0], THROWN - 2 * MU * (1 + E) * G * FALL, atol=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_in_a_sweep(tmp_path):
+    """Each point has its own modes, also in the store; one whose restitution is NaN fails and says so."""
+    bounces = lj.Contact(lambda t, q, p: q, restitution=lambda p: p["e"])
+    ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, elements={"floor": bounces})
+    run = lambda point: lj.integrate(ball, 5.0, 0.0, point, ts=np.linspace(0.0, 3.0, 4))
+    swept = lj.sweep(run, {"e": np.array([0.0, 0.5, np.nan])}, store=tmp_path / "swept", progress=False)
+    assert swept.counts() == {"successful": 2, "The state after a switch is NaN or infinite.": 1}
+    assert swept.values.modes[:2, :, 0].tolist() == [[0, 0, 1, 1], [0, 0, 0, 1]]
+    stored = lj.open_sweep(tmp_path / "swept", system=ball).values
+    assert np.array_equal(stored.modes, swept.values.modes)
+    np.testing.assert_allclose(jax.tree.map(lambda x: x[1], stored).at(1.5).q, 1.25, atol=1e-9)
