@@ -531,10 +531,11 @@ def _size(function) -> int:
     return int(np.prod(jnp.shape(function.program.value)))
 
 
-def _shape_of_normal_forces(normal, source: str, gaps: dict[str, Any], plain: System) -> tuple[int, ...]:
+def _shape_of_normal_forces(normal: Any, source: str, gaps: dict[str, Any], plain: System) -> tuple[int, ...]:
     if source:
         normal = gaps[source] if source in gaps else plain.constraints[source].function
-    return jnp.shape(normal.program.value if callable(normal) else normal)
+    program = getattr(normal, "program", None)
+    return jnp.shape(normal if program is None else program.value)
 
 
 def _check_sliding(shape: tuple[int, ...], call: Call, value):

@@ -65,7 +65,7 @@ def by_scipy(v0, mu, tan, until):
         return [*y[2:], *(-mu * G * y[2:] / np.hypot(*y[2:]) - [0.0, tan * G])]
 
     stops = lambda t, y: np.hypot(*y[2:]) - 1e-9
-    stops.terminal = True
+    setattr(stops, "terminal", True)
     found = solve_ivp(rates, (0, until), [0, 0, *v0], rtol=1e-12, atol=1e-14, events=stops, method="DOP853")
     return found.y[:2, -1], found.t[-1]
 
