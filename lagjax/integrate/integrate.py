@@ -181,7 +181,7 @@ def integrate(
     dtype = state.t.dtype
     system = traced_phases(system if start is None else system.starting(start), state, ts)
     for phase in system.phases:
-        given = state._replace(params=system.given(state.params)) if system.in_phases else state
+        given = state._replace(params=system.given(state.params)) if isinstance(system, Hybrid) else state
         warn_of_odd_dissipation(phase.dissipation, given)
     crossings, left = crossings_of(events, event), left_to_diffrax(event)
     if system.in_phases:

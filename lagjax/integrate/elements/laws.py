@@ -50,6 +50,7 @@ from lagjax.system import (
     SampledControl,
     State,
     System,
+    Traced,
     check_use,
     coordinates,
     model_of,
@@ -532,10 +533,8 @@ def _size(function) -> int:
 
 
 def _shape_of_normal_forces(normal: Any, source: str, gaps: dict[str, Any], plain: System) -> tuple[int, ...]:
-    if source:
-        normal = gaps[source] if source in gaps else plain.constraints[source].function
-    program = getattr(normal, "program", None)
-    return jnp.shape(normal if program is None else program.value)
+    given: Any = normal if not source else gaps[source] if source in gaps else plain.constraints[source].function
+    return jnp.shape(given.program.value if isinstance(given, Traced) else given)
 
 
 def _check_sliding(shape: tuple[int, ...], call: Call, value):
