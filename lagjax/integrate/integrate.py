@@ -171,7 +171,7 @@ def integrate(
         arguments.check_equal_steps(
             method, dt0, system, stepsize_controller=None if fixed else stepsize_controller, max_step=max_step,
             jump_ts=jump_ts, events=events, event=event, adjoint=adjoint, outputs=outputs, start=start,
-            drift=None if drift == "project" else drift,
+            drift=drift if drift == "baumgarte" else None,
         )  # fmt: skip
         stepsize_controller = diffrax.ConstantStepSize()
     arguments.check_controller(stepsize_controller, max_step, jump_ts)

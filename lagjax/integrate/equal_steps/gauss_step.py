@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import applied_force, mass_and_forcing
@@ -29,8 +29,8 @@ from lagjax.numerics import Tableau, dense
 from lagjax.system import Model, constraints
 
 MOST_ITERATIONS = 60
-# A few iterations are made even if corrections grow at first.
-AT_LEAST = 4
+# Steps have one length if they differ by less than this part of it.
+SAME_LENGTH = 1e-6
 # A step is solved if the last correction is below this power of the round-off, in kinetic energy.
 SOLVED = 1.2
 # Iteration ends where less than this part of a round-off is missing.
@@ -52,7 +52,7 @@ class Way(NamedTuple):
     """The state between two steps.
 
     `x_rest`, `p_rest`: what is to be added to x and p; `velocities`, `multipliers`: at the nodes of the last two steps,
-    and of the last one.
+    and of the last one. `alike`: how many of these steps had the length `h`.
     """
 
     x: Float[Array, " n"]
@@ -61,6 +61,8 @@ class Way(NamedTuple):
     p_rest: Float[Array, " n"]
     velocities: Float[Array, "2s n"]
     multipliers: Float[Array, "s m"]
+    h: Float[Array, ""]
+    alike: Int[Array, ""]
     unsolved: Bool[Array, ""]
 
 
@@ -77,14 +79,14 @@ class GaussStep(NamedTuple):
         s, none = len(self.tableau.nodes), jnp.zeros_like(x)
         multipliers = jnp.zeros((s, self.model.m), x.dtype)
         p = self._momentum(t, x, u)
-        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, jnp.asarray(False))
+        h, alike = jnp.zeros_like(t), jnp.asarray(0)
+        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, h, alike, jnp.asarray(False))
 
     def advanced(self, way: Way, t: Array, h: Array) -> Way:
         """The state after a step from t to t + h."""
         s, dtype = len(self.tableau.nodes), h.dtype
-        # Beyond steps that are longer than an oscillation a polynomial through them leads nowhere.
-        ahead = np.repeat([[0.0, 1 / s]], s, axis=1).repeat(s, axis=0) if self.newton else self.tableau.ahead
-        guess = Unknown(ahead.astype(dtype) @ way.velocities, way.multipliers)
+        alike = jnp.where(jnp.abs(h - way.h) <= SAME_LENGTH * h, way.alike, 0)
+        guess = Unknown(self._guess(way, alike, dtype), way.multipliers)
         found, solved = self._solved(stop_gradient(way), *stop_gradient((t, h, guess)))
         if self.differentiated:
             found = self._with_derivatives(way, t, h, found)
@@ -95,7 +97,19 @@ class GaussStep(NamedTuple):
             _, dp = self._at_end(t + h, x, way.p, dp, self.tableau.at_end.astype(dtype) @ found.velocities)
         p, p_rest = added(way.p, dp)
         velocities = jnp.concatenate([way.velocities[s:], found.velocities])
-        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, way.unsolved | ~solved)
+        alike = jnp.minimum(alike + 1, 2)
+        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, h, alike, way.unsolved | ~solved)
+
+    def _guess(self, way: Way, alike: Array, dtype) -> Float[Array, "s n"]:
+        """Velocities at the nodes, by the polynomial through those of the steps of this length."""
+        tab, s = self.tableau, len(self.tableau.nodes)
+        last = way.velocities[s:]
+        same = jnp.tile(tab.at_end.astype(dtype) @ last, (s, 1))
+        if self.newton:
+            # Through steps that are longer than an oscillation a polynomial leads nowhere.
+            return jnp.tile(jnp.mean(last, axis=0), (s, 1))
+        of_one, of_two = tab.ahead.astype(dtype) @ last, tab.ahead_of_two.astype(dtype) @ way.velocities
+        return jnp.where(alike == 0, same, jnp.where(alike == 1, of_one, of_two))
 
     def velocity(self, way: Way, t: Array) -> Float[Array, " n"]:
         """The velocity that belongs to the momentum."""
@@ -181,9 +195,12 @@ class GaussStep(NamedTuple):
             motion = jnp.abs(jnp.sum(z.velocities * at.momenta))
             return Unknown(z.velocities + du, z.multipliers + dm), size, before, motion, count + 1
 
+        def is_solved(size: Array, motion: Array) -> Array:
+            return size <= small**SOLVED * motion + ROUND_OFFS**2 * round_off / h**2
+
         def goes_on(state: tuple) -> Array:
             _, size, before, motion, count = state
-            closer = (size < before) | (count < AT_LEAST)
+            closer = (size < before) | ~is_solved(size, motion)
             # What is still missing, at the rate of the last two corrections.
             missing = size * jnp.where(jnp.isfinite(before) & (before > 0), jnp.minimum(size / before, 1.0), 1.0)
             return (missing > (ENOUGH * small) ** 2 * motion) & closer & (count < MOST_ITERATIONS)
@@ -191,7 +208,7 @@ class GaussStep(NamedTuple):
         infinite = jnp.asarray(jnp.inf, h.dtype)
         start = better((guess, infinite, infinite, infinite, jnp.asarray(0)))
         z, size, _, motion, _ = lax.while_loop(goes_on, better, start)
-        return z, size <= small**SOLVED * motion + ROUND_OFFS**2 * round_off / h**2
+        return z, is_solved(size, motion)
 
     def _change(self, h: Array, at: "AtNodes", at_nodes: Array, whole: Array | None) -> tuple[Array, Array, Array]:
         """The changes of V and of the multipliers that give what is lacking, and δκ."""

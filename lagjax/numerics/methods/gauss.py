@@ -93,9 +93,9 @@ class Tableau(NamedTuple):
     """The coefficients of the method with s stages, as in the text above.
 
     `nodes`, `weights` (s,): c, b; `mixed` (s, s): μ; `lobatto_nodes`, `lobatto_weights` (s + 1,): c̃, b̃; `to_nodes`
-    (s + 1, s): ν. From values at the nodes of two steps, `ahead` (s, 2 s) leads to those of the polynomial through them
-    at the nodes of the next step; from values at the nodes of a step, `at_end` (s,) to that at its end, and `to_middle`
-    (s,) from velocities to half the way.
+    (s + 1, s): ν. From values at the nodes of a step, `ahead` (s, s) leads to those of the polynomial through them at
+    the nodes of the next step, `at_end` (s,) to that at its end, and `to_middle` (s,) from velocities to half the way;
+    `ahead_of_two` (s, 2 s) is `ahead` from two steps.
     """
 
     nodes: np.ndarray
@@ -105,6 +105,7 @@ class Tableau(NamedTuple):
     lobatto_weights: np.ndarray
     to_nodes: np.ndarray
     ahead: np.ndarray
+    ahead_of_two: np.ndarray
     at_end: np.ndarray
     to_middle: np.ndarray
 
@@ -145,7 +146,8 @@ def tableau(stages: int) -> Tableau:
     return Tableau(
         nodes, weights, mixed, lobatto, 1 / (stages * (stages + 1) * last(ends) ** 2),
         to_nodes=np.stack([p(lobatto) for p in integrals], axis=1) / weights,
-        ahead=np.stack([_lagrange(both, j)(1 + nodes) for j in range(2 * stages)], axis=1),
+        ahead=np.stack([ell(1 + nodes) for ell in basis], axis=1),
+        ahead_of_two=np.stack([_lagrange(both, j)(1 + nodes) for j in range(2 * stages)], axis=1),
         at_end=np.array([ell(1.0) for ell in basis]), to_middle=np.array([p(0.5) for p in integrals]),
     )  # fmt: skip
 

@@ -109,6 +109,45 @@ def of_momenta(x, system, params, method, span):
     return jnp.concatenate([traj.q[-1], momentum(traj.q[-1], traj.v[-1])])
 
 
+def spin(q, v):
+    """The angular velocity in the axes of a body with the unit quaternion q."""
+    w, x, y, z = q
+    a, b, c, d = v
+    return 2 * jnp.stack([w * b - x * a - y * d + z * c, w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b])
+
+
+@pytest.mark.exhaustive
+def test_a_heavy_top_by_quaternion():
+    """Order 6 where the mass matrix is singular without the constraint, and depends on q. Twin: as for the others."""
+    inertia = np.array([1.0, 1.0, 0.5])
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * jnp.sum(inertia * spin(q, v) ** 2) - params * (q[0] ** 2 - q[1] ** 2 - q[2] ** 2 + q[3] ** 2)
+
+    top = lj.System(lagrangian, constraints={"unit": lj.Holonomic(lambda t, q, params: jnp.sum(q**2) - 1.0)})
+    q0, turn = np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0]), np.array([0.3, 0.0, 6.0])
+    v0 = 0.5 * np.array([-q0[1] * turn[0], q0[0] * turn[0], -q0[1] * turn[2], q0[0] * turn[2]])
+    run = lambda **options: lj.integrate(
+        top, q0, v0, 3.0, ts=np.linspace(0.0, 10.0, 11), estimate_error=False, **options
+    )
+    exact = run(rtol=1e-12).q
+    errors = [float(np.max(np.abs(run(method=lj.Gauss(3), dt0=h).q - exact))) for h in (0.1, 0.05)]
+    assert abs(np.log2(errors[0] / errors[1]) - 6) < 0.35 and errors[1] < 1e-7
+
+
+@pytest.mark.exhaustive
+def test_a_mass_that_depends_on_the_velocity():
+    """A relativistic oscillator, whose L has a largest velocity. Twin: the classical one is far away."""
+    rel = lj.System(lambda t, q, v, params: -jnp.sqrt(1 - v**2) - 0.5 * q**2)
+    run = lambda system, **options: lj.integrate(
+        system, 0.5, 0.0, ts=np.linspace(0.0, 10.0, 11), estimate_error=False, **options
+    )
+    exact = run(rel, rtol=1e-12).q
+    np.testing.assert_allclose(run(rel, method=lj.Gauss(4), dt0=0.1).q, exact, atol=1e-11)
+    classical = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2)
+    assert np.max(np.abs(run(classical, rtol=1e-9).q - exact)) > 0.1
+
+
 @pytest.mark.slow
 def test_steps_are_symplectic():
     """Dᵀ J D = J for twenty steps of a double pendulum, whose mass matrix depends on the angles. Twin: Dopri8."""
