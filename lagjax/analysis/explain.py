@@ -221,10 +221,7 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     held = [constraints.jacobian(model.of(modes), *state) for modes in both]
     here, open_rank = (int(np.linalg.matrix_rank(np.asarray(rows))) for rows in held)
     free = found.degrees_of_freedom - here + open_rank
-    together_held = int(np.sum(laws.holds(met.modes))) + laws.equations - len(laws.rows)
-    shared = (
-        f"the {together_held} that hold have {here} independent directions: others have the same motion, or another"
-    )
+    equations = int(np.sum(laws.holds(met.modes))) + laws.equations - len(laws.rows)
     at_once = "one after the other" if laws.impacts == "sequential" else "all at once"
     gaps, slips = laws.count
     together = f"up to {gaps + slips} forces of contacts that touch, as a complementarity problem"
@@ -235,7 +232,7 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
         ("modes", f"{laws.size} ({counted}); here {', '.join(now)}"),
         ("in these modes", f"{free} degree{'' if free == 1 else 's'} of freedom"),
         *([("solved together", together)] if gaps + slips > 1 else []),
-        *([("forces", f"not unique, {shared}")] if together_held > here else []),
+        *([("forces", f"not unique: {equations} hold, {here} of them independent")] if equations > here else []),
         *([("impacts", f"of contacts that are struck together: {at_once}")] if gaps > 1 else []),
     ]
     problem = found.problem

@@ -132,7 +132,7 @@ def test_explained():
     assert all("forces" not in row for row in rows)
     walls = lj.Contact(lambda t, q, params: jnp.stack([q[0], -q[0]]))
     between = lj.explain(lj.System(block.lagrangian, elements={"walls": walls}), 0.0, np.zeros(2), np.zeros(2), PARAMS)
-    assert "not unique, the 2 that hold have 1 independent directions" in dict(between.rows)["forces"]
+    assert "not unique: 2 hold, 1 of them independent" in dict(between.rows)["forces"]
     inside = lj.explain(block, 0.0, np.array([0.0, -0.1]), np.zeros(2), PARAMS)
     assert "the gap 'floor' is below zero" in str(inside.problem)
 
