@@ -181,6 +181,8 @@ def integrate(
     dtype = state.t.dtype
     system = traced_phases(system if start is None else system.starting(start), state, ts)
     for phase in system.phases:
+        if phase.dissipation is None:
+            continue
         given = state._replace(params=system.given(state.params)) if isinstance(system, Hybrid) else state
         warn_of_odd_dissipation(phase.dissipation, given)
     crossings, left = crossings_of(events, event), left_to_diffrax(event)

@@ -92,8 +92,6 @@ def sequence(order: int) -> Sequence:
         drifts = np.array([*STEPS, 1 - 2 * sum(STEPS), *STEPS[::-1]])
         return Sequence((np.append(0.0, drifts) + np.append(drifts, 0.0)) / 2, drifts)
     kicks, drifts = KICKS[order], DRIFTS[order]
-    if order == 2:
-        return Sequence(np.array([0.5, 0.5]), np.array([1.0]))
     if len(kicks) > len(drifts):
         # A kick in the middle.
         middle = 1 - 2 * sum(kicks)

@@ -63,7 +63,7 @@ STEPS = {1: (80, 160, 320), 2: (24, 34, 48), 3: (16, 22, 30), 4: (10, 14, 18)}
     ],
 )
 def test_order_of_gauss(exact, form, stages):
-    """Order 2 s in positions, velocities and multipliers. Twin: coefficients that are not symmetric have order 1."""
+    """Order 2 s in positions, velocities and multipliers. Twin: `test_a_wrong_order_would_be_seen`."""
     found = measured(exact, form, lj.Gauss(stages), STEPS[stages])
     assert all(within(2 * stages, found)), found
 
@@ -118,7 +118,7 @@ def spin(q, v):
 
 @pytest.mark.exhaustive
 def test_a_heavy_top_by_quaternion():
-    """Order 6 where the mass matrix is singular without the constraint, and depends on q. Twin: as for the others."""
+    """Order 6 where the mass matrix is singular without the constraint, and depends on q."""
     inertia = np.array([1.0, 1.0, 0.5])
 
     def lagrangian(t, q, v, params):
@@ -188,7 +188,7 @@ def test_a_thousand_turns_and_back():
 
 
 @pytest.mark.slow
-def test_constraints_over_a_million_steps():
+def test_constraints_over_half_a_million_steps():
     """A pendulum on a rod, half a million steps: the rod's length to round-off, and the energy."""
     pendulum = lj.System(
         lambda t, q, v, g: 0.5 * jnp.sum(v**2) - g * q[1],
@@ -209,7 +209,7 @@ def test_constraints_over_a_million_steps():
 
 @pytest.mark.slow
 def test_derivatives_in_both_modes():
-    """d(end)/d(parameter), forward and in reverse, and as by Dopri8; second ones. Twin: another span differs."""
+    """d(end)/d(parameter), forward and in reverse, and as by steps that adapt."""
     pendulum = lj.System(lambda t, q, v, k: 0.5 * v**2 + k * jnp.cos(q))
 
     def end(k, **options):
