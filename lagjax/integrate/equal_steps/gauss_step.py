@@ -8,8 +8,12 @@ matrices in the middle of the step:
     [M  -Aᵀ] [δV_i]   [R_i]
     [A   0 ] [δκ_i] = [r_i]        κ = h ã λ, or h a μ: what the multipliers add to the momenta at the nodes
 
-The last multipliers of a step are those with which its velocity at the end satisfies the constraints. Positions and
-momenta carry what is lost when a step is added to them (compensated summation).
+The last multipliers of a step are those with which its velocity at the end satisfies the constraints. Of constraints
+that depend on each other a largest independent set is kept in each step, chosen at its start. Positions and momenta
+carry what is lost when a step is added to them (compensated summation).
+
+Coordinates of first order, v = φ(t, q, v_others), are collocated at the same nodes: V_i = φ(Q_i, V_i), a row of the
+unit matrix in M. With q, p and these as unknowns all of it is one Gauss method, which keeps quadratic invariants.
 
 Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VIII.6.1 (iteration), §VIII.5 (round-off).
 """
@@ -24,8 +28,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.jaxtools import stop_gradient
-from lagjax.mechanics import applied_force, mass_and_forcing
-from lagjax.numerics import Tableau, dense
+from lagjax.mechanics import applied_force, mass_and_forcing, resolved
+from lagjax.numerics import Tableau, dense, independent_rows
 from lagjax.system import Model, constraints
 
 MOST_ITERATIONS = 60
@@ -52,7 +56,8 @@ class Way(NamedTuple):
     """The state between two steps.
 
     `x_rest`, `p_rest`: what is to be added to x and p; `velocities`, `multipliers`: at the nodes of the last two steps,
-    and of the last one. `alike`: how many of these steps had the length `h`.
+    and of the last one. `independent`: which constraint equations the next step is solved with. `alike`: how many of
+    these steps had the length `h`.
     """
 
     x: Float[Array, " n"]
@@ -61,6 +66,7 @@ class Way(NamedTuple):
     p_rest: Float[Array, " n"]
     velocities: Float[Array, "2s n"]
     multipliers: Float[Array, "s m"]
+    independent: Bool[Array, " m"]
     h: Float[Array, ""]
     alike: Int[Array, ""]
     unsolved: Bool[Array, ""]
@@ -80,25 +86,26 @@ class GaussStep(NamedTuple):
         multipliers = jnp.zeros((s, self.model.m), x.dtype)
         p = self._momentum(t, x, u)
         h, alike = jnp.zeros_like(t), jnp.asarray(0)
-        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, h, alike, jnp.asarray(False))
+        kept = independent_rows(constraints.jacobian(self.model, t, x, u))
+        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, kept, h, alike, jnp.asarray(False))
 
     def advanced(self, way: Way, t: Array, h: Array) -> Way:
         """The state after a step from t to t + h."""
         s, dtype = len(self.tableau.nodes), h.dtype
         alike = jnp.where(jnp.abs(h - way.h) <= SAME_LENGTH * h, way.alike, 0)
-        guess = Unknown(self._guess(way, alike, dtype), way.multipliers)
+        guess = Unknown(self._guess(way, alike, dtype), jnp.where(way.independent, way.multipliers, 0.0))
         found, solved = self._solved(stop_gradient(way), *stop_gradient((t, h, guess)))
         if self.differentiated:
             found = self._with_derivatives(way, t, h, found)
         at = self._at_nodes(way, t, h, found)
         x, x_rest = added(way.x, way.x_rest + jnp.sum(at.moves, axis=0))
-        dp = way.p_rest + jnp.sum(at.kicks, axis=0) + jnp.sum(at.impulses, axis=0)
+        dp, kept = way.p_rest + jnp.sum(at.kicks, axis=0) + jnp.sum(at.impulses, axis=0), way.independent
         if self.model.m:
-            _, dp = self._at_end(t + h, x, way.p, dp, self.tableau.at_end.astype(dtype) @ found.velocities)
+            _, dp, kept = self._at_end(t + h, x, way.p, dp, self.tableau.at_end.astype(dtype) @ found.velocities)
         p, p_rest = added(way.p, dp)
         velocities = jnp.concatenate([way.velocities[s:], found.velocities])
         alike = jnp.minimum(alike + 1, 2)
-        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, h, alike, way.unsolved | ~solved)
+        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, kept, h, alike, way.unsolved | ~solved)
 
     def _guess(self, way: Way, alike: Array, dtype) -> Float[Array, "s n"]:
         """Velocities at the nodes, by the polynomial through those of the steps of this length."""
@@ -117,14 +124,28 @@ class GaussStep(NamedTuple):
         return self._at_end(t, way.x, way.p, way.p_rest, u)[0]
 
     def _at_end(self, t: Array, x: Array, p: Array, dp: Array, u: Array):
-        """The velocity at x with the momentum p + dp, and dp with the impulse that keeps it on the constraints."""
-        model, (inverse, _) = self.model, self._matrices(t, x, u)
-        rows = constraints.jacobian(model, t, x, u)
+        """The velocity at x with the momentum p + dp, dp with the impulse that keeps it on the constraints, and which
+        of these are independent."""
+        model, rows = self.model, constraints.jacobian(self.model, t, x, u)
+        kept = independent_rows(rows)
+        inverse, _ = self._matrices(t, x, u, kept)
         for _ in range(CORRECTIONS):
-            lacks = dp + (p - self._momentum(t, x, u))
-            change = inverse @ jnp.concatenate([lacks, -constraints.velocity_residual(model, t, x, u)])
+            short = self._of_first_order(t, x, u, dp + (p - self._momentum(t, x, u)))
+            lacks = jnp.where(kept, -constraints.velocity_residual(model, t, x, u), 0.0)
+            change = inverse @ jnp.concatenate([short, lacks])
             u, dp = u + change[: model.n], dp + change[model.n :] @ rows
-        return u, dp
+        return u, dp, kept
+
+    def _of_first_order(self, t: Array, x: Array, u: Array, short: Array) -> Array:
+        """What momenta lack; for coordinates of first order what their velocities lack."""
+        if self.model.form.first_order is None:
+            return short
+        return jnp.where(self._is_first_order, resolved(self.model, t, x, u) - u, short)
+
+    @property
+    def _is_first_order(self) -> np.ndarray:
+        first = self.model.form.first_order
+        return np.zeros(self.model.n, bool) if first is None else first.mask(self.model.n)
 
     def _momentum(self, t: Array, x: Array, u: Array) -> Array:
         return jax.grad(self.model.lagrangian, argnums=2)(t, x, u)
@@ -133,15 +154,16 @@ class GaussStep(NamedTuple):
         push, p = jax.grad(self.model.lagrangian, argnums=(1, 2))(t, x, u)
         return p, push + applied_force(self.model, t, x, u)
 
-    def _matrices(self, t: Array, x: Array, u: Array) -> tuple[Array, Array]:
-        """The inverse of the matrix, and the round-off of x."""
+    def _matrices(self, t: Array, x: Array, u: Array, kept: Array) -> tuple[Array, Array]:
+        """The inverse of the matrix with these constraints, and the round-off of x."""
         t, x, u, model = stop_gradient((t, x, u, self.model))
         mass = mass_and_forcing(model, t, x, u).mass
-        round_off = jnp.abs(x) @ jnp.abs(mass) @ jnp.abs(x) * jnp.finfo(x.dtype).eps ** 2
+        size = jnp.where(self._is_first_order, 0.0, jnp.abs(x))
+        round_off = size @ jnp.abs(mass) @ size * jnp.finfo(x.dtype).eps ** 2
         if not model.m:
             return dense.inverse(mass), round_off
-        rows = constraints.jacobian(model, t, x, u)
-        matrix = jnp.block([[mass, -rows.T], [rows, jnp.zeros((model.m, model.m), x.dtype)]])
+        rows = jnp.where(kept[:, None], constraints.jacobian(model, t, x, u), 0.0)
+        matrix = jnp.block([[mass, -rows.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0).astype(x.dtype))]])
         return dense.inverse(matrix), round_off
 
     def _at_nodes(self, way: Way, t: Array, h: Array, z: Unknown) -> "AtNodes":
@@ -166,16 +188,20 @@ class GaussStep(NamedTuple):
         kicks = parts * pushes
         after = mixed @ kicks
         if holonomic.any():
-            times, to_nodes = t + tab.lobatto_nodes.astype(dtype) * h, tab.to_nodes.astype(dtype)
+            ends, to_nodes = t + tab.lobatto_nodes.astype(dtype) * h, tab.to_nodes.astype(dtype)
             at_ends = way.x[None] + (way.x_rest[None] + to_nodes[1:] @ moves)
             starts = jnp.concatenate([way.x[None], at_ends[:-1]])
             rows = jax.vmap(lambda t, x: constraints.jacobian(model, t, x, z.velocities[0])[holonomic])
             forces = h * tab.lobatto_weights[:-1, None].astype(dtype) * z.multipliers[:, holonomic]
-            impulses = jnp.einsum("sm,smn->sn", forces, rows(times[:-1], starts))
+            impulses = jnp.einsum("sm,smn->sn", forces, rows(ends[:-1], starts))
             after = after + (1 - to_nodes[:-1].T) @ impulses
-            gaps = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times[1:], at_ends)
+            gaps = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(ends[1:], at_ends)
             lacks = lacks.at[:, holonomic].set(-_inverted(tab.inner_to_nodes, dtype) @ gaps / h)
         short = way.p[None] + (way.p_rest[None] + after) - momenta
+        short = jax.vmap(self._of_first_order)(times, x, z.velocities, short)
+        if model.m > 1:
+            # The multipliers of the others are zero.
+            lacks = jnp.where(way.independent, lacks, z.multipliers)
         return AtNodes(momenta, moves, kicks, impulses, short, lacks)
 
     def _solved(self, way: Way, t: Array, h: Array, guess: Unknown) -> tuple[Unknown, Bool[Array, ""]]:
@@ -183,32 +209,60 @@ class GaussStep(NamedTuple):
         step = self._replace(model=stop_gradient(self.model))
         small = jnp.finfo(h.dtype).eps
         middle = way.x + h * (self.tableau.to_middle.astype(h.dtype) @ guess.velocities)
-        at_nodes, round_off = step._matrices(t + h / 2, middle, jnp.mean(guess.velocities, axis=0))
+        turning = jnp.mean(guess.velocities, axis=0)
+        at_nodes, round_off = step._matrices(t + h / 2, middle, turning, way.independent)
         whole = step._whole_inverse(way, t, h, guess) if self.newton else None
+        first, noise = self._is_first_order, step._noise(t + h / 2, middle, turning)
+        slack = ROUND_OFFS**2 * round_off / h**2
 
         def better(state: tuple) -> tuple:
-            z, before, _, _, count = state
+            z, before, *_, count = state
             at = step._at_nodes(way, t, h, z)
             du, dm, dk = step._change(h, at, at_nodes, whole)
+            new, heavy = Unknown(z.velocities + du, z.multipliers + dm), jnp.where(first, 0.0, z.velocities)
             # In the metric of M: M δV = R + Aᵀ δκ, where forces change little.
-            size = jnp.abs(jnp.sum(du * at.short)) + jnp.abs(jnp.sum(dk * at.lacks))
-            motion = jnp.abs(jnp.sum(z.velocities * at.momenta))
-            return Unknown(z.velocities + du, z.multipliers + dm), size, before, motion, count + 1
-
-        def is_solved(size: Array, motion: Array) -> Array:
-            return size <= small**SOLVED * motion + ROUND_OFFS**2 * round_off / h**2
+            size = jnp.abs(jnp.sum(jnp.where(first, 0.0, du * at.short))) + jnp.abs(jnp.sum(dk * at.lacks))
+            motion = jnp.abs(jnp.sum(heavy * at.momenta))
+            solved = size <= small**SOLVED * motion + slack
+            if first.any():
+                # There is no such metric: each relative to the velocities of its kind.
+                change = jnp.max(jnp.abs(du), axis=0)
+                speed = self._levels(jnp.max(jnp.maximum(jnp.abs(z.velocities), jnp.abs(new.velocities)), axis=0))
+                solved &= jnp.all(~first | (change <= small ** (SOLVED / 2) * speed + noise))
+                share = jnp.where(first, change / jnp.where(speed > 0, speed, 1.0), 0.0)
+                size, motion = jnp.stack([size, jnp.max(share) ** 2]), jnp.stack([motion, jnp.ones_like(motion)])
+            return new, size, before, motion, solved, count + 1
 
         def goes_on(state: tuple) -> Array:
-            _, size, before, motion, count = state
-            closer = (size < before) | ~is_solved(size, motion)
+            _, size, before, motion, solved, count = state
+            closer = (size < before) | ~solved
             # What is still missing, at the rate of the last two corrections.
             missing = size * jnp.where(jnp.isfinite(before) & (before > 0), jnp.minimum(size / before, 1.0), 1.0)
-            return (missing > (ENOUGH * small) ** 2 * motion) & closer & (count < MOST_ITERATIONS)
+            return jnp.any((missing > (ENOUGH * small) ** 2 * motion) & closer) & (count < MOST_ITERATIONS)
 
-        infinite = jnp.asarray(jnp.inf, h.dtype)
-        start = better((guess, infinite, infinite, infinite, jnp.asarray(0)))
-        z, size, _, motion, _ = lax.while_loop(goes_on, better, start)
-        return z, is_solved(size, motion)
+        infinite = jnp.full((2,) if first.any() else (), jnp.inf, h.dtype)
+        start = better((guess, infinite, infinite, infinite, jnp.asarray(False), jnp.asarray(0)))
+        z, *_, solved, _ = lax.while_loop(goes_on, better, start)
+        return z, solved
+
+    def _levels(self, y: Array) -> Array:
+        """The largest |y| among coordinates of each one's kind: with a mass, determined by a balance, one state."""
+        kinds, first = np.zeros((1, self.model.n), bool), self.model.form.first_order
+        if first is not None:
+            of_kinds = [first.damped, *(places for _, places in first.states)]
+            kinds = np.stack([np.isin(np.arange(self.model.n), places) for places in ([], *of_kinds)])
+            kinds[0] = ~self._is_first_order
+        largest = jnp.max(jnp.where(kinds, jnp.abs(y)[None], 0.0), axis=1)
+        return largest @ kinds.astype(y.dtype)
+
+    def _noise(self, t: Array, x: Array, u: Array) -> Array:
+        """By how much velocities of first order change where everything else does by a small part of its size."""
+        if self.model.form.first_order is None:
+            return jnp.zeros_like(x)
+        share = jnp.sqrt(jnp.finfo(x.dtype).eps) * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
+        others = jnp.where(self._is_first_order, 0.0, self._levels(u))
+        nearby = resolved(self.model, t, x + share * self._levels(x), u + share * others)
+        return jnp.abs(nearby - resolved(self.model, t, x, u))
 
     def _change(self, h: Array, at: "AtNodes", at_nodes: Array, whole: Array | None) -> tuple[Array, Array, Array]:
         """The changes of V and of the multipliers that give what is lacking, and δκ."""

@@ -8,11 +8,11 @@ from lagjax.system import Model
 def check_can_be_stepped(method: EqualSteps, model: Model):
     """Raise unless the method is made for systems like this one."""
     first = with_first_order(model).form.first_order
-    if first is not None:
+    if first is not None and isinstance(method, Splitting):
         names = ", ".join(f"'{name}'" for name, is_first in zip(model.names, first.mask(model.n)) if is_first)
         raise ValueError(
             f"lj.{method.label} steps coordinates with a mass, and {names} have none: they are of first order.\n"
-            "Fix: leave method out."
+            "Fix: method=lj.Gauss(3)."
         )
     if model.reacts:
         raise ValueError(f"lj.{method.label} does not solve for forces that take multipliers.\nFix: leave method out.")
