@@ -29,9 +29,9 @@ lagjax.numerics.methods.runge_kutta
 lagjax.numerics.methods.nystrom
   Nystrom8 Nystrom12: in_a_loop
 lagjax.numerics.methods.gauss
-  Gauss: stages newton
+  Gauss: stages newton pace
 lagjax.numerics.methods.splitting
-  Splitting: order
+  Splitting: order pace
 lagjax.numerics.methods.radau
   Radau5: root_finder root_find_max_steps step_powers
 lagjax.numerics.methods.radau

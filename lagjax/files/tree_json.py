@@ -120,6 +120,11 @@ class Writer:
                 "Fix: graphdef, state = nnx.split(model); nnx.to_pure_dict(state) in params, dictionaries of arrays; "
                 "nnx.merge(graphdef, ...) of them in the Lagrangian."
             )
+        if ".pace" in path and callable(value):
+            raise NotWritable(
+                f"{path.split('.pace')[0]} has a pace, which is a function, and functions are not data.\n"
+                "Fix: np.savez of traj.t, traj.q and traj.v."
+            )
         if isinstance(value, types.FunctionType) or callable(value):
             raise NotWritable(
                 f"{path} is a function ({getattr(value, '__name__', type(value).__name__)}), and functions are not "

@@ -176,9 +176,14 @@ def _of_controller(trajectory: Trajectory, settings: Settings):
 
 def _of_equal_steps(trajectory: Trajectory, settings: Settings):
     """The fix for equal steps, one of which was not solved: a shorter one that is."""
-    assert settings.dt0 is not None
-    end, longest = trajectory.end, float(settings.dt0)
-    ts = end.t + np.sign(float(trajectory.t[-1] - end.t)) * np.array([0.0, longest], np.asarray(end.t).dtype)
+    assert settings.dt0 is not None and isinstance(settings.method, EqualSteps)
+    end, longest, pace = trajectory.end, float(settings.dt0), 1.0
+    if settings.method.pace is not None:
+        pace = float(settings.method.pace(end.t, end.q, trajectory.params))
+        if not 0 < pace < np.inf:
+            return f"a pace that is positive and finite: there it is {pace:.3g}"
+    ahead = np.array([0.0, longest * pace], np.asarray(end.t).dtype)
+    ts = end.t + np.sign(float(trajectory.t[-1] - end.t)) * ahead
     newton = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else ""
     for part in (2, 4, 8, 16, 32):
         shorter = replace(settings, dt0=settings.dt0 / part, repeated_up_to=np.zeros((), np.int32))

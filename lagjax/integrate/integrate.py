@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.integrate import arguments
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
+from lagjax.integrate.equal_steps.pace import with_traced_pace
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
@@ -179,6 +180,8 @@ def integrate(
     ts = arguments.vector_of_times(ts)
     state = coordinates.prepared(ts[0], q0, with_rates(system, q0, v0), params)
     dtype = state.t.dtype
+    if isinstance(method, EqualSteps):
+        method = with_traced_pace(method, state)
     system = traced_phases(system if start is None else system.starting(start), state, ts)
     for phase in system.phases:
         if phase.dissipation is None:

@@ -1,10 +1,12 @@
-"""The steps of a motion, all of one length between two outputs.
+"""The steps of a motion, all of one length between two outputs, or following a pace (`pace.py`).
 
 An interval between two outputs is divided into the fewest equal steps that are no longer than `dt0`. Only outputs are
 kept. In reverse mode an interval is run again, from the state at its start, with the states of some of its steps.
 """
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox.internal as eqxi
@@ -14,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.equal_steps.gauss_step import GaussStep
+from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
 from lagjax.jaxtools import one_function, where
 from lagjax.numerics import EqualSteps, Gauss, Splitting, tableau
@@ -26,46 +29,21 @@ CHECKPOINTS = 64
 
 
 def stepped(
-    model: Model, method: EqualSteps, q: PyTree, v: PyTree, ts: Float[Array, " T"], dt: Float[Array, ""], adjoint: Any,
-    differentiated: bool,
+    model: Model, method: EqualSteps, pace: Pace | None, q: PyTree, v: PyTree, ts: Float[Array, " T"],
+    dt: Float[Array, ""], adjoint: Any, differentiated: bool,
 ):  # fmt: skip
     """The states (q, v) at `ts`, which of these were reached, the number of steps, the last time and state (1,), and
     the result."""
     forward = isinstance(adjoint, diffrax.ForwardMode)
+    checkpointed = partial(eqxi.while_loop, kind="checkpointed", checkpoints=CHECKPOINTS)
+    loop = lax.while_loop if forward else checkpointed
 
-    def steps(model: Model, q: PyTree, v: PyTree, ts: Array, dt: Array):
+    def steps(model: Model, pace: Pace | None, q: PyTree, v: PyTree, ts: Array, dt: Array):
         x, u = model.vectors(q, v)
         step = _step_of(method, model, ts[0], x, u, differentiated)
-
-        def interval(way: Any, row: tuple[Array, Array]):
-            t0, t1 = row
-            count = jnp.ceil((t1 - t0) / dt - ROUNDED).astype(int)
-            count = jnp.where(way.unsolved, 0, jnp.where(t1 > t0, jnp.maximum(count, 1), 0))
-            h = (t1 - t0) / jnp.maximum(count, 1)
-
-            def goes_on(state: tuple) -> Array:
-                k, way = state
-                return (k < count) & ~way.unsolved
-
-            def one(state: tuple) -> tuple:
-                k, way = state
-                new = step.advanced(way, t0 + k * h, h)
-                # A step that was not solved is where the motion ends.
-                before = way._replace(unsolved=jnp.asarray(True))
-                return jnp.where(new.unsolved, k, k + 1), where(new.unsolved, before, new)
-
-            start = jnp.asarray(0), way
-            if forward:
-                k, way = lax.while_loop(goes_on, one, start)
-            else:
-                k, way = eqxi.while_loop(goes_on, one, start, kind="checkpointed", checkpoints=CHECKPOINTS)
-            t = jnp.where(way.unsolved, jnp.minimum(t0 + k * h, t1), t1)
-            return way, (t, way.x, step.velocity(way, t), way.unsolved, k)
-
-        if not forward:
-            interval = jax.checkpoint(interval, prevent_cse=False)
-        first = step.first(ts[0], x, u)
-        _, (times, xs, us, unsolved, counts) = lax.scan(interval, first, (ts[:-1], ts[1:]))
+        steps = EquallyLong(step, dt, loop) if pace is None else PacedSteps(step, pace, dt, loop)
+        interval = steps.interval if forward else jax.checkpoint(steps.interval, prevent_cse=False)
+        _, (times, xs, us, unsolved, counts) = lax.scan(interval, steps.first(ts[0], x, u), (ts[:-1], ts[1:]))
         states = jax.tree.map(
             lambda first, rows: jnp.concatenate([first[None], rows]), (q, v), (model.tree(xs), model.tree(us))
         )
@@ -74,11 +52,45 @@ def stepped(
         end = jnp.concatenate([ts[:1], times])[last], jax.tree.map(lambda x: x[last], states)
         return states, reached, jnp.sum(counts), end
 
-    arguments = model, q, v, ts, dt
+    arguments = model, pace, q, v, ts, dt
     states, reached, count, end = one_function(steps, *arguments) if forward else steps(*arguments)
     diverged = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(jnp.all(reached), diffrax.RESULTS.successful, diverged)
     return states, reached, count, end, result
+
+
+class EquallyLong(NamedTuple):
+    """Steps by `step` of equal length between two outputs, at most `dt`, in a loop like JAX's `while_loop`."""
+
+    step: Any
+    dt: Float[Array, ""]
+    loop: Callable
+
+    def first(self, t: Array, x: Array, u: Array):
+        """The start of the motion."""
+        return self.step.first(t, x, u)
+
+    def interval(self, way: Any, row: tuple[Array, Array]):
+        """The state at the end of an interval, twice: to go on from, and as an output."""
+        t0, t1 = row
+        count = jnp.ceil((t1 - t0) / self.dt - ROUNDED).astype(int)
+        count = jnp.where(way.unsolved, 0, jnp.where(t1 > t0, jnp.maximum(count, 1), 0))
+        h = (t1 - t0) / jnp.maximum(count, 1)
+
+        def goes_on(state: tuple) -> Array:
+            k, way = state
+            return (k < count) & ~way.unsolved
+
+        def one(state: tuple) -> tuple:
+            k, way = state
+            new = self.step.advanced(way, t0 + k * h, h)
+            # A step that was not solved is where the motion ends.
+            before = way._replace(unsolved=jnp.asarray(True))
+            return jnp.where(new.unsolved, k, k + 1), where(new.unsolved, before, new)
+
+        k, way = self.loop(goes_on, one, (jnp.asarray(0), way))
+        t = jnp.where(way.unsolved, jnp.minimum(t0 + k * h, t1), t1)
+        return way, (t, way.x, self.step.velocity(way, t), way.unsolved, k)
 
 
 def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, differentiated: bool):

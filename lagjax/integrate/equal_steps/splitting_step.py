@@ -41,7 +41,8 @@ class SplittingStep(NamedTuple):
 
     def advanced(self, way: SplitWay, t: Array, h: Array) -> SplitWay:
         """The state after a step from t to t + h."""
-        kicks, drifts = sequence(self.order)
+        # Python's numbers, which take the dtype of the state.
+        kicks, drifts = (part.tolist() for part in sequence(self.order))
         part, dx, du, pull = 0.0, way.x_rest, way.u_rest + kicks[0] * h * way.pull, way.pull
         for kick, drift in zip(kicks[1:], drifts):
             part += drift

@@ -31,6 +31,7 @@ from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.parts import Snapshot, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.numerics import EqualSteps
 from lagjax.system import System, is_traced, takes_of
 
 
@@ -75,6 +76,8 @@ def backward_trajectory_of(
         reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
     )
     asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
+    if isinstance(settings.method, EqualSteps):
+        asked = asked._replace(method=settings.method)
     how = reflected.static.how._replace(backward=True)
     arrays, static = pack((system, params, asked), how, backward_trajectory_of)
     events = {name: replace(found, t=-found.t, v=_negative(found.v)) for name, found in reflected.events.items()}
@@ -107,8 +110,12 @@ def reflect_snapshot(snapshot: Snapshot) -> Snapshot:
 
 def _reflect_settings(settings: Settings):
     controller, event, jump_ts = settings.controller, settings.event, settings.jump_ts
+    method = settings.method
+    if isinstance(method, EqualSteps) and method.pace is not None:
+        method = replace(method, pace=Reflected(method.pace, of_velocities=False))
     return replace(
         settings,
+        method=method,
         controller=None if controller is None else controller.wrap(-1),
         event=None if event is None else _reflect_event(event),
         jump_ts=None if jump_ts is None else -jump_ts,

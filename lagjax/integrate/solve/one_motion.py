@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.integrate.adjoint.replay import Replay, replayed
 from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, with_room
 from lagjax.integrate.equal_steps.loop import stepped
+from lagjax.integrate.equal_steps.pace import Pace
 from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
@@ -265,8 +266,10 @@ def _in_equal_steps(equations: Equations, start: Start, ts: Array, settings: Set
     assert isinstance(settings.method, EqualSteps) and settings.dt0 is not None
     state = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
     at = jnp.where(start.refused, ts[0], ts)
+    form, model = equations.users or equations.model.form, equations.model
+    pace = None if settings.method.pace is None else Pace(settings.method.pace, form, model.params)
     states, reached, count, end, result = stepped(
-        equations.model, settings.method, *state, at, settings.dt0, adjoint, settings.differentiated
+        model, settings.method, pace, *state, at, settings.dt0, adjoint, settings.differentiated
     )
     stats = {"num_steps": count, "num_accepted_steps": count, "num_rejected_steps": jnp.zeros_like(count)}
     return Solution(jnp.where(reached, ts, jnp.inf), states, end, stats, result, None)

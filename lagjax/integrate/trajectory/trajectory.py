@@ -343,7 +343,8 @@ def _not_estimated(traj):
 def _lengths(traj):
     """What chose the steps."""
     if traj.static.how.steps == "fixed":
-        return f"steps of {float(traj.asked.dt0):.6g}"
+        paced = getattr(traj.asked.method, "pace", None) is not None
+        return f"steps of {float(traj.asked.dt0):.6g}{' times the pace' if paced else ''}"
     return f"rtol {_pair(traj.tolerance[0])}, atol {_absolute(traj.tolerance[1])}"
 
 

@@ -21,6 +21,7 @@ Numer. Algorithms 76 (2017) 861 (μ).
 """
 
 import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -33,7 +34,9 @@ MOST_STAGES = 8
 
 
 class EqualSteps(eqx.Module):
-    """A method that makes steps of equal length, and keeps what only such steps keep."""
+    """A method that makes steps of equal length, or of one that follows a pace, and keeps what only such steps keep."""
+
+    pace: eqx.AbstractVar[Callable | None]
 
     @property
     def label(self) -> str:
@@ -42,6 +45,16 @@ class EqualSteps(eqx.Module):
 
     def __repr__(self):
         return self.label
+
+
+def check_pace(method: EqualSteps):
+    """Raise unless the pace is None or a function."""
+    if method.pace is not None and not callable(method.pace):
+        raise TypeError(
+            f"pace must be a function of (t, q, params), not {type(method.pace).__name__}.\n"
+            "Usual cause: a length, which is dt0 of lj.integrate.\n"
+            f"Fix: lj.{type(method).__name__}(pace=lambda t, q, params: jnp.sum(q**2) ** 0.75)."
+        )
 
 
 class Gauss(EqualSteps):
@@ -66,18 +79,25 @@ class Gauss(EqualSteps):
     - `newton`: False solves a step by iteration with the mass matrix at its start, which fails where the fastest
       oscillation turns by more than about two radians in a step. True takes Newton's method, for stiff springs: a step
       costs several times as much, and may be of any length.
+    - `pace`: None for steps of equal length; or `pace(t, q, params)`, a positive number that says by what to multiply
+      `dt0` where the motion is, as r^(3/2) on an eccentric orbit. Steps follow it so that a motion backward makes the
+      same ones (Hairer & Söderlind), and energy stays where it was; outputs then do not change the steps. What a pace
+      closes over is not differentiated: what it takes from `params` is.
 
-    Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VI.6.
+    Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VI.6; Hairer & Söderlind, SIAM J. Sci. Comput.
+    26 (2005) 1838 (pace).
     """
 
     stages: int = eqx.field(static=True, default=3)
     newton: bool = eqx.field(static=True, default=False)
+    pace: Callable | None = None
 
     @property
     def label(self) -> str:
-        return f"Gauss({self.stages}{', newton' if self.newton else ''})"
+        return f"Gauss({self.stages}{', newton' if self.newton else ''}{', pace' if self.pace else ''})"
 
     def __check_init__(self):
+        check_pace(self)
         if not (isinstance(self.stages, int) and 1 <= self.stages <= MOST_STAGES):
             raise ValueError(
                 f"stages must be a whole number from 1 to {MOST_STAGES}, not {self.stages!r}: the order is twice "

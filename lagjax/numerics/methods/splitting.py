@@ -10,12 +10,13 @@ Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, Table 3 (orders 4 
 (1997) 1089, s17odr8a (order 8).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from lagjax.numerics.methods.gauss import EqualSteps
+from lagjax.numerics.methods.gauss import EqualSteps, check_pace
 
 # The first coefficients, kicks and drifts; the others follow from symmetry, those in the middle from their sums, 1.
 KICKS = {
@@ -55,18 +56,20 @@ class Splitting(EqualSteps):
     It keeps the energy to about the error of one step, however long the motion is, and momenta of linear symmetries to
     round-off. `dt0` is the length of its steps, as for `lj.Gauss`. Forces may depend on time.
 
-    **Arguments:** `order`: 2, 4, 6 or 8, with 1, 6, 11 or 17 forces per step.
+    **Arguments:** `order`: 2, 4, 6 or 8, with 1, 6, 11 or 17 forces per step; `pace`: as for `lj.Gauss`.
 
     Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313; Kahan & Li, Math. Comput. 66 (1997) 1089.
     """
 
     order: int = eqx.field(static=True, default=4)
+    pace: Callable | None = None
 
     @property
     def label(self) -> str:
-        return f"Splitting({self.order})"
+        return f"Splitting({self.order}{', pace' if self.pace else ''})"
 
     def __check_init__(self):
+        check_pace(self)
         if self.order not in ORDERS:
             raise ValueError(f"order must be one of {ORDERS}, not {self.order!r}.\nFix: lj.Splitting(4).")
 
