@@ -101,7 +101,8 @@ def integrate(
       out number by number, as they also do with `diffrax.Dopri8()` and `diffrax.Tsit5()`, which are treated as ours;
       diffrax's other methods take 2 to 10 times longer. For stiff systems use `lj.Radau5()` if something decays fast,
       and `lj.Radau5(step_powers=(0, 1))` if springs are stiff and their oscillation does not matter. `lj.Gauss` and
-      `lj.Splitting` are symplectic, for long motions; their steps have the length `dt0`, whatever the tolerances are.
+      `lj.Splitting` are symplectic, for long motions; their steps have the length `dt0`, or `dt0` times a `pace`,
+      whatever the tolerances are.
     - `stepsize_controller`: any diffrax controller, in place of `diffrax.PIDController(rtol, atol)`.
     - `dt0`: the length of the first step, `[t]`; of all steps with `diffrax.ConstantStepSize()`, `lj.Gauss` and
       `lj.Splitting`, which need it.

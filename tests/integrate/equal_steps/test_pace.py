@@ -1,0 +1,167 @@
+"""Steps that follow a pace: close encounters without drift, there and back, and outputs that change nothing."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import lagjax as lj
+from lagjax.integrate.equal_steps.gauss_step import GaussStep
+from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
+from lagjax.integrate.equal_steps.splitting_step import SplittingStep
+from lagjax.numerics import tableau
+from lagjax.system import prepare
+
+TURN = 2 * np.pi
+kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + params / jnp.sqrt(jnp.sum(q**2)))
+
+
+def pace(t, q, params):
+    """The distance to the power 3/2, in proportion to the time that the motion takes there."""
+    return jnp.sum(q**2) ** 0.75
+
+
+def ellipse(e):
+    """The pericentre of an orbit with the period 2π."""
+    return np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
+
+
+def on_ellipse(e, ts):
+    """Positions by Kepler's equation, M = E - e sin E, solved by halving: E lies within e of M."""
+    M = np.mod(ts + np.pi, TURN) - np.pi
+    low, high = M - e, M + e
+    for _ in range(60):
+        E = (low + high) / 2
+        late = E - e * np.sin(E) > M
+        low, high = np.where(late, low, E), np.where(late, E, high)
+    return np.stack([np.cos(E) - e, np.sqrt(1 - e**2) * np.sin(E)], axis=-1)
+
+
+def run(method, ts, e=0.99, **options):
+    """An ellipse, with about 160 steps in a turn where the pace is as above."""
+    return lj.integrate(kepler, *ellipse(e), 1.0, ts=ts, method=method, estimate_error=False, **{"dt0": 0.06} | options)
+
+
+@pytest.mark.slow
+def test_a_hundred_turns_of_a_long_ellipse():
+    """Energy and places at e = 0.99; other outputs change none of them. Twin: `test_steps_by_the_place_alone_drift`."""
+    ts = TURN * np.linspace(0.0, 100.0, 301) + 0.3 * (np.arange(301) > 0)
+    traj = run(lj.Splitting(8, pace=pace), ts)
+    h = np.asarray(traj.jacobi_integral())
+    assert np.max(np.abs(h + 0.5)) < 2e-8 and abs(np.polyfit(ts, h, 1)[0]) * ts[-1] < 1e-9
+    # A phase error grows with the time; as a share of a turn it is 1e-8 of these.
+    np.testing.assert_allclose(traj.q, on_ellipse(0.99, ts), atol=2e-5)
+    assert int(traj.stats["num_steps"]) < 100 * 200
+    fewer = run(lj.Splitting(8, pace=pace), np.append(ts[::2][:-1], np.linspace(ts[-1] - 1.0, ts[-1], 151)))
+    np.testing.assert_array_equal(fewer.q[:150], traj.q[::2][:150])
+
+
+def place_alone(self, line):
+    """Steps of the length dt0 σ(q)."""
+    return self.dt * self.pace.at(line.t, line.way.x)
+
+
+@pytest.mark.exhaustive
+def test_steps_by_the_place_alone_drift(monkeypatch):
+    """Failing twin: h = dt0 σ(q_n), which a motion backward does not repeat."""
+    ts = TURN * np.linspace(0.0, 1000.0, 41)
+
+    def slope(method):
+        return np.polyfit(ts, run(method, ts, dt0=0.12).jacobi_integral(), 1)[0] * ts[-1]
+
+    assert abs(slope(lj.Splitting(8, pace=lambda t, q, params: 1.0 * pace(t, q, params)))) < 1e-7
+    monkeypatch.setattr(PacedSteps, "_length", place_alone)
+    # Another function, since programs are kept.
+    assert slope(lj.Splitting(8, pace=lambda t, q, params: pace(t, q, params) / 1.0)) > 1e-5
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("method", "dt"), [(lj.Splitting(8, pace=pace), 0.06), (lj.Gauss(6, pace=pace), 0.1)])
+def test_a_hundred_thousand_turns(method, dt):
+    """At e = 0.99 energy stays within its bounds, and its slope is that of round-off, √N; momentum to 1e-11."""
+    ts = TURN * np.linspace(0.0, 1e5, 401)
+    traj = run(method, ts, dt0=dt)
+    h = np.asarray(traj.jacobi_integral())
+    walk = np.sqrt(float(traj.stats["num_steps"])) * np.finfo(float).eps * 100.0  # kinetic energy at the pericentre
+    assert np.max(np.abs(h + 0.5)) < 1e-7 and abs(np.polyfit(ts, h, 1)[0]) * ts[-1] < walk
+    momentum = np.asarray(traj.q[:, 0] * traj.v[:, 1] - traj.q[:, 1] * traj.v[:, 0])
+    np.testing.assert_allclose(momentum / momentum[0], 1.0, atol=1e-11)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("method", [lj.Splitting(n, pace=pace) for n in (2, 4, 6, 8)] + [lj.Gauss(2, pace=pace)])
+def test_order(method):
+    """The order of the method, at e = 0.9. Twin: each order is told from the others by itself."""
+    order = method.error_order()
+    ts, exact = np.array([0.0, 5.0, 9.0]), on_ellipse(0.9, np.array([5.0, 9.0]))
+    h = {2: 0.01, 4: 0.04, 6: 0.06, 8: 0.12}[order]
+    errors = [np.max(np.abs(run(method, ts, 0.9, dt0=jnp.asarray(dt)).q[1:] - exact)) for dt in (h, h / 1.5)]
+    assert abs(np.log(errors[0] / errors[1]) / np.log(1.5) - order) < 0.5, errors
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param("splitting", marks=pytest.mark.slow), pytest.param("gauss", marks=pytest.mark.exhaustive)]
+)
+def test_there_and_back(kind):
+    """Velocities turned round: the same 150 steps lead back. Twin: with the next step's length they do not."""
+    model, s = prepare(kepler, 0.0, *ellipse(0.9), 1.0)
+    x, u = model.vectors(s.q, s.v)
+    step = SplittingStep.of(model, 2, s.t, x, u) if kind == "splitting" else GaussStep(model, tableau(2), False, False)
+    steps = PacedSteps(step, Pace(pace, model.form, model.params), jnp.asarray(0.1), lax.while_loop)
+
+    many = partial(lax.fori_loop, 0, 150, lambda _, line: steps._one((0, line))[1])
+
+    @jax.jit
+    def back(line, share):
+        there = many(line)
+        # The step that lies before the state now is the one that led there: log ρ goes back over dσ/dt.
+        u = step.velocity(there.way, there.t)
+        rate = steps.pace.rate(there.t, there.way.x, u)
+        turned = steps.first(there.t, there.way.x, -u)._replace(log_pace=there.log_pace - share * steps.dt * rate)
+        home = many(turned)
+        return there.way.x, home.way.x, -step.velocity(home.way, home.t)
+
+    place, home, velocity = back(steps.first(s.t, x, u), 1.0)
+    assert jnp.linalg.norm(place - x) > 0.2
+    np.testing.assert_allclose(home, x, atol=1e-11)
+    np.testing.assert_allclose(velocity, u, atol=1e-10)
+    assert jnp.linalg.norm(back(steps.first(s.t, x, u), 0.0)[1] - x) > 1e-6
+
+
+@pytest.mark.slow
+def test_derivatives_in_both_modes():
+    """d(end)/d(GM), forward and in reverse, and by scaling."""
+
+    def end(gm, ts, method=lj.Splitting(4, pace=lambda t, q, params: pace(t, q, params) / jnp.sqrt(params))):
+        q0, v0 = ellipse(0.6)
+        return lj.integrate(kepler, q0, v0 * jnp.sqrt(gm), gm, ts=ts, method=method, dt0=0.02, estimate_error=False)
+
+    ts = np.array([0.0, 8.0])
+    x = lambda gm: end(gm, ts).q[-1, 0]
+    forward, reverse = jax.jit(lambda gm: (jax.jvp(x, (gm,), (1.0,))[1], jax.grad(x)(gm)))(1.0)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
+    # Where the start scales along, the place depends on √GM t alone.
+    h = 1e-3
+    places = on_ellipse(0.6, ts[-1] * np.sqrt(1 + h * np.array([-2.0, -1.0, 1.0, 2.0])))[:, 0]
+    np.testing.assert_allclose(forward, places @ np.array([1.0, -8.0, 8.0, -1.0]) / (12 * h), rtol=1e-5)
+
+
+def test_what_a_pace_refuses():
+    """Bad input, in words."""
+    refused = partial(run, ts=[0.0, 1.0])
+    with pytest.raises(TypeError, match=r"pace must be a function of \(t, q, params\), not float"):
+        lj.Gauss(3, pace=0.1)
+    with pytest.raises(ValueError, match=r"pace\(t, q, params\) of lj.Splitting must return one .* shape \(2,\)"):
+        refused(lj.Splitting(4, pace=lambda t, q, params: q))
+    with pytest.raises(TypeError, match=r"(?s)pace.* of lj.Gauss is called with 3 arguments.*f\(t, q\)"):
+        refused(lj.Gauss(2, pace=lambda t, q: 1.0))
+
+
+@pytest.mark.exhaustive
+def test_a_pace_that_is_not_positive():
+    """It ends the motion there, and says what it is."""
+    with pytest.raises(RuntimeError, match=r"stopped at t = [\d.]+, (?s:.*)a pace that is positive and finite: there"):
+        run(lj.Splitting(4, pace=lambda t, q, params: q[0] + 0.5), [0.0, 10.0], e=0.3)
