@@ -101,7 +101,7 @@ from lagjax.fit import (
 
 # isort: split
 # Error against run time.
-from lagjax.work_precision import WorkPrecision, work_precision
+from lagjax.work_precision import Horizons, WorkPrecision, horizons, work_precision
 
 if TYPE_CHECKING:
     from lagjax import scenes
@@ -322,6 +322,8 @@ __all__ = [
     "TrackingLQR",
     "WorkPrecision",
     "work_precision",
+    "horizons",
+    "Horizons",
     "export",
     "result_codes",
     "scenes",

@@ -286,6 +286,16 @@ def _draw_work(axis, panel, names):
     _ticks_of_decades(axis.yaxis)
 
 
+def growth(title: str, labels: tuple[str, str], x: np.ndarray, curves: dict[str, np.ndarray]):
+    """Draw curves over x with both axes logarithmic. Returns a matplotlib `Figure`."""
+    fig, ((axis,),) = figure(size=(5.6, 3.6))
+    axis.set(xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1], title=title)
+    for i, (name, y) in enumerate(curves.items()):
+        axis.plot(x, y, marker=MARKERS[i % len(MARKERS)], markersize=4, label=name, **style(i))
+    fig.legend(fontsize=8, frameon=False, loc="outside right upper")
+    return fig
+
+
 def _ticks_of_decades(axis):
     """Ticks at powers of ten, fewer if there are many; within two decades also at two and five times them."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator

@@ -8,7 +8,7 @@ import numpy as np
 
 from lagjax.integrate import ROUND_OFFS, arguments, nystrom_for
 from lagjax.mechanics import is_free_of_velocities
-from lagjax.numerics import Dopri8, Nystrom, Tsit5
+from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Tsit5
 from lagjax.system import State, System, model_of
 
 # From too loose for high orders to show, to where round-off dominates.
@@ -60,6 +60,11 @@ def _named(methods: Any):
 def _check(name: str, method: Any, system: System, start: State):
     if method is None:
         raise TypeError(f"method {name!r} is None.\nFix: leave methods out; the comparison then includes the default.")
+    if isinstance(method, EqualSteps):
+        raise TypeError(
+            f"method {name!r} makes steps of equal length, which no tolerance sets.\n"
+            "Fix: lj.horizons(system, q0, v0, params, period=period), which compares it over many periods."
+        )
     if isinstance(method, diffrax.AbstractSolver) and not isinstance(method, diffrax.AbstractAdaptiveSolver):
         kind = type(method).__name__
         by_halves = method.term_structure is diffrax.AbstractTerm

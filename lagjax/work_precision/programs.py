@@ -6,6 +6,7 @@ the program that a plain call of `integrate` runs, without the checks around it.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import Trajectory, integrate, reporting, runs_backward
 from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition
+from lagjax.numerics import EqualSteps
 from lagjax.system import State, System
 
 # Seconds of measuring after which a call is not repeated; a single call that takes longer is timed twice, unless it is
@@ -37,6 +39,7 @@ class ComparedMotion(NamedTuple):
 
 class TimedProgram:
     """The trajectory of a motion by one method, as a function of (tolerance, ts, q, v); the number of times is fixed.
+    For a method of equal steps the tolerance is the length of a step.
 
     `compile_seconds` is the time of tracing and compiling. Like `integrate`, the program first assumes that the
     equations are regular; if they turn out singular, the robust program is compiled, too, and used from then on.
@@ -55,6 +58,12 @@ class TimedProgram:
             self._compiled = self._compile(robust=True)
             trajectory, _ = self._compiled(args)
         return jax.block_until_ready(trajectory)
+
+    def at(self, ts: np.ndarray) -> "TimedProgram":
+        """The same compiled program, with outputs at as many other times."""
+        other = copy(self)
+        other._motion = self._motion._replace(ts=ts)
+        return other
 
     def call(self, tolerance: ArrayLike) -> Callable[[], Any]:
         """The bare call, for timing; the caller has to wait for the result."""
@@ -85,8 +94,9 @@ class TimedProgram:
             tolerance, ts, q, v, params = static.combine(args)
             # Decreasing times must be known at compile time.
             ts = motion.ts if runs_backward(motion.ts) else ts
+            steps = {"dt0" if isinstance(self._method, EqualSteps) else "rtol": tolerance}
             return integrate(
-                motion.system, q, v, params, ts=ts, method=self._method, throw=False, rtol=tolerance, **motion.options
+                motion.system, q, v, params, ts=ts, method=self._method, throw=False, **steps, **motion.options
             )
 
         def program(args: Sequence[Array]):

@@ -31,6 +31,8 @@ FARTHER = 10.0
 FIX_OF_FORM = "reference=traj, reference=(q, v) with each leaf at all ts, or reference=lambda ts: (q, v)"
 # The number of times at which the largest values are sought, and the tolerance of that motion.
 SAMPLES, ROUGH_TOLERANCE = 200, 1e-5
+# The power with which samples are spread.
+UNEVEN = 1.2
 
 
 class ComparedStates(NamedTuple):
@@ -115,14 +117,19 @@ def states_during(motion: ComparedMotion, program: TimedProgram):
         found = TimedProgram(motion._replace(ts=np.linspace(ts[0], ts[-1], SAMPLES, dtype=ts.dtype)), None)(tolerance)
         return found.q, found.v
     q, v, rows = start.q, start.v, []
-    for a, b in pairwise(np.linspace(ts[0], ts[-1], 1 + max(1, SAMPLES // (len(ts) - 1)))):
-        found = program(tolerance, np.linspace(a, b, len(ts), dtype=ts.dtype), q, v)
+    for a, b in pairwise(_uneven(ts[0], ts[-1], 1 + max(1, SAMPLES // (len(ts) - 1)))):
+        found = program(tolerance, _uneven(a, b, len(ts)).astype(ts.dtype), q, v)
         rows.append((found.q, found.v))
         # Stop at an event or a failure.
         if not bool(ended_well(found.result)) or float(found.end.t) < b:
             break
         q, v = found.end.q, found.end.v
     return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves]), *rows)
+
+
+def _uneven(a: float, b: float, count: int) -> np.ndarray:
+    """Increasing numbers from a to b. With equal distances, samples of a periodic motion may all have one phase."""
+    return np.append(a + (b - a) * np.linspace(0.0, 1.0, count)[:-1] ** UNEVEN, b)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "periodic_orbit": (lambda system: lj.periodic_orbit(system, (1.0, 0.0), 2.0, PARAMS), False),
     "lyapunov_exponents": (lambda system: lj.lyapunov_exponents(system, 1.0, 0.0, PARAMS, ts=TS), False),
     "work_precision": (lambda system: lj.work_precision(system, 1.0, 0.0, PARAMS, ts=TS), False),
+    "horizons": (lambda system: lj.horizons(system, 1.0, 0.0, PARAMS, period=2.0), False),
     "fit": (lambda system: lj.fit(system, RECORD, PARAMS), True),
     "fit_residuals": (lambda system: lj.fit_residuals(system, RECORD, PARAMS), True),
     "fit_loss": (lambda system: lj.fit_loss(system, RECORD, PARAMS), True),
@@ -115,6 +116,7 @@ BY_NAME = {
     "continue_equilibria": (lambda: lj.continue_equilibria(pendulum, PARAMS, 1.0, "g", 3.0), "along and to"),
     "lyapunov_exponents": (lambda: lj.lyapunov_exponents(pendulum, 1.0, 0.0, PARAMS, TS), "ts"),
     "work_precision": (lambda: lj.work_precision(pendulum, 1.0, 0.0, PARAMS, TS), "ts"),
+    "horizons": (lambda: lj.horizons(pendulum, 1.0, 0.0, PARAMS), "period"),
 }
 
 

@@ -5,10 +5,10 @@ kept. In reverse mode an interval is run again, from the state at its start, wit
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.integrate.equal_steps.gauss_step import GaussStep
 from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
+from lagjax.integrate.settings import Settings
 from lagjax.jaxtools import one_function, where
 from lagjax.numerics import EqualSteps, Gauss, Splitting, tableau
 from lagjax.system import Model
@@ -26,24 +27,38 @@ from lagjax.system import Model
 ROUNDED = 1e-6
 # The states kept in reverse mode within an interval.
 CHECKPOINTS = 64
+# How often a progress meter is moved.
+SHOWN = 200
 
 
 def stepped(
-    model: Model, method: EqualSteps, pace: Pace | None, q: PyTree, v: PyTree, ts: Float[Array, " T"],
-    dt: Float[Array, ""], adjoint: Any, differentiated: bool,
+    model: Model, settings: Settings, pace: Pace | None, q: PyTree, v: PyTree, ts: Float[Array, " T"], adjoint: Any,
+    meter: diffrax.AbstractProgressMeter,
 ):  # fmt: skip
     """The states (q, v) at `ts`, which of these were reached, the number of steps, the last time and state (1,), and
-    the result."""
+    the result. `meter` is shown unless the motion is run for reverse mode."""
+    method, dt = settings.method, settings.dt0
+    assert isinstance(method, EqualSteps) and dt is not None
     forward = isinstance(adjoint, diffrax.ForwardMode)
-    checkpointed = partial(eqxi.while_loop, kind="checkpointed", checkpoints=CHECKPOINTS)
-    loop = lax.while_loop if forward else checkpointed
+    shown = forward and not isinstance(meter, diffrax.NoProgressMeter)
 
     def steps(model: Model, pace: Pace | None, q: PyTree, v: PyTree, ts: Array, dt: Array):
         x, u = model.vectors(q, v)
-        step = _step_of(method, model, ts[0], x, u, differentiated)
+        step = _step_of(method, model, ts[0], x, u, settings.differentiated)
+        loop = _forward if forward else _checkpointed
         steps = EquallyLong(step, dt, loop) if pace is None else PacedSteps(step, pace, dt, loop)
-        interval = steps.interval if forward else jax.checkpoint(steps.interval, prevent_cse=False)
-        _, (times, xs, us, unsolved, counts) = lax.scan(interval, steps.first(ts[0], x, u), (ts[:-1], ts[1:]))
+
+        def interval(carried: tuple[Any, Any], row: tuple[Array, Array]):
+            state, bar = carried
+            watched = Watched(meter, bar, ts, dt)
+            state, output = (steps._replace(loop=watched.loop) if shown else steps).interval(state, row)
+            return (state, watched.bar), output
+
+        interval = interval if forward else jax.checkpoint(interval, prevent_cse=False)
+        first = steps.first(ts[0], x, u), meter.init() if shown else None
+        (_, bar), (times, xs, us, unsolved, counts) = lax.scan(interval, first, (ts[:-1], ts[1:]))
+        if shown:
+            meter.close(bar)
         states = jax.tree.map(
             lambda first, rows: jnp.concatenate([first[None], rows]), (q, v), (model.tree(xs), model.tree(us))
         )
@@ -53,14 +68,49 @@ def stepped(
         return states, reached, jnp.sum(counts), end
 
     arguments = model, pace, q, v, ts, dt
-    states, reached, count, end = one_function(steps, *arguments) if forward else steps(*arguments)
+    states, reached, count, end = one_function(steps, *arguments) if forward and not shown else steps(*arguments)
     diverged = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(jnp.all(reached), diffrax.RESULTS.successful, diverged)
     return states, reached, count, end, result
 
 
+def _forward(goes_on: Callable, one: Callable, state: tuple, time: Callable):
+    return lax.while_loop(goes_on, one, state)
+
+
+def _checkpointed(goes_on: Callable, one: Callable, state: tuple, time: Callable):
+    return eqxi.while_loop(goes_on, one, state, kind="checkpointed", checkpoints=CHECKPOINTS)
+
+
+class Watched:
+    """A loop whose steps are made by a few hundred machine functions, between which a meter is moved.
+
+    `bar` is the state of the meter, before a loop and after it.
+    """
+
+    def __init__(self, meter: diffrax.AbstractProgressMeter, bar: Any, ts: Float[Array, " T"], dt: Float[Array, ""]):
+        self.meter, self.bar, self._ts = meter, bar, ts
+        self._steps = jnp.ceil((ts[-1] - ts[0]) / dt / SHOWN).astype(int)
+
+    def loop(self, goes_on: Callable, one: Callable, state: tuple, time: Callable):
+        """The state after the loop; the first of its parts counts steps."""
+
+        def some(watched: tuple) -> tuple:
+            state, bar = watched
+            until, (first, last) = state[0] + self._steps, (self._ts[0], self._ts[-1])
+            steps = lambda state: lax.while_loop(lambda state: goes_on(state) & (state[0] < until), one, state)
+            state = one_function(lambda steps, state: steps(state), eqx.filter_closure_convert(steps, state), state)
+            return state, self.meter.step(bar, (time(state) - first) / (last - first))
+
+        state, self.bar = lax.while_loop(lambda watched: goes_on(watched[0]), some, (state, self.bar))
+        return state
+
+
 class EquallyLong(NamedTuple):
-    """Steps by `step` of equal length between two outputs, at most `dt`, in a loop like JAX's `while_loop`."""
+    """Steps by `step` of equal length between two outputs, at most `dt`.
+
+    `loop`: called like JAX's `while_loop`, and with a function of its state that returns the time.
+    """
 
     step: Any
     dt: Float[Array, ""]
@@ -88,7 +138,7 @@ class EquallyLong(NamedTuple):
             before = way._replace(unsolved=jnp.asarray(True))
             return jnp.where(new.unsolved, k, k + 1), where(new.unsolved, before, new)
 
-        k, way = self.loop(goes_on, one, (jnp.asarray(0), way))
+        k, way = self.loop(goes_on, one, (jnp.asarray(0), way), lambda state: t0 + state[0] * h)
         t = jnp.where(way.unsolved, jnp.minimum(t0 + k * h, t1), t1)
         return way, (t, way.x, self.step.velocity(way, t), way.unsolved, k)
 

@@ -94,7 +94,7 @@ class PacedSteps(NamedTuple):
             _, line = state
             return (self._left(line, t1) > self._length(line)) & ~line.way.unsolved
 
-        k, line = self.loop(goes_on, self._one, (jnp.asarray(0), line))
+        k, line = self.loop(goes_on, self._one, (jnp.asarray(0), line), lambda state: state[1].t)
         # Never of the length zero: a step that would end at an output is this one.
         there = self.step.advanced(line.way, line.t, self._left(line, t1))
         unsolved = line.way.unsolved | there.unsolved

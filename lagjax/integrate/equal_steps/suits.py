@@ -20,6 +20,15 @@ def check_can_be_stepped(method: EqualSteps, model: Model):
         _check_can_be_split(model)
 
 
+def is_suited(method: EqualSteps, model: Model) -> bool:
+    """Whether the method is made for systems like this one."""
+    try:
+        check_can_be_stepped(method, model)
+    except ValueError:
+        return False
+    return True
+
+
 def _check_can_be_split(model: Model):
     """Raise unless L = T(v) - V(q), and forces do not depend on velocities."""
     found = structure(model) if not model.m else None

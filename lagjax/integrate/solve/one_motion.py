@@ -268,9 +268,8 @@ def _in_equal_steps(equations: Equations, start: Start, ts: Array, settings: Set
     at = jnp.where(start.refused, ts[0], ts)
     form, model = equations.users or equations.model.form, equations.model
     pace = None if settings.method.pace is None else Pace(settings.method.pace, form, model.params)
-    states, reached, count, end, result = stepped(
-        model, settings.method, pace, *state, at, settings.dt0, adjoint, settings.differentiated
-    )
+    meter = _progress_meter(settings.progress, often=1)
+    states, reached, count, end, result = stepped(model, settings, pace, *state, at, adjoint, meter)
     stats = {"num_steps": count, "num_accepted_steps": count, "num_rejected_steps": jnp.zeros_like(count)}
     return Solution(jnp.where(reached, ts, jnp.inf), states, end, stats, result, None)
 
@@ -511,9 +510,10 @@ def _by_position(event: Any):
     return diffrax.Event(jax.tree.map(by_position, event.cond_fn, is_leaf=callable))
 
 
-def _progress_meter(progress: bool | None):
+def _progress_meter(progress: bool | None, often: int = 20):
+    """A meter that is moved at every so many calls."""
     if not progress:
         return diffrax.NoProgressMeter()
     if importlib.util.find_spec("tqdm") is None:
         return diffrax.TextProgressMeter()
-    return diffrax.TqdmProgressMeter()
+    return diffrax.TqdmProgressMeter(often)

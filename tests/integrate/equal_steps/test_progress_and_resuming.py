@@ -1,0 +1,49 @@
+"""Long motions are watched, saved and gone on from."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+TURN = 2 * np.pi
+kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + params / jnp.sqrt(jnp.sum(q**2)))
+START = np.array([0.4, 0.0]), np.array([0.0, 2.0])
+
+
+def turns(q0, v0, first, last, **options):
+    """The ellipse of e = 0.6 at each of so many turns."""
+    ts = TURN * np.arange(first, last + 1.0)
+    return lj.integrate(
+        kepler, q0, v0, 1.0, ts=ts, method=lj.Splitting(6), dt0=TURN / 200, estimate_error=False, **options
+    )
+
+
+@pytest.mark.slow
+def test_a_meter_that_moves(capfd):
+    """`progress=True` shows parts of the way, and changes no digit. Twin: without it nothing is shown."""
+    silent = turns(*START, 0, 2)
+    jax.effects_barrier()
+    assert "%" not in capfd.readouterr().err
+    watched = turns(*START, 0, 2, progress=True)
+    jax.effects_barrier()
+    shown = capfd.readouterr().err
+    assert all(part in shown for part in ("25.00%", "50.00%", "100.00%"))
+    np.testing.assert_array_equal(watched.q, silent.q)
+    assert int(watched.stats["num_steps"]) == 400
+
+
+@pytest.mark.slow
+def test_a_saved_motion_goes_on(tmp_path):
+    """A motion that is saved and gone on from is the uninterrupted one, but for what compensated summation carries
+    there, a round-off of the state. Twin: a state kept to single precision."""
+    whole = turns(*START, 0, 128)
+    turns(*START, 0, 64).save(tmp_path / "half.npz")
+    half = lj.load_trajectory(tmp_path / "half.npz", kepler)
+    assert isinstance(half, lj.Trajectory)
+    rest = turns(half.end.q, half.end.v, 64, 128)
+    apart = lambda found: float(np.max(np.abs(found.q - whole.q[64:])))
+    assert apart(rest) < 1e-11
+    single = turns(*(np.asarray(x, np.float32).astype(float) for x in (half.end.q, half.end.v)), 64, 128)
+    assert apart(single) > 1e-7
