@@ -259,7 +259,9 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
     independent = int(found.independent.sum())
     groups = tuple(dependencies(jacobian, found.independent, equations)) if independent < len(equations) else ()
     problem = place.unreachable or explain_failure(model, s)
-    mass = _definiteness(np.asarray(found.linear.mass), names)
+    first = equations_of(model).model.form.first_order
+    heavy = [i for i in range(len(names)) if first is None or not first.mask(len(names))[i]]
+    mass = _definiteness(np.asarray(found.linear.mass)[np.ix_(heavy, heavy)], [names[i] for i in heavy])
 
     rows = [("at", f"t = {float(s.t):.6g}, q = {describe(s.q)}, v = {describe(s.v)}")]
     if place.off:
@@ -272,11 +274,10 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         rows.append(("constraints", ", ".join(f"'{name}' ({kind})" for name, kind in kinds.items())))
         rows.append(("equations", f"{len(equations)}, of which {independent} independent"))
     rows += [("dependent", _in_words(group)) for group in groups]
-    first = equations_of(model).model.form.first_order
     if first is not None:
-        damped = [f"{names[i]} (its velocity by force and dissipation)" for i in first.damped]
-        rows.append(("of first order", ", ".join([*(f"{name} (state)" for name, _ in first.states), *damped])))
-    free = len(names) - independent - (0 if first is None else int(first.mask(len(names)).sum()))
+        massless = [f"{names[i]} (no mass)" for i in first.massless]
+        rows.append(("of first order", ", ".join([*(f"{name} (state)" for name, _ in first.states), *massless])))
+    free = len(heavy) - independent
     rows.append(("degrees of freedom", f"{free}"))
     found_structure = structure(model)
     rows.append(("mass matrix", mass if found_structure is None else f"{mass}, {_of_mass(found_structure)}"))
@@ -388,6 +389,8 @@ def _how_solved(equations, found):
 def _definiteness(mass, names):
     scale = np.sqrt(np.abs(np.diag(mass)))
     scale = np.where(scale > 0, scale, 1.0)
+    if not mass.size:
+        return "zero"
     if not np.all(np.isfinite(mass)):
         return "not finite"
     values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))

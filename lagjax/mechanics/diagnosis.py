@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.first_order import of_states, with_first_order
+from lagjax.mechanics.first_order import balance_matrix, is_determined, of_states, with_first_order
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 from lagjax.system import Model, State, constraints, coordinates
 
@@ -31,16 +31,10 @@ def explain_failure(model: Model, s: coordinates.State) -> str | None:
             "Usual cause: a division by zero, a root or logarithm of a negative number, or NaN in params.\n"
             "Fix: evaluate lagrangian(t, q, v, params) there, term by term."
         )
-    first = with_first_order(model).form.first_order
-    undetermined = np.flatnonzero(~np.isfinite(coordinates.flatten(found.a)[0])) if first is not None else ()
-    for i in undetermined:
-        if first is not None and i in first.damped:
-            return (
-                f"the velocity of '{names[i]}' is not determined {place}: L does not contain it, and neither force nor "
-                "dissipation depends on it there.\n"
-                "Usual cause: a damping of zero in params.\n"
-                f"Fix: a damping above zero, a mass of '{names[i]}' in L, or the system without it."
-            )
+    if undetermined := explain_undetermined(model, s):
+        return undetermined
+    has_states = with_first_order(model).form.first_order is not None
+    for i in np.flatnonzero(~np.isfinite(coordinates.flatten(found.a)[0])) if has_states else ():
         if of_states(model)[i]:
             return (
                 f"the rate of state '{names[i]}', or its change with time, is not finite {place}.\n"
@@ -69,6 +63,29 @@ def explain_failure(model: Model, s: coordinates.State) -> str | None:
         explain_singular(np.asarray(found.matrix), model, s)
         or explain_contradiction(found, model, s)
         or _explain_paradox(found, s)
+    )
+
+
+def explain_undetermined(model: Model, s: State) -> str | None:
+    """Name the coordinates without a mass whose equations do not determine their velocities; None if they do."""
+    model = with_first_order(model)
+    first, state = model.form.first_order, (s.t, *model.vectors(s.q, s.v))
+    if first is None or bool(is_determined(model, *state)):
+        return None
+    matrix = np.asarray(balance_matrix(model, *state))
+    free = np.ones(len(matrix), bool)
+    if np.all(np.isfinite(matrix)):
+        _, sizes, directions = np.linalg.svd(matrix)
+        null = directions[sizes <= max(sizes[-1], SINGULAR_BELOW[matrix.dtype] * sizes[0])]
+        free = np.max(np.abs(null), axis=0) > SHARE
+    names = [model.names[i] for i, is_free in zip(first.massless, free) if is_free]
+    whose = f"velocity of '{names[0]}' is" if len(names) == 1 else f"velocities of {listed(names)} are"
+    return (
+        f"the {whose} not determined {where(s)}: without a mass, what is linear in velocities in L, force and "
+        "dissipation must determine them, and is singular there.\n"
+        "Usual cause: a damping of zero in params; a field or circulation that vanishes; or an odd number of "
+        "coordinates in A(q) v, whose forces K v are antisymmetric.\n"
+        f"Fix: a damping above zero, a mass of '{names[0]}' in L, or the system without it."
     )
 
 

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import WATCHED, compiled, jitted, kept_as_call, once
-from lagjax.mechanics.first_order import completed, resolved, with_first_order
+from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
@@ -190,7 +190,8 @@ def _verdict(form, model: Model, t: Array, q: PyTree, v: PyTree) -> Verdict:
     found = form.verdict(model, *state)
     a = completed(model, *state, found.a)
     finite = found.finite & jnp.all(jnp.isfinite(a))
-    return found._replace(a=model.tree(a), multipliers=model.split(found.multipliers), finite=finite)
+    singular = found.singular | ~is_determined(model, *state)
+    return found._replace(a=model.tree(a), multipliers=model.split(found.multipliers), finite=finite, singular=singular)
 
 
 def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):

@@ -3,9 +3,11 @@
 A row of Lagrange's equations without an acceleration in it is an equation for a velocity. There are two kinds:
 
     a state z:           v_z = f(t, q, v)                     what the user says of a bristle, an actuator, a cost
-    a damped s:          ∂L/∂q_s + Q_s - ∂R/∂v_s = 0          L has no v_s, and this is linear in it
+    a massless s:        ∂L/∂q_s - dp_s/dt + Q_s - ∂R/∂v_s = 0          p_s does not contain v, this is linear in it
 
-Either way v_first = φ(t, q, v), where φ sees only the other velocities, and along the motion
+The second is a point on a damper, or a vortex or guiding centre with a term A_s(q) v_s in L, where p_s = A_s and its
+row is Σ_r K_sr v_r + ... = 0 with K_sr = ∂A_r/∂q_s - ∂A_s/∂q_r. The rows of all massless coordinates are solved
+together. Either way v_first = φ(t, q, v), where φ sees only the other velocities, and along the motion
 
     a_first = ∂φ/∂t + (∂φ/∂q) v + (∂φ/∂v) a
 
@@ -14,39 +16,37 @@ so that the state stays (q, v), for outputs, events and derivatives. In `M a = F
 the given ones are, and a_first is put in afterwards.
 
 Source: Hairer & Wanner, *Solving ODEs II*, §VI.1 (index 1); Canudas de Wit et al., IEEE Trans. Autom. Control 40 (1995)
-419 (a bristle).
+419 (a bristle); Faddeev & Jackiw, Phys. Rev. Lett. 60 (1988) 1692 (L linear in velocities).
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from lagjax.jaxtools import Literal, TooLong, depends, once
-from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
-from lagjax.numerics import dense, solve_without_exchanges
-from lagjax.system import FirstOrder, Model, unchecked
-
-# Damped coordinates are looked for in systems of up to so many; up to eight are solved for number by number.
-UP_TO, ONE_BY_ONE = 24, 8
+from lagjax.jaxtools import once, pattern
+from lagjax.numerics import SINGULAR_BELOW, dense, reciprocal_condition
+from lagjax.system import FirstOrder, Model, constraints, unchecked
 
 
 def with_first_order(model: Model) -> Model:
     """The model that knows which of its coordinates are of first order."""
     system = model.system
-    if model.form.first_order is not None or not (system.states or system.force or system.dissipation):
+    if model.form.first_order is not None or system.in_phases:
         return model
     leaves, structure = jtu.tree_flatten(model)
     found = _found(structure, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves))
-    return _with(model, found) if found.states or found.damped else model
+    return _with(model, found) if found.states or found.massless else model
 
 
 def of_states(model: Model) -> np.ndarray:
     """Which coordinates are states, (n,) booleans."""
     first = with_first_order(model).form.first_order
-    return np.zeros(model.n, bool) if first is None else first._replace(damped=()).mask(model.n)
+    return np.zeros(model.n, bool) if first is None else first._replace(massless=()).mask(model.n)
 
 
 def _with(model: Model, found: FirstOrder) -> Model:
@@ -59,61 +59,70 @@ def _found(structure, leaves: tuple) -> FirstOrder:
     model = jtu.tree_unflatten(structure, leaves)
     places = model.tree(np.arange(model.n))
     states = tuple((name, tuple(np.ravel(places[name]).tolist())) for name in model.system.states)
-    try:
-        return FirstOrder(states, _damped(model, [i for _, among in states for i in among]))
-    except TooLong:
-        return FirstOrder(states, ())
+    known = [i for _, among in states for i in among]
+    return FirstOrder(states, () if model.reacts else _massless(structure, leaves, known))
 
 
-def _damped(model: Model, states: list[int]) -> tuple[int, ...]:
-    """The coordinates without inertia whose velocities force and dissipation determine, by linear equations."""
-    system, n = model.system, model.n
-    if n > UP_TO or model.reacts or not (system.force or system.dissipation):
+def _massless(structure, leaves: tuple, states: list[int]) -> tuple[int, ...]:
+    """The coordinates whose momenta contain no velocity, and whose equations contain velocities of such coordinates."""
+    model = jtu.tree_unflatten(structure, leaves)
+    t, y = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
+    given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t
+
+    def at(given: tuple, first: FirstOrder | None = None) -> tuple[Model, Array]:
+        arrays, t = given
+        model = jtu.tree_unflatten(structure, [leaf if x is None else x for x, leaf in zip(arrays, leaves)])
+        return model if first is None else _with(model, first), t
+
+    def momentum(u: Array, x: Array, given: tuple) -> Array:
+        model, t = at(given)
+        return jax.grad(model.lagrangian, argnums=2)(t, x, u)
+
+    def residual(y: Array, given: tuple) -> Array:
+        model, t = at(given)
+        x, u = jnp.split(y, 2)
+        return constraints.velocity_residual(model, t, x, u)
+
+    heavy = pattern(momentum, y, y, given).any(axis=1)
+    if heavy.all():
         return ()
-
-    def lagrangian(model: Model, *state):
-        return model.system.lagrangian(*state, model.params)
-
-    def residuals(model: Model, *state):
-        return [c.residual(*state, model.params) for c in model.system.constraints.values()]
-
-    in_lagrangian, in_constraints = (Numbers(f, in_numbers(model), WRITTEN) for f in (lagrangian, residuals))
-
-    def free(i: int) -> bool:
-        _, *y = in_constraints.state_variables
-        return not _depends(in_lagrangian, 1 + n + i) and not depends(in_constraints.program.jaxpr, [y[i], y[n + i]])
-
-    found = tuple(i for i in range(n) if i not in states and free(i))
+    held = np.zeros(2 * model.n, bool)
+    if model.m:
+        held = pattern(residual, jax.ShapeDtypeStruct(held.shape, y.dtype), given).any(axis=0)
+    light = ~(heavy | held.reshape(2, -1).any(axis=0))
+    found = tuple(i for i in np.flatnonzero(light).tolist() if i not in states)
     while found:
-        slope = Numbers(_slope, in_numbers(_with(model, FirstOrder((), found))), WRITTEN)
-        own = np.array(slope.program.jaxpr.outvars, object).reshape(len(found), -1).diagonal()
-        left = tuple(i for i, x in zip(found, own) if not (isinstance(x, Literal) and x.val == 0))
+        first = FirstOrder((), found)
+        w = jax.ShapeDtypeStruct((len(found),), y.dtype)
+
+        def row(w: Array, x: Array, u: Array, given: tuple, first: FirstOrder = first) -> Array:
+            model, t = at(given, first)
+            return _balance(model, t, x, u)[0](w)
+
+        def slope(w: Array, along: Array, *rest, row: Callable = row) -> Array:
+            return jax.jvp(lambda w: row(w, *rest), (w,), (along,))[1]
+
+        contain = pattern(row, w, y, y, given).any(axis=1)
+        left = tuple(i for i, contains in zip(found, contain) if contains)
         if left == found:
-            return () if any(_depends(slope, 1 + n + i) for i in found) else found
+            return () if pattern(slope, w, w, y, y, given).any() else found
         found = left
     return ()
 
 
-def _depends(numbers: Numbers, place: int) -> bool:
-    return depends(numbers.program.jaxpr, [numbers.state_variables[place]])
-
-
-def _slope(model: Model, t: Array, q: tuple, v: tuple):
-    balance, w = _balance(model, t, *model.vectors(q, v))
-    return [x for row in jax.jacfwd(balance)(w) for x in row]
-
-
 def _balance(model: Model, t: Array, x: Array, u: Array):
-    """The equations of the damped velocities, as a function of these, and the given ones."""
+    """The equations of the massless velocities, as a function of these, and the given ones."""
     first = model.form.first_order
     assert first is not None
-    damped = np.array(first.damped)
-    chosen = np.eye(model.n, dtype=x.dtype)[damped]
-    along_x = jax.grad(model.lagrangian, argnums=1)(t, x, u)
+    massless = np.array(first.massless)
+    chosen = np.eye(model.n, dtype=x.dtype)[massless]
 
     def balance(w: Array) -> Array:
         v = jnp.where(chosen.sum(0) > 0, w @ chosen, u)
-        force = along_x
+        along_x = jax.grad(model.lagrangian, argnums=1)(t, x, v)
+        momentum = jax.grad(model.lagrangian, argnums=2)
+        _, change = jax.jvp(lambda t, x: momentum(t, x, v), (t, x), (jnp.ones_like(t), v))
+        force = along_x - change
         if model.system.force is not None:
             force = force + model.force(t, x, v)
         if model.system.dissipation is not None:
@@ -123,15 +132,29 @@ def _balance(model: Model, t: Array, x: Array, u: Array):
     return balance, chosen @ u
 
 
+def balance_matrix(model: Model, t: Array, x: Array, u: Array) -> Float[Array, "k k"]:
+    """The matrix of the equations of the massless velocities."""
+    balance, w = _balance(model, t, x, u)
+    return jax.jacfwd(balance)(w)
+
+
+def is_determined(model: Model, t: Array, x: Array, u: Array) -> Bool[Array, ""]:
+    """Whether the massless velocities are."""
+    first = model.form.first_order
+    if first is None or not first.massless:
+        return jnp.asarray(True)
+    return reciprocal_condition(balance_matrix(model, t, x, u)) > SINGULAR_BELOW[np.dtype(x.dtype)]
+
+
 def resolved(model: Model, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
     """The velocities u, with those of first-order coordinates as they are determined, whatever u says of them."""
     first = model.form.first_order
     if first is None:
         return u
-    if first.damped:
+    if first.massless:
         balance, w = _balance(model, t, x, jnp.where(first.mask(model.n), 0.0, u))
-        w = _solved(jax.jacfwd(balance)(w), -balance(w))
-        u = _put(u, np.array(first.damped), w)
+        w = dense.solve(jax.jacfwd(balance)(w), -balance(w))
+        u = _put(u, np.array(first.massless), w)
     q, v = model.tree(x), model.tree(u)
     rates = [jnp.ravel(model.system.states[name](t, q, v, model.params)) for name, _ in first.states]
     return _put(u, np.array([i for _, places in first.states for i in places]), jnp.concatenate(rates)) if rates else u
@@ -141,14 +164,6 @@ def _put(u: Array, places: np.ndarray, values: Array):
     # A scatter has no form in single numbers.
     to = np.eye(u.size, dtype=u.dtype)[places]
     return jnp.where(to.sum(0) > 0, values.astype(u.dtype) @ to, u)
-
-
-def _solved(matrix: Array, known: Array):
-    if known.size > ONE_BY_ONE:
-        return dense.solve(matrix, known)
-    x, pivots = solve_without_exchanges([list(row) for row in matrix], list(known))
-    # A product, so that derivatives are not numbers either.
-    return jnp.stack(x) * jnp.where(jnp.stack(pivots) != 0, 1.0, jnp.nan)
 
 
 def completed(model: Model, t: Array, x: Array, u: Array, a: Array) -> Float[Array, " n"]:

@@ -38,10 +38,10 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import compiled
-from lagjax.mechanics.first_order import completed, with_first_order
+from lagjax.mechanics.first_order import completed, is_determined, with_first_order
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
-from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, unit_rows
+from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense, independent_rows, unit_rows
 from lagjax.system import Model, State, constraints
 
 # A constraint whose derivative is this much smaller than nearby has none: it is written as a square.
@@ -79,10 +79,6 @@ def acceleration_round_off(inertia, forces, x: Array, u: Array):
     extent = jnp.max(jnp.abs(x))
     by_velocity = jnp.max(jnp.abs(u)) ** 2 / jnp.where(extent > 0, extent, 1.0)
     return 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity)
-
-
-# Below this reciprocal condition, after scaling, the matrix counts as singular.
-SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class Dense(NamedTuple):
@@ -267,7 +263,7 @@ def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
     matrix = _scaled_matrix(mass, jacobian, independent)
     known = independent if state[0].off is None else independent | state[0].off
     regular = jnp.all(known) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
-    return regular & unique, _largest_of_rows(mass)
+    return regular & unique & is_determined(*state), _largest_of_rows(mass)
 
 
 def _largest_of_rows(mass: Array):
@@ -278,7 +274,7 @@ class Examined(NamedTuple):
     """A solution of the equations, with what decides whether it is valid.
 
     `matrix`: the saddle-point matrix, with M and A each divided by its largest entry. `unique`: whether the equations
-    have one solution where the force depends on the multipliers.
+    have one solution where the force depends on the multipliers, and for velocities of first order.
     """
 
     a: PyTree[Array]
@@ -316,7 +312,7 @@ def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:
         lagrangian=jnp.asarray(model.lagrangian(t, x, u)),
         matrix=_scaled_matrix(linear.mass, rows.jacobian, independent),
         contradictory=_contradictory(linear, rows, independent, a, multipliers, x, u),
-        unique=unique,
+        unique=unique & is_determined(model, t, x, u),
     )
 
 

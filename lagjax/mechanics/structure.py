@@ -36,6 +36,7 @@ from lagjax.jaxtools import (
     interpreted,
     varies,
 )
+from lagjax.mechanics.first_order import with_first_order
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import force_with_ones
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers, in_numbers
@@ -165,7 +166,10 @@ def is_diagonal(model: Model) -> bool:
 
 def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
-    return not any(phase.m or phase.system.states or _sees_velocities(phase) for phase in model.phases)
+    return not any(
+        phase.m or with_first_order(phase).form.first_order is not None or _sees_velocities(phase)
+        for phase in model.phases
+    )
 
 
 def _sees_velocities(model: Model) -> bool:

@@ -2,7 +2,7 @@
 
 from lagjax.numerics import quadrature
 from lagjax.numerics.linalg import banded, dense, lapack
-from lagjax.numerics.linalg.dense import reciprocal_condition, solve_without_exchanges
+from lagjax.numerics.linalg.dense import SINGULAR_BELOW, reciprocal_condition, solve_without_exchanges
 from lagjax.numerics.linalg.eigenvalues import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
 from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, null_space, unit_rows
 from lagjax.numerics.methods.gauss import EqualSteps, Gauss, Tableau, tableau

@@ -36,14 +36,15 @@ class Residual(NamedTuple):
 
 
 class FirstOrder(NamedTuple):
-    """Coordinates whose velocities are determined, by their places: those of each state by name, and damped ones."""
+    """Coordinates whose velocities are determined, by their places: those of each state by name, and those without a
+    mass."""
 
     states: tuple[tuple[str, tuple[int, ...]], ...]
-    damped: tuple[int, ...]
+    massless: tuple[int, ...]
 
     def mask(self, n: int) -> np.ndarray:
         """Which of n coordinates they are, (n,) booleans."""
-        places = [*self.damped, *(i for _, places in self.states for i in places)]
+        places = [*self.massless, *(i for _, places in self.states for i in places)]
         return np.isin(np.arange(n), places)
 
 

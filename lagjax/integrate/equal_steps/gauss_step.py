@@ -249,7 +249,7 @@ class GaussStep(NamedTuple):
         """The largest |y| among coordinates of each one's kind: with a mass, determined by a balance, one state."""
         kinds, first = np.zeros((1, self.model.n), bool), self.model.form.first_order
         if first is not None:
-            of_kinds = [first.damped, *(places for _, places in first.states)]
+            of_kinds = [first.massless, *(places for _, places in first.states)]
             kinds = np.stack([np.isin(np.arange(self.model.n), places) for places in ([], *of_kinds)])
             kinds[0] = ~self._is_first_order
         largest = jnp.max(jnp.where(kinds, jnp.abs(y)[None], 0.0), axis=1)

@@ -29,6 +29,8 @@ ELIMINATE_UP_TO = 6
 ELIMINATE_INSIDE_UP_TO = 16
 # Rows count as independent if the squared sine of their angle to the span of those before exceeds this.
 INDEPENDENT_ABOVE = 1e-10
+# Below this reciprocal condition, after scaling, a matrix counts as singular.
+SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 @jax.custom_jvp

@@ -1,0 +1,222 @@
+"""Lagrangians linear in velocities: vortices, guiding centres, a mass beside a vortex. By closed forms and SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+import lagjax as lj
+from lagjax.mechanics import with_first_order
+from lagjax.system import model_of
+
+
+def vortex_lagrangian(t, q, v, params):
+    """Kirchhoff's: Γ x' = ∂H/∂y, Γ y' = -∂H/∂x, with H = -Σ Γ_i Γ_j log(r_ij) / 2π over pairs."""
+    x, y = q["x"], q["y"]
+    i, j = np.triu_indices(x.size, 1)
+    squared = (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2
+    pairs = params[i] * params[j] * jnp.log(squared)
+    return 0.5 * jnp.sum(params * (y * v["x"] - x * v["y"])) + jnp.sum(pairs) / (4 * jnp.pi)
+
+
+vortices = lj.System(vortex_lagrangian)
+PAIR = {"x": np.array([0.3, -0.7]), "y": np.zeros(2)}
+G = np.array([2.0, 1.0])
+
+
+def still(q):
+    """Velocities that do not count."""
+    return jax.tree.map(np.zeros_like, q)
+
+
+def plane(motion):
+    """The places as complex numbers."""
+    return np.asarray(motion.q["x"]) + 1j * np.asarray(motion.q["y"])
+
+
+def rotated(t, strengths=G):
+    """Two vortices turn about their centre at (Γ₁ + Γ₂) / 2π d²."""
+    z = PAIR["x"] + 1j * PAIR["y"]
+    centre, rate = strengths @ z / np.sum(strengths), np.sum(strengths) / (2 * np.pi * abs(z[0] - z[1]) ** 2)
+    return centre + (z - centre) * np.exp(1j * rate * np.asarray(t)[:, None])
+
+
+def impulses(motion, strengths):
+    """The two linear ones and the angular one, at each output."""
+    z = plane(motion)
+    return np.stack([(z @ strengths).real, (z @ strengths).imag, np.abs(z) ** 2 @ strengths])
+
+
+def test_velocities_and_accelerations_of_two():
+    """Both from L at one state, whatever velocity is given: a rotation about the centre. Twin: other circulations."""
+    rate, about = 3 / (2 * np.pi), PAIR["x"] - G @ PAIR["x"] / 3
+    _, v = lj.consistent_state(vortices, 0.0, PAIR, jax.tree.map(lambda x: x + 7.0, PAIR), G)
+    np.testing.assert_allclose([v["x"], v["y"]], [np.zeros(2), rate * about], atol=1e-15)
+    a, _ = lj.accelerations(vortices, 0.0, PAIR, still(PAIR), G)
+    np.testing.assert_allclose([a["x"], a["y"]], [-(rate**2) * about, np.zeros(2)], atol=1e-15)
+    assert abs(lj.jacobi_integral(vortices, 0.0, PAIR, v, G)) < 1e-16
+    assert np.max(np.abs(rotated([1.0]) - rotated([1.0], np.array([2.0, 1.1])))) > 1e-2
+
+
+def test_what_has_a_mass_is_not_among_them():
+    """A charge in a magnetic field has a mass; a charge without one drifts. Twin: which are found."""
+
+    def charge(mass):
+        return lj.System(lambda t, q, v, p: 0.5 * mass * (v @ v) + 0.5 * p * (q[0] * v[1] - q[1] * v[0]) - q[0])
+
+    found = [
+        with_first_order(model_of(charge(mass), jnp.zeros(()), np.ones(2), np.ones(2), 1.0)).form.first_order
+        for mass in (1.0, 0.0)
+    ]
+    assert found[0] is None and found[1] is not None and found[1].massless == (0, 1)
+    # E = -1 along x in a field of 3: the drift is E / B along y.
+    _, v = lj.consistent_state(charge(0.0), 0.0, np.ones(2), np.zeros(2), 3.0)
+    np.testing.assert_allclose(v, [0.0, 1 / 3], atol=1e-16)
+
+
+def test_what_is_singular_is_said():
+    """A circulation of zero, and an odd number of coordinates, in words."""
+    with pytest.raises(
+        ValueError, match=r"(?s)velocities of 'x\[1\]' and 'y\[1\]' are not determined.*circulation that vanishes"
+    ):
+        lj.accelerations(vortices, 0.0, PAIR, still(PAIR), np.array([2.0, 0.0]))
+    odd = lj.System(lambda t, q, v, p: q[0] * v[1] + q[1] * v[2] + 0.3 * q[2] * v[0] * q[1] - q @ q)
+    start = np.array([1.0, 2.0, 0.3]), np.zeros(3)
+    with pytest.raises(ValueError, match=r"(?s)'q\[0\]', 'q\[1\]' and 'q\[2\]' are not determined.*odd number"):
+        lj.accelerations(odd, 0.0, *start, None)
+
+
+@pytest.mark.slow
+def test_two_vortices():
+    """Half a thousand radians: adaptive steps, and Gauss' steps, which keep H and the impulses to round-off."""
+    ts = np.linspace(0.0, 20.0, 5)
+    np.testing.assert_allclose(
+        plane(lj.integrate(vortices, PAIR, still(PAIR), G, ts=ts, rtol=1e-12)), rotated(ts), atol=1e-12
+    )
+    ts = np.linspace(0.0, 1000.0, 5)
+    motion = lj.integrate(vortices, PAIR, still(PAIR), G, ts=ts, method=lj.Gauss(4), dt0=0.1, estimate_error=False)
+    np.testing.assert_allclose(plane(motion), rotated(ts), atol=1e-12)
+    assert np.ptp(motion.jacobi_integral()) < 1e-15
+    assert np.max(np.ptp(impulses(motion, G), axis=1)) < 1e-14
+
+
+def biot_savart(t, y, strengths):
+    """The velocities of point vortices, x before y."""
+    z = y[: strengths.size] + 1j * y[strengths.size :]
+    apart = z[:, None] - z[None] + np.eye(z.size)
+    w = np.sum(strengths / apart * (1 - np.eye(z.size)), axis=1) / (2j * np.pi)
+    return np.concatenate([w.real, -w.imag])
+
+
+@pytest.mark.exhaustive
+def test_a_triangle_and_leapfrogging_pairs():
+    """Against the closed form and SciPy; orders 2 s by Gauss; and their impulses over 1e5 steps. Twin: Heun's."""
+    z = np.exp(2j * np.pi * np.arange(3) / 3)
+    start, ts = {"x": z.real, "y": z.imag}, np.linspace(0.0, 20.0, 5)
+    # Equal vortices on a circle turn at (N - 1) Γ / 4π R².
+    turned = z * np.exp(2j / (4 * np.pi) * ts[:, None])
+    motion = lj.integrate(vortices, start, still(start), np.ones(3), ts=ts, rtol=1e-12)
+    np.testing.assert_allclose(plane(motion), turned, atol=1e-11)
+    start, strengths = (
+        {"x": np.array([0.0, 0.0, 0.0, 0.0]), "y": np.array([1.0, 0.4, -0.4, -1.0])},
+        np.array([1.0, 1.0, -1.0, -1.0]),
+    )
+    y0, span = np.concatenate([start["x"], start["y"]]), (0.0, 60.0)
+    exact = solve_ivp(biot_savart, span, y0, "DOP853", args=(strengths,), rtol=1e-13, atol=1e-13).y[:, -1]
+    exact = exact[:4] + 1j * exact[4:]
+
+    def run(method, dt, end=60.0):
+        return lj.integrate(
+            vortices, start, still(start), strengths, ts=np.linspace(0.0, end, 11), method=method,
+            dt0=jnp.asarray(dt), estimate_error=False,
+        )  # fmt: skip
+
+    for s, steps in {2: (0.5, 0.25), 3: (0.5, 0.25), 4: (0.5, 0.3)}.items():
+        errors = [np.max(np.abs(plane(run(lj.Gauss(s), dt))[-1] - exact)) for dt in steps]
+        order = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
+        assert abs(order - 2 * s) < 0.6, (s, errors, order)
+    assert errors[1] < 1e-6
+    long = run(lj.Gauss(3), 0.2, 20_000.0)
+    h = np.asarray(long.jacobi_integral())
+    assert int(long.stats["num_steps"]) == 100_000
+    assert np.ptp(h) < 1e-6 and abs(np.polyfit(np.asarray(long.t), h, 1)[0]) * 20_000 < 1e-10
+    first = impulses(long, strengths)
+    assert np.max(np.abs(first[:2] - first[:2, :1])) < 1e-10
+
+
+@pytest.mark.exhaustive
+def test_a_mass_on_a_spring_beside_a_vortex():
+    """A vortex bound to a mass by a spring, all linear: the matrix exponential, by adaptive and Gauss' steps."""
+    params = {"m": 0.7, "k": 2.0, "G": 1.5}
+
+    def lagrangian(t, q, v, p):
+        (x, y), (a, b) = q["vortex"], v["vortex"]
+        apart = q["mass"] - q["vortex"]
+        return 0.5 * p["G"] * (y * a - x * b) + 0.5 * p["m"] * (v["mass"] @ v["mass"]) - 0.5 * p["k"] * (apart @ apart)
+
+    both = lj.System(lagrangian)
+    q0 = {"vortex": np.array([0.0, 0.5]), "mass": np.array([1.0, 0.0])}
+    v0 = {"vortex": np.zeros(2), "mass": np.array([0.0, 0.3])}
+    # Γ x' = ∂H/∂y: z' = (k / Γ) J (z - r) with J = [[0, 1], [-1, 0]].
+    turn, one, none = 2.0 / 1.5 * np.array([[0.0, 1.0], [-1.0, 0.0]]), np.eye(2), np.zeros((2, 2))
+    matrix = np.block([[turn, -turn, none], [none, none, one], [one * 2 / 0.7, -one * 2 / 0.7, none]])
+    exact = expm(10 * matrix) @ [0.0, 0.5, 1.0, 0.0, 0.0, 0.3]
+    for options in (
+        {"rtol": 1e-12},
+        {"method": lj.Gauss(4), "dt0": 0.05},
+        {"method": lj.Gauss(4, newton=True), "dt0": 0.05},
+    ):
+        motion = lj.integrate(both, q0, v0, params, ts=np.array([0.0, 10.0]), **options)
+        found = [*motion.q["vortex"][-1], *motion.q["mass"][-1], *motion.v["mass"][-1]]
+        np.testing.assert_allclose(found, exact, atol=1e-10)
+        assert np.ptp(motion.jacobi_integral()) < 1e-10
+    assert np.max(np.abs(expm(10.1 * matrix) - expm(10 * matrix))) > 0.1
+
+
+def dipole(r):
+    """A and B of a magnetic dipole along z."""
+    x, y, z = r
+    d = jnp.sqrt(r @ r)
+    return jnp.stack([-y, x, 0.0 * z]) / d**3, (3 * z * r - jnp.array([0.0, 0.0, 1.0]) * d**2) / d**5
+
+
+def guiding_lagrangian(t, q, v, params):
+    """(A / ε + u b) · r' - u² / 2 - μ B (Littlejohn)."""
+    A, B = dipole(q["r"])
+    size = jnp.sqrt(B @ B)
+    return (A / params["eps"] + q["u"] * B / size) @ v["r"] - 0.5 * q["u"] ** 2 - params["mu"] * size
+
+
+guiding = lj.System(guiding_lagrangian)
+TRAPPED = {"r": np.array([1.0, 0.0, 0.0]), "u": np.array(1.0)}
+SLOW = {"eps": 0.02, "mu": 1.0}
+
+
+@jax.jit
+def drift_rate(y):
+    """Northrop's equations: r' = (u B* + ε μ b × ∇B) / B*∥, u' = -μ B* · ∇B / B*∥ with B* = B + ε u ∇ × b."""
+    r, u, eps, mu = y[:3], y[3], SLOW["eps"], SLOW["mu"]
+    size, unit = lambda r: jnp.sqrt(dipole(r)[1] @ dipole(r)[1]), lambda r: dipole(r)[1] / size(r)
+    slope, D = jax.grad(size)(r), jax.jacfwd(unit)(r)
+    curl = jnp.stack([D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]])
+    star = dipole(r)[1] + eps * u * curl
+    along = unit(r) @ star
+    return jnp.append((u * star + eps * mu * jnp.cross(unit(r), slope)) / along, -mu * (star @ slope) / along)
+
+
+@pytest.mark.exhaustive
+def test_a_guiding_centre():
+    """A particle trapped in a dipole's field, against Northrop's equations by SciPy. Twin: another μ."""
+    ts = np.linspace(0.0, 20.0, 5)
+    y0 = np.append(TRAPPED["r"], TRAPPED["u"])
+    exact = solve_ivp(lambda t, y: np.asarray(drift_rate(y)), (0, 20), y0, "DOP853", ts, rtol=1e-12, atol=1e-13).y
+    motion = lj.integrate(guiding, TRAPPED, still(TRAPPED), SLOW, ts=ts, rtol=1e-11)
+    np.testing.assert_allclose(np.column_stack([motion.q["r"], motion.q["u"]]).T, exact, atol=1e-9)
+    gauss = lj.integrate(
+        guiding, TRAPPED, still(TRAPPED), SLOW, ts=ts, method=lj.Gauss(4), dt0=0.02, estimate_error=False
+    )
+    np.testing.assert_allclose(gauss.q["r"].T, exact[:3], atol=1e-8)
+    other = lj.integrate(guiding, TRAPPED, still(TRAPPED), SLOW | {"mu": 1.1}, ts=ts)
+    assert np.max(np.abs(other.q["r"].T - exact[:3])) > 1e-2
