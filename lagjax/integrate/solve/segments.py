@@ -168,7 +168,9 @@ def solved_in_legs(
         return way
 
     if isinstance(adjoint, diffrax.ForwardMode):
-        way = lax.while_loop(lambda way: way.continues, next_legs, first)
+        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
+        most = hybrid.most_switches
+        way = lax.while_loop(lambda way: way.continues & (way.switches.count <= most), next_legs, first)
     else:
         # Each turn takes every lane at least one leg further.
         way, _ = lax.scan(partial(if_any, next_legs), first, None, length=hybrid.most_switches + 1)
