@@ -172,7 +172,7 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
         if in_time is not None:
             jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
         # With guards to be watched a program is long anyway, and compiles a third faster without copies.
-        unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
+        unroll_up_to = 0 if differentiated or jumps or system.in_phases else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(
             settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust, differentiated=differentiated
