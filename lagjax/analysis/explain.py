@@ -1,5 +1,6 @@
 """`explain`: what a system amounts to at one state, in words and numbers; a motion in phases as a graph of them."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import NamedTuple, overload
@@ -225,8 +226,7 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     at_once = "one after the other" if laws.impacts == "sequential" else "all at once"
     gaps, slips = laws.count
     together = f"up to {gaps + slips} forces of contacts that touch, as a complementarity problem"
-    many = {"gap": gaps, "sliding velocity": slips, "spring": laws.kinds["springs"], "control": laws.kinds["controls"]}
-    counted = ", ".join(f"{name}: {count}" for name, count in many.items() if count)
+    counted = ", ".join(f"{kind}: {count}" for kind, count in Counter(laws.kinds).items())
     rows = [
         ("elements", ", ".join(f"'{name}' ({type(x).__name__})" for name, x in assembly.user.elements.items())),
         ("modes", f"{laws.size} ({counted}); here {', '.join(now)}"),

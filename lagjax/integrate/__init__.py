@@ -4,7 +4,7 @@ from lagjax.integrate import arguments
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.adjoint.replay import Replay
 from lagjax.integrate.contacts.contacts import releases, slips, sticks, touches
-from lagjax.integrate.elements.laws import Masked, WithElements
+from lagjax.integrate.elements.in_modes import Masked, WithElements
 from lagjax.integrate.equal_steps.suits import is_suited
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning, crossings_of, traced_guard
 from lagjax.integrate.in_turn import in_turn

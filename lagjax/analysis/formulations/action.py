@@ -2,7 +2,7 @@
 
 A path is a trajectory, or a function of time whose derivative is the velocity. A trajectory is integrated again, at the
 nodes of a quadrature, so that it does not matter how far apart its outputs lie. The quadrature is refined until it is
-as accurate as the motion (`analysis/energy.py`); while JAX traces, its nodes must be known beforehand.
+as accurate as the motion (`analysis/works.py`); while JAX traces, its nodes must be known beforehand.
 
 Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.analysis.energy import Motion
+from lagjax.analysis.works import Motion
 from lagjax.integrate import Trajectory, in_one_solve
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.numerics import quadrature

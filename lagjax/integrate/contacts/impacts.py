@@ -38,7 +38,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.integrate.elements.laws import check_linear
+from lagjax.integrate.elements.laws_of_elements import check_linear
 from lagjax.integrate.solve.phases import OfPhases
 from lagjax.jaxtools import shape_of, stop_gradient
 from lagjax.mechanics import velocity_change

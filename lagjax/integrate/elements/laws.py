@@ -1,9 +1,8 @@
-"""A system with elements as one system whose constraints and forces depend on modes.
+"""The laws of elements: what holds in which mode, and the guards at which modes end.
 
 A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
 side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. A spring behind a gap is apart (0) or
-pressed (1), with a force (`compliant.py`). The functions of the system take `InModes` in place of the parameters, so
-that one program serves all modes; constraints that do not hold are off.
+pressed (1), with a force (`compliant.py`).
 
 A sliding velocity in a plane is two rows with one mode: it slides (1) with a force -μ N s/|s|, which has no limit at
 s = 0. Its sliding ends at a speed δ, the slack of its mode, and begins with 2 δ in the direction of the acceleration: a
@@ -18,8 +17,6 @@ Sampled controls (`sampled.py`) have the number of their next instant as a mode,
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -28,36 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
+from lagjax.integrate.elements.coefficients import coefficient
 from lagjax.integrate.elements.complementarity import lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
-from lagjax.integrate.jumps.find import OfParams
 from lagjax.integrate.trajectory.parts import mode_in_words
-from lagjax.jaxtools import depends, is_traced, stop_gradient
-from lagjax.system import (
-    OF_POSITION,
-    OF_STATE,
-    WITH_MULTIPLIERS,
-    Call,
-    CompliantContact,
-    Contact,
-    Elements,
-    Friction,
-    Holonomic,
-    InModes,
-    Nonholonomic,
-    SampledControl,
-    State,
-    System,
-    Traced,
-    check_use,
-    coordinates,
-    model_of,
-    takes_of,
-    traced_call,
-    traced_system,
-)
+from lagjax.jaxtools import is_traced, stop_gradient
+from lagjax.system import InModes, State
 
 OPEN, CLOSED = 0, 1
 FREE, STICKS = 0, 2
@@ -129,51 +103,6 @@ class Tangent(eqx.Module):
         return coefficient(self.coefficient if self.static is None else self.static, jnp.zeros_like(speed), params)
 
 
-class Masked(eqx.Module):
-    """A gap, or a sliding velocity, as the residual of a constraint: zero where it does not hold."""
-
-    function: Callable
-    at: tuple[int, int] = eqx.field(static=True)
-    holds: int = eqx.field(static=True)
-
-    def __call__(self, *arguments):
-        *state, given = arguments
-        value = self.function(*state, given.params)
-        on = given.modes[slice(*self.at)] == self.holds
-        return jnp.where(on.reshape(jnp.shape(value)), value, 0.0)
-
-
-class WithElements(eqx.Module):
-    """The force of a system with those of everything that slides, or is pressed."""
-
-    force: Callable | None
-    tangents: tuple[Tangent, ...]
-    compliant: tuple[Compliant, ...]
-    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
-
-    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        params = given.params
-        total = jax.tree.map(jnp.zeros_like, q) if self.force is None else self.force(t, q, v, params)
-        for force in self.by_element(t, q, v, multipliers, given).values():
-            total = jax.tree.map(jnp.add, total, force)
-        return total
-
-    def by_element(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        """The forces that elements add, each like q, by the names of their modes: of friction, while it slides."""
-        found, params, forces = {}, given.params, dict(multipliers)
-        for law in self.compliant:
-            forces[law.name], found[law.name] = law.push(t, q, v, given)
-        for law in self.tangents:
-            mode = given.modes[slice(*law.at)]
-            side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
-            slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
-            speed = law.speeds(slip) if law.plane else side * slip
-            side = side * slip / speed if law.plane else side
-            size = law.kinetic(speed, params) * law.normal_forces(t, q, v, forces, params)
-            found[law.name] = back(-side * size)[0]
-        return found
-
-
 class Laws(eqx.Module):
     """The elements of a system with their places among the modes: normals, tangents, compliant ones, sampled controls.
 
@@ -206,9 +135,12 @@ class Laws(eqx.Module):
         return self.compliant[-1].at[1] if self.compliant else len(self.rows)
 
     @property
-    def kinds(self) -> dict[str, int]:
-        """How many modes are those of gaps, of springs and of controls."""
-        return {"gaps": self.count[0], "springs": self.guarded - len(self.rows), "controls": len(self.sampled)}
+    def kinds(self) -> tuple[str, ...]:
+        """What each mode is one of."""
+        gaps, slips = self.count
+        springs, controls = self.guarded - gaps - slips, len(self.sampled)
+        many = {"gap": gaps, "sliding velocity": slips, "spring": springs, "control": controls}
+        return tuple(kind for kind, count in many.items() for _ in range(count))
 
     @property
     def is_sampled(self) -> np.ndarray:
@@ -250,7 +182,7 @@ class Laws(eqx.Module):
 
     def modes_in_words(self, modes) -> list[str]:
         """Each of these modes in a word."""
-        return [mode_in_words(i, int(mode), self.size, **self.kinds) for i, mode in enumerate(modes)]
+        return [mode_in_words(kind, int(mode)) for kind, mode in zip(self.kinds, modes)]
 
     def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " kNT"]:
         """Which of the normals and tangents are constraints in these modes."""
@@ -375,204 +307,3 @@ class Laws(eqx.Module):
             t = t + stop_gradient(jnp.where(jnp.any(near), output - t, 0.0))
             found = jnp.where((t < ts[-1]) & (t < found), t, found)
         return found
-
-
-class OneGuard(eqx.Module):
-    """The guards of all modes as one: the least of them, each in units of its slack.
-
-    Guards are followed one by one, so that many of them would take long to compile.
-    """
-
-    laws: Laws
-    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
-
-    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        slack = given.slack[: self.laws.guarded]
-        size = jnp.where(slack > 0, slack, 1.0)
-        return jnp.min((self.laws.last(t, q, v, multipliers, given) + slack) / size)
-
-
-def in_modes(system: System, start: State) -> tuple[System, Laws]:
-    """A system with elements as a system of `InModes`, with its laws; all functions checked and traced."""
-    assert system.elements is not None
-    plain = traced_system(replace(system, elements=None), start)
-    if plain.force is not None and takes_of(plain.force) == WITH_MULTIPLIERS:
-        raise ValueError(
-            "a force that takes multipliers cannot stand beside elements.\n"
-            'Fix: lj.Friction(sliding, coefficient, normal="name of the constraint") among the elements.'
-        )
-    normals, tangents, owners, compliant, sampled = _laws(system.elements, plain, start)
-    # As constraints are, contacts are no place for states.
-    as_constraints = {law.name: Holonomic(law.gap) for law in (*normals, *compliant)}
-    as_constraints |= {law.name: Nonholonomic(law.sliding) for law in tangents}
-    check_use(replace(plain, constraints=as_constraints, force=None))
-    constraints: dict[str, Any] = {name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()}
-    constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
-    constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
-    force = None if plain.force is None else OfParams(plain.force)
-    if tangents or compliant:
-        force = WithElements(plain.force, tangents, compliant)
-    dissipation = None if plain.dissipation is None else OfParams(plain.dissipation)
-    states = {name: OfParams(f) for name, f in plain.states.items()}
-    masked = System(OfParams(plain.lagrangian), constraints, force, dissipation, states)
-    guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
-    count = max(guarded, default=0) + len(sampled)
-    # The order of the stacked equations is known only with their shapes.
-    given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))
-    form = model_of(masked, *start[:3], given).form
-    places, first = {}, 0
-    for residual in form.residuals:
-        places[residual.name] = range(first, first + residual.size)
-        first += residual.size
-    rows = tuple(place for law in (*normals, *tangents) for place in places[law.name])
-    return masked, Laws(normals, tangents, compliant, sampled, rows, owners, form.m, system.elements.impacts)
-
-
-def _laws(elements: Elements, plain: System, start: State):
-    given: dict[str, Any] = dict(zip(OF_STATE, start)) | {"speed": start.t, "depth": start.t}
-    place, normals, tangents, owners, compliant, sampled = 0, [], [], [], [], []
-    with_friction = (Contact, CompliantContact)
-
-    def traced(name: str, role: str, f, takes: tuple[str, ...], shape: tuple | None = None):
-        if not callable(f):
-            return f
-        return traced_call(Call(role, f, takes, f" of element '{name}'"), given, lambda call, x: _check(call, x, shape))
-
-    def coefficients(name: str, of: str, **laws):
-        takes = {role: takes_of_coefficient(f, of) if callable(f) else () for role, f in laws.items()}
-        return [traced(name, role, f, takes[role], ()) for role, f in laws.items()]
-
-    gaps = {
-        name: traced(name, "gap", element.gap, OF_POSITION)
-        for name, element in elements.items()
-        if isinstance(element, with_friction)
-    }
-    for name, gap in gaps.items():
-        _check_name(name, plain)
-        _check_slope(name, gap, *start)
-    for name, contact in elements.items():
-        if not isinstance(contact, Contact):
-            continue
-        gap = gaps[name]
-        (e,), size = coefficients(name, "speed", restitution=contact.restitution), _size(gap)
-        normals.append(Normal(name, gap, e, contact.slower_than, (place, place + size)))
-        place += size
-    for name, element in elements.items():
-        if isinstance(element, SampledControl) or isinstance(element, with_friction) and element.sliding is None:
-            continue
-        own = isinstance(element, with_friction)
-        mu = element.friction if isinstance(element, with_friction) else element.coefficient
-        mu, static = coefficients(name, "speed", coefficient=mu, static=element.static)
-        normal = element.normal if isinstance(element, Friction) else None
-        source = name if own else normal if isinstance(normal, str) else ""
-        if not own:
-            known = [*plain.constraints, *gaps]
-            if source and source not in known:
-                raise ValueError(
-                    f"normal='{source}' of element '{name}' is no constraint and no contact; there "
-                    f"{'are ' + ', '.join(map(repr, known)) if known else 'are none'}.\n"
-                    "Fix: its name, a number, or a function of (t, q, v, params)."
-                )
-            normal = traced(name, "normal", normal, OF_STATE) if not source else None
-        shape = _shape_of_normal_forces(normal, source, gaps, plain)
-        sliding = traced_call(
-            Call("sliding", element.sliding, OF_STATE, f" of element '{name}'"), given, partial(_check_sliding, shape)
-        )
-        check_linear(sliding, *start)
-        size, plane = _size(sliding), jnp.shape(sliding.program.value) == (*shape, 2)
-        key = f"{name} friction" if own else name
-        _check_name(key, plain)
-        if own and key in elements:
-            raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
-        tangents.append(Tangent(key, sliding, mu, static, normal, source, (place, place + size), plane))
-        source_of = [law for law in normals if law.name == source]
-        owners += [source_of[0].at[0] + i // (1 + plane) if source_of else -1 for i in range(size)]
-        place += size
-    for name, element in elements.items():
-        if isinstance(element, CompliantContact):
-            k, c = coefficients(name, "depth", stiffness=element.stiffness, damping=element.damping)
-            size = _size(gaps[name])
-            shape = jnp.shape(gaps[name].program.value)
-            compliant.append(Compliant(name, gaps[name], k, c, (place, place + size), shape))
-            place += size
-    for name, element in elements.items():
-        if isinstance(element, SampledControl):
-            every, offset = coefficients(name, "speed", every=element.every, offset=element.offset)
-            acts = Call("controller", element.controller, OF_STATE, f" of element '{name}'")
-            controller = traced_call(acts, given, partial(_check_output, like=start.q[name]))
-            sampled.append(Sampled(name, controller, every, offset, place))
-            place += 1
-    return tuple(normals), tuple(tangents), tuple(owners), tuple(compliant), tuple(sampled)
-
-
-def check_linear(sliding: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
-    """Raise if a sliding velocity is not linear in v."""
-    u, unflatten = coordinates.flatten(v)
-    program = jax.make_jaxpr(jax.jacfwd(lambda u: sliding(t, q, unflatten(u), params)))(u).jaxpr
-    if depends(program, program.invars):
-        raise ValueError(
-            "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
-            "Usual cause: a speed, jnp.abs of the velocity or its length.\n"
-            'Fix: the velocity with its sign, v["x"] - params["R"] * v["phi"].'
-        )
-
-
-def _check_slope(name: str, gap: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
-    """Raise if no motion changes a gap, as far as JAX sees."""
-    program = jax.make_jaxpr(lambda v: jax.jvp(lambda q: gap(t, q, params), (q,), (v,))[1])(v).jaxpr
-    if not depends(program, program.invars):
-        raise ValueError(
-            f"the gap of element '{name}' has no derivative by q: its rate is zero in every motion.\n"
-            "Usual cause: jnp.floor, jnp.round, or a comparison, which is 0 or 1; a gap that does not depend on q.\n"
-            'Fix: a length that changes as the bodies move, such as q["y"] - params["R"].'
-        )
-
-
-def _size(function) -> int:
-    return int(np.prod(jnp.shape(function.program.value)))
-
-
-def _shape_of_normal_forces(normal: Any, source: str, gaps: dict[str, Any], plain: System) -> tuple[int, ...]:
-    given: Any = normal if not source else gaps[source] if source in gaps else plain.constraints[source].function
-    return jnp.shape(given.program.value if isinstance(given, Traced) else given)
-
-
-def _check_sliding(shape: tuple[int, ...], call: Call, value):
-    found = jnp.shape(value)
-    if found == shape or found == (*shape, 2):
-        return
-    raise ValueError(
-        f"{call} must return {f'shape {shape}' if shape else 'a number'}, as its normal force, or {(*shape, 2)} for "
-        f"sliding in a plane, and returned shape {found}.\n"
-        "Usual cause: the velocity of a point in space, or several sliding velocities with one normal force.\n"
-        "Fix: its components along the contact; jnp.full(k, N) for k sliding velocities with N each."
-    )
-
-
-def _check_name(name: str, plain: System):
-    if name in plain.constraints:
-        raise ValueError(
-            f"'{name}' is the name of an element and of a constraint, whose multipliers would have one name.\n"
-            "Fix: another name for one of them; a contact that always holds is a lj.Holonomic and no element."
-        )
-
-
-def _check_output(call: Call, value, like: Array):
-    found = getattr(value, "shape", () if isinstance(value, float | int) else None)
-    if found != like.shape:
-        raise ValueError(
-            f"{call} must return its output in the shape of its entry in q0, {like.shape}, and returned "
-            f"{f'a {type(value).__name__}' if found is None else f'shape {found}'}.\n"
-            "Usual cause: several outputs of one controller, or a missing return.\n"
-            "Fix: an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each."
-        )
-
-
-def _check(call: Call, value, shape: tuple | None):
-    found = jnp.shape(value)
-    if shape is not None and found != shape or len(found) > 1:
-        raise ValueError(
-            f"{call} must return {'a number or a vector' if shape is None else 'a number'}, and returned shape {found}."
-            "\nUsual cause: the velocity of a point in space.\n"
-            "Fix: its component along the contact."
-        )

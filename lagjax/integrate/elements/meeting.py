@@ -1,18 +1,18 @@
 """What happens where the modes of elements change: contacts that touch are solved together, in three steps.
 
-1. Impact: where a gap closes, velocities jump by the impulses of the contacts, until no gap closes any more.
-2. Forces: of the gaps that are closed and do not open, those stay closed that have to push (`complementarity.py`), and
-   of the sliding velocities that are zero, those stick whose friction can hold them.
+1. Impact: where a gap closes, velocities jump by the impulses of the contacts (`impact_law.py`).
+2. Forces: with the accelerations W λ + b of all contacts, the forces λ obey for each gap that touches, and each sliding
+   velocity on it (`complementarity.py`)
+
+       0 ≤ λ_N ⊥ a_N ≥ 0        |λ_T| ≤ μ N        a_T = 0 or λ_T against it, of size μ N
+
+   A gap stays closed where λ_N pushes, or where it does not open; a sliding velocity that is zero sticks where a_T is.
 3. Velocities are moved onto what holds now.
 
 With the rows A of all contacts, and the constraints that always hold, the response of the velocities to a unit of each
 force is D: M D = Aᵀ + constraint forces, and W = A D.
 
-Impacts one after the other: always the gap that closes fastest, with its restitution, until none with a restitution
-closes; what then still closes is stopped all at once. Simultaneous impacts: Newton's law for all at once,
-0 ≤ Λ ⊥ γ' + e γ ≥ 0.
-
-Source: Glocker, *Set-Valued Force Laws*, §6; Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*,
+Source: Glocker, *Set-Valued Force Laws*, §5, §6; Pfeiffer & Glocker, *Multibody Dynamics with Unilateral Contacts*,
 ch. 6-8.
 """
 
@@ -22,10 +22,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, directions, lengths, solved
+from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
@@ -46,8 +46,21 @@ LET_GO = 0.01
 ENDS_AT, ENDS_AT_ROUND_OFFS = 3e-8, 1000
 # That of sliding which begins at rest, with twice this speed.
 BEGINS_AT = 1e-9
-# Impacts one after the other, at most: so many for each pair of gaps, and a few more.
-MORE_IMPACTS = 8
+
+
+class AtMeeting(NamedTuple):
+    """A state at which contacts meet, as vectors; `model`: with all contacts on; `given`: the modes before."""
+
+    model: Model
+    t: Float[Array, ""]
+    x: Float[Array, " n"]
+    u: Float[Array, " n"]
+    given: InModes
+
+    @property
+    def state(self) -> tuple:
+        """What functions of the user's take."""
+        return self.t, self.model.tree(self.x), self.model.tree(self.u), self.given.params
 
 
 class Met(NamedTuple):
@@ -94,6 +107,14 @@ class Rows(NamedTuple):
         return jnp.stack([x, u])[:, None] / heavy[None]
 
 
+class Zeros(NamedTuple):
+    """What counts as zero: `gap` (k_N,), `velocity` (k,); `ends` (k_T,): the speed at which sliding in a plane ends."""
+
+    gap: Float[Array, " kN"]
+    velocity: Float[Array, " k"]
+    ends: Float[Array, " kT"]
+
+
 class Meeting(eqx.Module):
     """Solves the contacts of a system in modes (`laws.py`) at one state."""
 
@@ -122,27 +143,22 @@ class Meeting(eqx.Module):
     ) -> Met:  # fmt: skip
         """The modes and velocities after a meeting. `fired`: the modes whose guards are zero; `sizes`: the largest
         coordinates and velocities of the motion. Without `impacts` gaps that close stay open."""
-        laws, (normals, _) = self.laws, self.laws.count
-        model = self._all_on(t, q, v, given)
-        x, u = model.vectors(q, v)
-        eps, rows = jnp.finfo(x.dtype).eps, self._rows(model, t, x, u, given)
-        scale = jnp.abs(rows.jacobian) @ rows.sizes(sizes).T
-        gaps = jnp.concatenate([law.gaps(t, q, given.params) for law in laws.normals] or [jnp.zeros(0, t.dtype)])
-        closed = (
-            (given.modes == CLOSED)[:normals]
-            | fired[:normals]
-            | (jnp.abs(gaps) <= 4 * CLOSED_BELOW * eps * scale[:normals, 0])
-        )
-        if impacts:
-            u = u + self._impact(model, t, x, u, given, rows, stop_gradient(closed)) @ rows.response
-        given, reach = laws.pressed(t, q, model.tree(u), given, fired, rows.sizes(sizes))
-        decided = self._forces(model, t, x, u, given, rows, stop_gradient(closed), fired, stop_gradient(scale))
-        u = u + self._onto(model, t, x, u, rows, decided.onto) @ rows.response
-        slack = jnp.concatenate([decided.slack, reach, jnp.zeros(len(laws.sampled), x.dtype)])
+        at = self._at(t, q, v, given)
+        rows = self._rows(at)
+        sizes = rows.sizes(sizes)
+        scale = jnp.abs(rows.jacobian) @ sizes.T
+        closed = stop_gradient(self._closed(at, fired, scale))
+        if impacts and self.laws.normals:
+            at = at._replace(u=at.u + self._struck(at, rows, closed).impulses() @ rows.response)
+        given, reach = self.laws.pressed(*at.state[:3], given, fired, sizes)
+        at = at._replace(given=given)
+        decided = self._decided(*stop_gradient((at, rows, closed, scale)), fired)
+        u = at.u + self._onto(at, rows, decided.onto) @ rows.response
+        after = self.laws.in_rows(given, decided.modes)
         # The rates of states are those of the new velocities.
-        after = laws.in_rows(given, decided.modes)
-        u = resolved(model.of(after), t, x, u)
-        return Met(model.tree(u), after.modes, stop_gradient(slack), decided.found)
+        u = resolved(at.model.of(after), t, at.x, u)
+        slack = jnp.concatenate([decided.slack, reach, jnp.zeros(len(self.laws.sampled), u.dtype)])
+        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
         """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
@@ -151,241 +167,190 @@ class Meeting(eqx.Module):
         sizes = stop_gradient(jnp.abs(jnp.stack([coordinates.flatten(y)[0] for y in (q, v)])))
         return q, self.met(t, q, v, given, none, sizes, impacts=False)
 
-    def _all_on(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Model:
+    def _at(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> AtMeeting:
         normals, tangents = self.laws.count
         modes = jnp.array([CLOSED] * normals + [STICKS] * tangents, int)
-        return with_first_order(model_of(self.system, t, q, v, self.laws.in_rows(given, modes)))
+        model = with_first_order(model_of(self.system, t, q, v, self.laws.in_rows(given, modes)))
+        return AtMeeting(model, t, *model.vectors(q, v), given)
 
-    def _rows(self, model: Model, t: Array, x: Array, u: Array, given: InModes) -> Rows:
-        every, mine = constraints.jacobian(model, t, x, u), np.array(self.laws.rows, int)
-        always = np.setdiff1d(np.arange(model.m), mine)
-        linear = mass_and_forcing(self._free(model, given), t, x, u)
-        mass = linear.mass
-        jacobian, held = every[mine], every[always]
-        independent = independent_rows(held)
-        still = jnp.zeros(held.shape[0], x.dtype)
+    def _free(self, at: AtMeeting) -> Model:
+        """The model with all gaps open."""
+        return at.model.of(self.laws.in_rows(at.given, jnp.zeros(len(self.laws.rows), int)))
+
+    def _places(self, model: Model) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the stacked constraint equations are those of contacts, and which always hold."""
+        mine = np.array(self.laws.rows, int)
+        return mine, np.setdiff1d(np.arange(model.m), mine)
+
+    def _rows(self, at: AtMeeting) -> Rows:
+        model, t, x, u, _ = at
+        mine, always = self._places(model)
+        every, linear = constraints.jacobian(model, t, x, u), mass_and_forcing(self._free(at), t, x, u)
+        jacobian, held, mass = every[mine], every[always], linear.mass
+        independent, still = independent_rows(held), jnp.zeros(always.size, x.dtype)
         # What has no inertia says nothing about the sizes of what has.
         light = model.form.first_order.mask(model.n) if model.form.first_order else np.zeros(model.n, bool)
         root_mass = jnp.where(light, 0.0, jnp.sqrt(jnp.max(jnp.abs(mass), axis=1)))
-        every = jnp.concatenate([jacobian, linear.forcing[None]])
-        response, added = jax.vmap(lambda row: solve_saddle_point(mass, held, row, still, independent))(every)
+        loads = jnp.concatenate([jacobian, linear.forcing[None]])
+        response, added = jax.vmap(lambda load: solve_saddle_point(mass, held, load, still, independent))(loads)
         return Rows(jacobian, response[:-1], jacobian @ response[:-1].T, added[:-1], root_mass, response[-1])
 
-    def _free(self, model: Model, given: InModes) -> Model:
-        """The model with all gaps open."""
-        return model.of(self.laws.in_rows(given, jnp.zeros(len(self.laws.rows), int)))
+    def _velocities(self, at: AtMeeting) -> Float[Array, " k"]:
+        """The rates of gaps, and sliding velocities."""
+        return constraints.velocity_residual(*at[:4])[self._places(at.model)[0]]
 
-    def _slopes(self, model: Model, t: Array, x: Array, u: Array) -> Array:
-        return constraints.velocity_residual(model, t, x, u)[np.array(self.laws.rows, int)]
+    def _closed(self, at: AtMeeting, fired: Bool[Array, " k"], scale: Float[Array, "k 2"]) -> Bool[Array, " kN"]:
+        """Which gaps are closed."""
+        (normals, _), (t, q, _, params) = self.laws.count, at.state
+        gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in self.laws.normals)])
+        small = 4 * CLOSED_BELOW * jnp.finfo(gaps.dtype).eps * scale[:normals, 0]
+        return (at.given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= small)
 
-    def _coefficients(self, t: Array, q: PyTree, v: PyTree, params: PyTree, slips: Array, sticking: bool) -> Array:
-        parts = []
-        first = self.laws.count[0]
+    def _struck(self, at: AtMeeting, rows: Rows, closed: Bool[Array, " kN"]) -> Struck:
+        """The contacts as an impact finds them."""
+        normals, _ = self.laws.count
+        c = self._velocities(at)
+        still = STILL_BELOW * jnp.finfo(c.dtype).eps * (jnp.abs(rows.jacobian) @ jnp.abs(at.u))[:normals]
+        # Forces that are no impulses of gaps do nothing in no time.
+        by_gaps = np.array(self.laws.owners, int) >= 0
+        mu = jnp.where(by_gaps, self._coefficients(at, c[normals:], sticking=False), 0.0)
+        _, pressed_by = self._normal_forces(at, rows, jnp.zeros(rows.of_constraints.shape[1], c.dtype))
+        return Struck(self.laws, at.given.params, rows.matrix, c, closed, still, mu, pressed_by)
+
+    def _coefficients(self, at: AtMeeting, slips: Float[Array, " kT"], sticking: bool) -> Float[Array, " kT"]:
+        """μ of sticking, or of sliding with these velocities."""
+        found, normals, params = [slips[:0]], self.laws.count[0], at.given.params
         for law in self.laws.tangents:
-            own = slips[law.at[0] - first : law.at[1] - first]
-            speeds = lengths(own, law.partners)
-            parts.append(law.sticking(speeds, params) if sticking else law.kinetic(speeds, params))
-        return jnp.concatenate([*parts, jnp.zeros(0, t.dtype)])
-
-    def _impact(self, model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array) -> Array:
-        """The impulses of the contacts."""
-        laws, (normals, tangents) = self.laws, self.laws.count
-        if not normals:
-            return jnp.zeros(tangents, x.dtype)
-        q, v = model.tree(x), model.tree(u)
-        before = self._slopes(model, t, x, u)
-        mu = self._coefficients(t, q, v, given.params, before[normals:], sticking=False)
-        owners = np.array(laws.owners, int)
-        still = STILL_BELOW * jnp.finfo(x.dtype).eps * (jnp.abs(rows.jacobian) @ jnp.abs(u))[:normals]
-
-        def closing_at(c: Array) -> Array:
-            return closed & (stop_gradient(c[:normals]) < -still)
-
-        def restitution(closing: Array) -> Array:
-            return jnp.concatenate([law.returned(closing[slice(*law.at)], given.params) for law in laws.normals])
-
-        def at_once(c: Array, bounce: Array, closed: Array = closed) -> Array:
-            """The impulses of all closed contacts together; `bounce`: e γ."""
-            free = jnp.concatenate([c[:normals] + bounce, c[normals:]])
-            problem = ContactProblem(
-                rows.matrix, free, closed, self._of_contacts(x.dtype), jnp.zeros(tangents, x.dtype),
-                jnp.where(owners >= 0, mu, 0.0), jnp.zeros(tangents, x.dtype), laws.partners,
-            )  # fmt: skip
-            return solved(problem).forces
-
-        def alone(c: Array, i: Array, bounce: Array) -> Array:
-            """The impulses of gap i."""
-            if laws.in_planes.any():
-                return at_once(c, -bounce, jnp.arange(normals) == i)
-            return self._one(rows.matrix, c, i, bounce[i] - c[i], mu)
-
-        if laws.impacts == "simultaneous":
-            struck = jnp.any(closing_at(before))
-            closing = jnp.where(closed, jnp.maximum(-before[:normals], 0.0), 0.0)
-            return lax.cond(
-                struck, lambda: at_once(before, -restitution(closing) * closing), lambda: jnp.zeros_like(before)
-            )
-
-        def next_impact(impulses: Array, _) -> tuple[Array, None]:
-            c = before + rows.matrix @ impulses
-            closing = jnp.maximum(-c[:normals], 0.0)
-            e = restitution(closing)
-            # One that is NaN strikes, so that the motion fails.
-            struck = closing_at(c) & ~(stop_gradient(e) <= 0)
-            i = jnp.argmax(jnp.where(struck, stop_gradient(closing), 0.0))
-            return impulses + jnp.where(jnp.any(struck), alone(c, i, e * closing), 0.0), None
-
-        most = normals * (normals + 1) + MORE_IMPACTS if normals > 1 else 1
-        impulses, _ = lax.scan(next_impact, jnp.zeros_like(before), None, length=most)
-        left = before + rows.matrix @ impulses
-        rest = lax.cond(
-            jnp.any(closing_at(left)), lambda: at_once(left, jnp.zeros(normals, x.dtype)), lambda: jnp.zeros_like(left)
-        )
-        return impulses + rest
-
-    def _one(self, matrix: Array, c: Array, i: Array, jump: Array, mu: Array) -> Array:
-        """The impulses of gap i alone, whose velocity changes by `jump`: see `contacts/impacts.py`."""
-        normals, tangents = self.laws.count
-        unit = jnp.zeros(normals + tangents, c.dtype).at[i].set(1.0)
-        smooth = jump / matrix[i, i]
-        if not tangents:
-            return smooth * unit
-        owners = np.array(self.laws.owners, int)
-        j = normals + jnp.argmax(owners == i)
-        n, k, h = matrix[i, i], matrix[i, j], matrix[j, j]
-        after = c[j] + smooth * k
-        det = n * h - k * k
-        held_t = (-c[j] * n - jump * k) / jnp.where(det > 0, det, 1.0)
-        held_n = (jump - k * held_t) / n
-        most, side = mu[j - normals], jnp.sign(after)
-        room = n - side * most * k
-        slid_n = jump / jnp.where(room > 0, room, 1.0)
-        sticks = (jnp.abs(held_t) <= most * held_n) & (det > DEPENDENT[c.dtype] * n * h) | (room <= 0)
-        normal = jnp.where(sticks, held_n, slid_n)
-        tangential = jnp.where(sticks, held_t, -side * most * slid_n)
-        both = normal * unit + tangential * jnp.zeros_like(unit).at[j].set(1.0)
-        return jnp.where(jnp.any(owners == i), both, smooth * unit)
-
-    def _of_contacts(self, dtype) -> np.ndarray:
-        """Which normal force belongs to each sliding velocity, (k_T, k)."""
-        normals, tangents = self.laws.count
-        found = np.zeros((tangents, normals + tangents), dtype)
-        for j, owner in enumerate(self.laws.owners):
-            if owner >= 0:
-                found[j, owner] = 1.0
-        return found
-
-    def _forces(
-        self, model: Model, t: Array, x: Array, u: Array, given: InModes, rows: Rows, closed: Array, fired: Array,
-        scale: Array,
-    ) -> Decided:  # fmt: skip
-        """The modes after a meeting, by the forces at accelerations."""
-        laws, (normals, _), partners, in_planes = self.laws, self.laws.count, self.laws.partners, self.laws.in_planes
-        count = len(laws.rows)
-        if not count:
-            none = jnp.zeros(0, x.dtype)
-            return Decided(given.modes[:0], none, none, jnp.asarray(True))
-        model, t, x, u, given, rows = stop_gradient((model, t, x, u, given, rows))
-        q, v, params = model.tree(x), model.tree(u), given.params
-        every = constraints.acceleration_rows(model, t, x, u)
-        mine = np.array(laws.rows, int)
-        always = np.setdiff1d(np.arange(model.m), mine)
-        linear = mass_and_forcing(self._free(model, given), t, x, u)
-        held = every.jacobian[always]
-        gamma, independent = every.gamma[always], independent_rows(held)
-        a, multipliers = solve_saddle_point(linear.mass, held, linear.forcing, gamma, independent)
-        free = rows.jacobian @ a - every.gamma[mine]
-        slopes = self._slopes(model, t, x, u)
-        eps = jnp.finfo(x.dtype).eps
-        # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
-        slid = jnp.where(jnp.abs(given.modes) == 1, given.slack, 0.0)[: slopes.size].at[:normals].set(0.0)
-        still = STILL_BELOW * jnp.maximum(eps * scale[:, 1], slid / CLOSED_BELOW)
-        slower = jnp.concatenate(
-            [*(jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in laws.normals), jnp.zeros(0, x.dtype)]
-        )
-        touching = closed & (jnp.abs(slopes[:normals]) <= jnp.maximum(slower, still[:normals]))
-        slips = slopes[normals:]
-        by_motion = CLOSED_BELOW * eps * jnp.concatenate([scale[:normals, 0], scale[normals:, 1]])
-        # Where sliding in a plane ends, also where nothing has moved yet.
-        ends_at = max(ENDS_AT, ENDS_AT_ROUND_OFFS * eps) * lengths(scale[normals:, 1], partners)
-        ends_at = jnp.where(ends_at > 0, ends_at, ENDS_AT)
-        slid = given.modes[normals:count] == 1
-        slow = 1.5 * jnp.where(slid, jnp.maximum(ends_at, given.slack[normals:count]), ends_at)
-        slow = jnp.where(in_planes, slow, still[normals:])
-        slides = jnp.where(lengths(slips, partners) > slow, directions(slips, partners), 0.0)
-        given_side = lengths(slides, partners) > 0
-        constant, of_forces = self._normal_forces(t, q, v, given, model, multipliers, rows, always)
-        mu_slides, mu_sticks = (self._coefficients(t, q, v, params, slips, sticking) for sticking in (False, True))
-        problem = ContactProblem(
-            rows.matrix, free, touching, of_forces, constant, jnp.where(given_side, mu_slides, mu_sticks), slides,
-            partners,
-        )  # fmt: skip
-        forces, found = solved(problem)
-        accelerations = rows.matrix @ forces + free
-        # The acceleration of a motion of this size and speed.
-        faster = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
-        slack = NO_FORCE * eps * problem.step * (jnp.abs(free) + jnp.abs(rows.matrix) @ jnp.abs(forces) + faster)
-        slack = jnp.concatenate([slack[:normals], lengths(slack[normals:], partners)])
-        # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
-        # may open far more slowly than by its own response, since others stay closed.
-        let_go = fired[:count] & laws.holds(given.modes)
-        nothing = jnp.where(let_go, LET_GO * given.slack[:count], slack) / problem.step
-        # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
-        pushes = forces > problem.step * accelerations
-        stays = touching & (pushes[:normals] | (accelerations[:normals] <= nothing[:normals]))
-        normal_modes = jnp.where(stays, CLOSED, OPEN)
-        # The force of friction is larger than its acceleration, and so says more about the direction.
-        most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
-        moves = lengths(accelerations[normals:], partners) > nothing[normals:]
-        starts = jnp.where(
-            moves, directions(jnp.where(most > 0, -forces[normals:], accelerations[normals:]), partners), 0.0
-        )
-        side = jnp.where(given_side, slides, starts)
-        one_mode = jnp.where(in_planes, lengths(side, partners) > 0, side).astype(int)
-        owners = np.array(laws.owners, int)
-        present = jnp.where(owners >= 0, jnp.concatenate([stays, jnp.ones(1, bool)])[owners], laws.rubs(given.modes))
-        tangent_modes = jnp.where(present, jnp.where(one_mode != 0, one_mode, STICKS), FREE)
-        modes = jnp.concatenate([normal_modes, tangent_modes]).astype(given.modes.dtype)
-        begins = in_planes & (tangent_modes == 1) & ~given_side
-        begins_at = max(BEGINS_AT, ENDS_AT_ROUND_OFFS * eps) / max(ENDS_AT, ENDS_AT_ROUND_OFFS * eps)
-        ends_at = jnp.where(begins, begins_at * ends_at, ends_at)
-        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends_at * side, jnp.nan)])
-        onto = jnp.where(laws.holds(modes), 0.0, onto)
-        if_not_held = jnp.concatenate([by_motion[:normals], jnp.where(in_planes, ends_at, by_motion[normals:])])
-        return Decided(modes, jnp.where(laws.holds(modes), slack, if_not_held), onto, found)
+            speeds = lengths(slips[law.at[0] - normals : law.at[1] - normals], law.partners)
+            found.append(law.sticking(speeds, params) if sticking else law.kinetic(speeds, params))
+        return jnp.concatenate(found)
 
     def _normal_forces(
-        self, t: Array, q: PyTree, v: PyTree, given: InModes, model: Model, multipliers: Array, rows: Rows, always
-    ) -> tuple[Array, Array]:
-        """N of each sliding velocity as `constant + of_forces @ λ`."""
-        constant, of_forces = [], []
-        names = model.equation_names
-        place = {names[i].split("[")[0]: k for k, i in reversed(list(enumerate(always)))}
-        for law in self.laws.tangents:
-            count, width = law.at[1] - law.at[0], 1 + law.plane
-            if law.source in place:
-                first = place[law.source]
-                constant += [multipliers[first + i // width] for i in range(count)]
-                of_forces += [rows.of_constraints[:, first + i // width] for i in range(count)]
-                continue
-            gaps = [normal for normal in self.laws.normals if normal.name == law.source]
-            if not gaps:
-                constant += [*law.normal_forces(t, q, v, self.laws.forces(t, q, v, given), given.params)]
-            else:
-                constant += [jnp.zeros((), t.dtype)] * count
-            unit = np.eye(len(self.laws.rows))
-            of_forces += [
-                jnp.asarray(unit[gaps[0].at[0] + i // width] if gaps else 0 * unit[0], t.dtype) for i in range(count)
-            ]
-        if not constant:
-            return jnp.zeros(0, t.dtype), jnp.zeros((0, len(self.laws.rows)), t.dtype)
-        return jnp.stack(constant), jnp.stack(of_forces)
+        self, at: AtMeeting, rows: Rows, multipliers: Float[Array, " mb"]
+    ) -> tuple[Float[Array, " kT"], Float[Array, "kT k"]]:
+        """N of each sliding velocity as `constant + of_forces @ λ`; `multipliers`: of what always holds, at λ = 0."""
+        t, q, v, params = at.state
+        mine, always = self._places(at.model)
+        by_springs = self.laws.forces(t, q, v, at.given)
 
-    def _onto(self, model: Model, t: Array, x: Array, u: Array, rows: Rows, wanted: Array) -> Array:
+        def of(forces: Float[Array, " k"]) -> Float[Array, " kT"]:
+            held = multipliers + forces @ rows.of_constraints
+            every = at.model.split(jnp.zeros(at.model.m, t.dtype).at[mine].set(forces).at[always].set(held))
+            found = [law.normal_forces(t, q, v, every | by_springs, params) for law in self.laws.tangents]
+            return jnp.concatenate([forces[:0], *found])
+
+        zero = jnp.zeros(mine.size, t.dtype)
+        return of(zero), jax.jacfwd(of)(zero)
+
+    def _zeros(self, at: AtMeeting, scale: Float[Array, "k 2"]) -> Zeros:
+        laws, (normals, _), eps = self.laws, self.laws.count, jnp.finfo(scale.dtype).eps
+        modes, slack = at.given.modes[: len(laws.rows)], at.given.slack[: len(laws.rows)]
+        # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
+        slid = jnp.where(jnp.abs(modes) == 1, slack, 0.0).at[:normals].set(0.0)
+        velocity = STILL_BELOW * jnp.maximum(eps * scale[:, 1], slid / CLOSED_BELOW)
+        ends = _ends_at(eps) * lengths(scale[normals:, 1], laws.partners)
+        # Also where nothing has moved yet.
+        return Zeros(CLOSED_BELOW * eps * scale[:normals, 0], velocity, jnp.where(ends > 0, ends, ENDS_AT))
+
+    def _sliding(self, at: AtMeeting, slips: Float[Array, " kT"], zeros: Zeros) -> Float[Array, " kT"]:
+        """The side, or direction, to which each sliding velocity slides; zero where it does not."""
+        laws, (normals, _) = self.laws, self.laws.count
+        modes, slack = (x[normals : len(laws.rows)] for x in (at.given.modes, at.given.slack))
+        in_plane = 1.5 * jnp.where(modes == 1, jnp.maximum(zeros.ends, slack), zeros.ends)
+        slow = jnp.where(laws.in_planes, in_plane, zeros.velocity[normals:])
+        return jnp.where(lengths(slips, laws.partners) > slow, directions(slips, laws.partners), 0.0)
+
+    def _problem(self, at: AtMeeting, rows: Rows, touching: Bool[Array, " kN"], slides: Float[Array, " kT"]):
+        """The complementarity problem of the forces at accelerations."""
+        model, t, x, u, _ = at
+        mine, always = self._places(model)
+        every, linear = constraints.acceleration_rows(model, t, x, u), mass_and_forcing(self._free(at), t, x, u)
+        held, gamma = every.jacobian[always], every.gamma[always]
+        a, multipliers = solve_saddle_point(linear.mass, held, linear.forcing, gamma, independent_rows(held))
+        constant, of_forces = self._normal_forces(at, rows, multipliers)
+        slips = self._velocities(at)[touching.size :]
+        moving, resting = (self._coefficients(at, slips, sticking) for sticking in (False, True))
+        mu = jnp.where(lengths(slides, self.laws.partners) > 0, moving, resting)
+        free = rows.jacobian @ a - every.gamma[mine]
+        return ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
+
+    def _touching(self, at: AtMeeting, closed: Bool[Array, " kN"], zeros: Zeros) -> Bool[Array, " kN"]:
+        """Which gaps are closed and do not open."""
+        normals = closed.size
+        slower = [jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in self.laws.normals]
+        slower = jnp.maximum(jnp.concatenate([zeros.gap[:0], *slower]), zeros.velocity[:normals])
+        return closed & (jnp.abs(self._velocities(at)[:normals]) <= slower)
+
+    def _tangent_modes(self, at: AtMeeting, stays: Bool[Array, " kN"], side: Float[Array, " kT"]) -> Int[Array, " kT"]:
+        """The modes of sliding velocities that slide to this `side`, zero where they stick, or are free."""
+        owners = np.array(self.laws.owners, int)
+        rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], self.laws.rubs(at.given.modes))
+        slides = jnp.where(self.laws.in_planes, lengths(side, self.laws.partners) > 0, side).astype(int)
+        return jnp.where(rubs, jnp.where(slides != 0, slides, STICKS), FREE)
+
+    def _decided(
+        self, at: AtMeeting, rows: Rows, closed: Bool[Array, " kN"], scale: Float[Array, "k 2"], fired: Array
+    ) -> Decided:
+        """The modes after a meeting, by the forces at accelerations."""
+        laws, normals, partners, eps = self.laws, closed.size, self.laws.partners, jnp.finfo(at.u.dtype).eps
+        before, slack = at.given.modes[: len(laws.rows)], at.given.slack[: len(laws.rows)]
+        if not laws.rows:
+            return Decided(before, slack, slack, jnp.asarray(True))
+        zeros = self._zeros(at, scale)
+        touching, slides = self._touching(at, closed, zeros), self._sliding(at, self._velocities(at)[normals:], zeros)
+        problem = self._problem(at, rows, touching, slides)
+        forces, found = solved(problem)
+        a, no_force = problem.matrix @ forces + problem.free, _no_force(problem, forces, scale)
+        # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
+        # may open far more slowly than by its own response, since others stay closed.
+        let_go = fired[: before.size] & laws.holds(before)
+        no_acceleration = jnp.where(let_go, LET_GO * slack, no_force) / problem.step
+        # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
+        pushes = forces > problem.step * a
+        stays = touching & (pushes | (a <= no_acceleration))[:normals]
+        goes_on, moves = (lengths(x, partners) for x in (slides, a[normals:]))
+        starts = jnp.where(moves > no_acceleration[normals:], _against_friction(problem, forces, a), 0.0)
+        side = jnp.where(goes_on > 0, slides, starts)
+        tangents = self._tangent_modes(at, stays, side)
+        modes = jnp.concatenate([jnp.where(stays, CLOSED, OPEN), tangents]).astype(before.dtype)
+        begins = laws.in_planes & (tangents == 1) & (goes_on == 0)
+        ends = jnp.where(begins, zeros.ends * max(BEGINS_AT, ENDS_AT_ROUND_OFFS * eps) / _ends_at(eps), zeros.ends)
+        by_motion = jnp.where(laws.in_planes, ends, CLOSED_BELOW * eps * scale[normals:, 1])
+        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * side, jnp.nan)])
+        holds = laws.holds(modes)
+        slack = jnp.where(holds, no_force, jnp.concatenate([zeros.gap, by_motion]))
+        return Decided(modes, slack, jnp.where(holds, 0.0, onto), found)
+
+    def _onto(self, at: AtMeeting, rows: Rows, wanted: Float[Array, " k"]) -> Float[Array, " k"]:
         """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""
         if not self.laws.rows:
-            return jnp.zeros(0, x.dtype)
+            return wanted
         on = jnp.isfinite(wanted)
-        left = jnp.where(on, self._slopes(model, t, x, u) - jnp.where(on, wanted, 0.0), 0.0)
+        left = jnp.where(on, self._velocities(at) - jnp.where(on, wanted, 0.0), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left
+
+
+def _ends_at(eps) -> float:
+    """At which part of the velocities in the motion sliding in a plane ends."""
+    return max(ENDS_AT, ENDS_AT_ROUND_OFFS * float(eps))
+
+
+def _against_friction(
+    problem: ContactProblem, forces: Float[Array, " k"], a: Float[Array, " k"]
+) -> Float[Array, " kT"]:
+    """The direction in which each contact begins to slide, if it does: against its friction, or as nothing holds it."""
+    normals = problem.may_push.size
+    most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
+    # The force of friction is larger than its acceleration, and so says more about the direction.
+    return directions(jnp.where(most > 0, -forces[normals:], a[normals:]), problem.partners)
+
+
+def _no_force(problem: ContactProblem, forces: Float[Array, " k"], scale: Float[Array, "k 2"]) -> Float[Array, " k"]:
+    """Below which size a force is zero."""
+    normals = problem.may_push.size
+    # The acceleration of a motion of this size and speed.
+    faster = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
+    accelerations = jnp.abs(problem.free) + jnp.abs(problem.matrix) @ jnp.abs(forces) + faster
+    found = NO_FORCE * jnp.finfo(forces.dtype).eps * problem.step * accelerations
+    return jnp.concatenate([found[:normals], lengths(found[normals:], problem.partners)])

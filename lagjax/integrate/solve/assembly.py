@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.laws import Laws, OneGuard, in_modes
+from lagjax.integrate.elements.in_modes import OneGuard, in_modes
+from lagjax.integrate.elements.laws import Laws
 from lagjax.integrate.elements.meeting import Meeting, Met
 from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of
 from lagjax.integrate.jumps.find import OfParams

@@ -214,7 +214,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
         ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
         modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
-        **({} if phase.meeting is None else phase.meeting.laws.kinds),
+        kinds=() if phase.meeting is None else phase.meeting.laws.kinds,
     )  # fmt: skip
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
@@ -401,7 +401,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
         count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
         modes=None if after.modes is None else put(s.modes, after.modes.modes),
-        gaps=s.gaps, springs=s.springs, controls=s.controls,
+        kinds=s.kinds,
     )  # fmt: skip
     return after, to, record
 

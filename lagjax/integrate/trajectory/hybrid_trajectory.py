@@ -34,7 +34,7 @@ class Switches(eqx.Module):
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      of which the first `gaps` are those of gaps, and the last ones those of `springs` and of sampled `controls`.
+      and `kinds` what they are modes of: a "gap", a "sliding velocity", a "spring" or a "control".
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -55,9 +55,7 @@ class Switches(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     ways: tuple[str, ...] = eqx.field(static=True)
     modes: Int[Array, "S k"] | None = None
-    gaps: int = eqx.field(static=True, default=0)
-    springs: int = eqx.field(static=True, default=0)
-    controls: int = eqx.field(static=True, default=0)
+    kinds: tuple[str, ...] = eqx.field(static=True, default=())
 
     def as_crossings(self) -> Crossings:
         """Return the switches as crossings of one guard, with the states before them."""
@@ -87,16 +85,16 @@ class Switches(eqx.Module):
     def _happened(self, k: int) -> str:
         """What a mode does where it ends at switch k."""
         way = int(self.way[k])
-        if way >= len(self.ways) - self.controls:
+        if self.kinds[way] == "control":
             return "acts"
         after = self.mode_in_words(way, int(np.asarray(self.modes)[k, way]))
         impulses = jax.tree.leaves(self.impulse)
-        struck = way < self.gaps and any(np.any(np.asarray(x)[k]) for x in impulses)
+        struck = self.kinds[way] == "gap" and any(np.any(np.asarray(x)[k]) for x in impulses)
         return f"is struck, then {after}" if struck else after
 
     def mode_in_words(self, way: int, mode: int) -> str:
         """A mode in a word; `way`: its place among the modes."""
-        return mode_in_words(way, mode, len(self.ways), self.gaps, self.springs, self.controls)
+        return mode_in_words(self.kinds[way], mode)
 
 
 class HybridTrajectory(Trajectory):

@@ -13,15 +13,17 @@ from lagjax.numerics import EqualSteps
 NO_PHASE = -1
 
 
-def mode_in_words(way: int, mode: int, count: int, gaps: int, springs: int, controls: int) -> str:
-    """A mode in a word; `way`: its place among `count` modes: of gaps, of what slides, of springs, of controls."""
-    if way < gaps:
-        return "closed" if mode else "open"
-    if way >= count - controls:
-        return "holds its output"
-    if way >= count - controls - springs:
-        return "pressed" if mode else "apart"
-    return {0: "free", 2: "sticks"}.get(mode, "slides")
+# What modes are called, by the kind of what they are modes of.
+MODES = {
+    "gap": {0: "open", 1: "closed"},
+    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks"},
+    "spring": {0: "apart", 1: "pressed"},
+}
+
+
+def mode_in_words(kind: str, mode: int) -> str:
+    """A mode in a word."""
+    return "holds its output" if kind == "control" else MODES[kind][mode]
 
 
 class Snapshot(NamedTuple):
