@@ -12,13 +12,14 @@ from lagjax.integrate.integrate import integrate
 from lagjax.integrate.jumps.find import found
 from lagjax.integrate.load import check_is_system, described_system, load_trajectory, same_system, trajectory_from
 from lagjax.integrate.settings import PATIENCE
-from lagjax.integrate.solve.assembly import modes_at
+from lagjax.integrate.solve.assembly import InElements, modes_at
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.solve.harvest import Report, reported, reporting, watched
 from lagjax.integrate.solve.over_jumps import JumpWarning
-from lagjax.integrate.solve.phases import traced_phases
+from lagjax.integrate.solve.phases import phases_in, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for
+from lagjax.integrate.solve.segments import switches_before_any
 from lagjax.integrate.trajectory.dense_output import in_one_solve
 from lagjax.integrate.trajectory.drawing import curves, drawn, film_of_lanes
 from lagjax.integrate.trajectory.error_report import angle_mask

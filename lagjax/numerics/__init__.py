@@ -19,6 +19,7 @@ from lagjax.numerics.newton import (
     least_squares_root,
     newton,
     newton_in_python,
+    while_in_python,
     with_value,
     zero_below,
 )

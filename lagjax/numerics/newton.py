@@ -109,11 +109,13 @@ def damped_newton(
     y0: PyTree,
     at: PyTree,
     memory: Any,
+    loop: Callable = lax.while_loop,
 ) -> Search:
     """Repeat `trial = propose(search)`, and keep it where it is better.
 
     `judge(search, trial, evaluate(trial))` says whether it is, and gives the next memory. The first trial is to be y0,
-    whose evaluation `at` is unknown: so the program contains one evaluation.
+    whose evaluation `at` is unknown: so the program contains one evaluation. `loop`: `while_in_python`, if that is a
+    program of its own.
     """
 
     def iterate(search):
@@ -123,7 +125,14 @@ def damped_newton(
         y, at = jax.tree.map(lambda new, old: jnp.where(better, new, old), (trial, there), (search.y, search.at))
         return Search(y, at, memory, search.steps + 1)
 
-    return lax.while_loop(unfinished, iterate, Search(y0, at, memory, jnp.zeros((), int)))
+    return loop(unfinished, iterate, Search(y0, at, memory, jnp.zeros((), int)))
+
+
+def while_in_python(unfinished: Callable[[Any], Bool[Array, ""]], iterate: Callable[[Any], Any], state: Any) -> Any:
+    """What `lax.while_loop` does, with nothing traced."""
+    while bool(unfinished(state)):
+        state = iterate(state)
+    return state
 
 
 class Ended(NamedTuple):

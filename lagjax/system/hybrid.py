@@ -217,7 +217,7 @@ class Hybrid(eqx.Module):
         """The system of the phase in which motions start. Not while JAX is tracing."""
         return self.systems[int(self.first)]
 
-    def starting(self, start: str | ArrayLike | None) -> "Hybrid":
+    def starting(self, start: str | ArrayLike | None, argument: str = "start") -> "Hybrid":
         """The same hybrid with motions that start in this phase, a name or a number; None keeps the present one.
 
         A number may be traced: one that no phase has is then a failure of the motion.
@@ -225,28 +225,29 @@ class Hybrid(eqx.Module):
         if start is None:
             return self
         if not isinstance(start, str):
-            return replace_fields(self, first=self._number(start))
+            return replace_fields(self, first=self._number(start, argument))
         if start not in self.names:
             raise ValueError(
-                f"start={start!r} is not a phase.\nThe phases are {', '.join(map(repr, self.names))}; motions start in "
-                "the first one by default."
+                f"{argument}={start!r} is not a phase.\nThe phases are {', '.join(map(repr, self.names))}; motions "
+                "start in the first one by default."
             )
         return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
 
-    def _number(self, start):
+    def _number(self, start, argument: str):
         whole = hasattr(start, "dtype") and np.issubdtype(start.dtype, np.integer) or isinstance(start, int)
         if isinstance(start, bool) or not whole or np.ndim(start):
             shape = f" of shape {np.shape(start)}" if np.ndim(start) else ""
             raise ValueError(
-                f"start must be the name of a phase, or its number, a whole one, not {type(start).__name__}{shape}.\n"
-                'Fix: start="flying"; or lanes that start in different phases, '
+                f"{argument} must be the name of a phase, or its number, a whole one, not "
+                f"{type(start).__name__}{shape}."
+                f'\nFix: {argument}="flying"; or lanes that start in different phases, '
                 "jax.vmap(lambda q, start: lj.integrate(..., start=start))(q, jnp.array([0, 1]))."
             )
         if isinstance(start, Tracer):
             return start.astype(np.int32)
         if not 0 <= int(start) < len(self.names):
             raise ValueError(
-                f"start={int(start)} is not the number of a phase.\nThe phases are "
+                f"{argument}={int(start)} is not the number of a phase.\nThe phases are "
                 f"{', '.join(f'{i}: {name!r}' for i, name in enumerate(self.names))}."
             )
         return np.asarray(start, np.int32)

@@ -203,11 +203,11 @@ class System(eqx.Module):
         """The system itself, without its elements."""
         return self if self.elements is None else unchecked(*(getattr(self, name) for name in FIELDS[:-1]))
 
-    def starting(self, start) -> "System":
+    def starting(self, start, argument: str = "start") -> "System":
         """The system itself; raise if `start` names a phase."""
         if start is not None:
             raise ValueError(
-                "start= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out."
+                f"{argument}= names the first phase of a lj.Hybrid, and this is one lj.System.\nFix: leave it out."
             )
         return self
 

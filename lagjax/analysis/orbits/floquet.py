@@ -20,11 +20,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from lagjax.analysis.orbits.monodromy import period_of, problem_of, refuse_singular
+from lagjax.analysis.orbits.monodromy import period_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
+from lagjax.analysis.orbits.switching_problem import any_problem_of, refuse_unfollowed
 from lagjax.display import plots
 from lagjax.jaxtools import is_traced
-from lagjax.system import State, System
+from lagjax.system import Hybrid, State, System
 
 # The largest extent of the axes: beyond this the circle would be too small to see.
 FAR = 4.0
@@ -75,10 +76,10 @@ class Floquet(eqx.Module):
       it constrains the velocity too).
     - `trivial` (k,): whether a multiplier is 1 for a known reason; `reasons` (r,) says which of those in `words` apply.
     - `monodromy` (2n, 2n): M for displacements (q, v) in the order of their names, zero for those off the constraints.
-    - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt.
+    - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt; NaN for a motion with switches.
     - `error`: the estimated error of the entries of M, in units in which the state has size 1; from a second, less
-      accurate run if nothing is traced, else from Liouville's formula. Multipliers that are not much larger than this
-      are unknown.
+      accurate run if nothing is traced, else from Liouville's formula, or of the size of the tolerance where that is
+      unknown. Multipliers that are not much larger than this are unknown.
     - `period`; `ended`: whether the motion could be followed through it; `apart`: how far it then is from its start, in
       units of the state, apart from whole turns and coordinates on which nothing depends.
 
@@ -174,19 +175,23 @@ class Floquet(eqx.Module):
             )
         rows = [("multipliers", ", ".join(_listed(self))), ("period", f"{float(self.period):.9g}")]
         rows.append(("verdict", self.verdict))
-        off = abs(float(self.product) - float(self.liouville))
-        rows.append(("product", f"{float(self.product):.9g}; by Liouville's formula {float(self.liouville):.9g}"
-                     f" (apart by {off:.0e})"))  # fmt: skip
+        product, liouville = f"{float(self.product):.9g}", float(self.liouville)
+        if not np.isnan(liouville):
+            off = abs(float(self.product) - liouville)
+            product += f"; by Liouville's formula {liouville:.9g} (apart by {off:.0e})"
+        rows.append(("product", product))
         rows.append(("error of M", f"{float(self.error):.0e} (estimated, in units of the state)"))
         unknown = int(np.sum(np.abs(np.asarray(self.multipliers)) <= UNKNOWN_BELOW * float(self.error)))
-        if unknown:
-            are = "is" if unknown == 1 else "are"
+        are = "is" if unknown == 1 else "are"
+        if unknown and np.isnan(liouville):
+            rows.append(("zero", f"{unknown} of the multipliers {are} 0 within the errors of M, as after sticking"))
+        elif unknown:
             rows.append(("WARNING", f"{unknown} of the multipliers {are} not known: as small as the errors of M"))
         return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
 
 
 def floquet(
-    system, t=None, q: PyTree = None, v: PyTree = None, params: PyTree = None, period=None, *, rtol=None
+    system, t=None, q: PyTree = None, v: PyTree = None, params: PyTree = None, period=None, *, rtol=None, phase=None
 ) -> Floquet:
     """Return the Floquet multipliers of a motion that comes back after a period.
 
@@ -202,9 +207,10 @@ def floquet(
 
     **Arguments:**
 
-    - `system`: the result of `lj.periodic_orbit`, alone; or a `System`, and
+    - `system`: the result of `lj.periodic_orbit`, alone; or a `System`, which may have elements, or a `Hybrid`, and
     - `t`, `q`, `v`, `params`: its state at the start; `period`, after which it comes back, `[t]`. Angles that go
       around, and coordinates on which nothing depends, need not come back, only their velocities.
+    - `phase`: the phase of a `Hybrid` at the start, by name or number; by default the first one.
     - `rtol`: the tolerance of the steps, for the motion and its tangents; 1e-12 by default in float64, 1e-5 in float32.
 
     **Returns:** a `Floquet`, differentiable in both modes by the state and `params`; a double multiplier has no
@@ -215,19 +221,19 @@ def floquet(
 
     Source: Coddington & Levinson, *Theory of Ordinary Differential Equations*, §3.5.
     """
-    if not isinstance(system, System):
-        return _of_orbit(system, rtol, (t, q, v, params, period))
+    if not isinstance(system, System | Hybrid):
+        return _of_orbit(system, rtol, (t, q, v, params, period, phase))
     for name, given in (("t", t), ("q", q), ("v", v), ("period", period)):
         if given is None:
             raise TypeError(
                 f"floquet needs {name} with a system.\n"
                 "Fix: lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit."
             )
-    problem = problem_of(system, State(t, q, v, params))
+    problem = any_problem_of(system, State(t, q, v, params), phase)
     found, error = period_of(problem, period, rtol)
     result = _floquet_of(problem, found, error, period)
     if not is_traced(found) and not bool(found.ended):
-        refuse_singular(problem)
+        refuse_unfollowed(problem, float(period))
     if not is_traced(found) and bool(found.ended) and not bool(result.comes_back):
         raise ValueError(
             f"this state does not come back after period = {float(period):.9g}: it is off by {float(found.apart):.2g} "
@@ -249,7 +255,9 @@ def _of_orbit(orbit, rtol, given):
             "a periodic orbit already contains its state, parameters and period.\n"
             "Fix: lj.floquet(orbit) alone; for other parameters find their orbit first."
         )
-    problem = problem_of(orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params))
+    problem = any_problem_of(orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params))
+    if problem.system.in_phases:
+        problem = problem._replace(is_angle=orbit.asked.angles)
     found, error = period_of(problem, orbit.period, rtol, orbit.nodes)
     return _floquet_of(problem, found, error, orbit.period)
 

@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate import solve_in_both_modes
+from lagjax.integrate import Switches, solve_in_both_modes
 from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
 from lagjax.mechanics import equations_of
 from lagjax.numerics import Dopri8, last_step, newton
@@ -51,7 +51,9 @@ ONTO_CONSTRAINTS = 3
 class Passage(NamedTuple):
     """The end of a state z (2n,) and of a frame of tangents (2n, k) after a time.
 
-    `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested.
+    `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested. The
+    other fields are those of a motion with switches (`switching_flow.py`): the `rate` at its end, and whether it
+    `returns` to the phase of its start.
     """
 
     z: Float[Array, " 2n"]
@@ -59,6 +61,9 @@ class Passage(NamedTuple):
     growth: Float[Array, ""]
     steps: Int[Array, ""]
     ended: Bool[Array, ""]
+    rate: Float[Array, " 2n"] | None = None
+    switches: Switches | None = None
+    returns: Bool[Array, ""] | None = None
 
 
 class Changes(NamedTuple):
@@ -94,6 +99,11 @@ class Flow(eqx.Module):
         """f(t, z): the velocities and accelerations."""
         a, _ = equations_of(self.model).accelerations(t, *self.state(z))
         return jnp.concatenate([z[self.size :], self.model.vector(a)])
+
+    def rates(self, times, nodes, passed: Passage, span) -> Float[Array, "2K 2n"]:
+        """The rates at K nodes, and at the ends of the passages from there."""
+        both = jnp.concatenate([times, times + span]), jnp.concatenate([nodes, passed.z])
+        return jax.vmap(self.rate)(*both)
 
     def residual(self, t, z):
         """c(t, z): the independent constraint equations of positions and velocities."""

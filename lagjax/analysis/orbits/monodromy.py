@@ -29,7 +29,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, flow_of, independent_rows_of, scale_of
+from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, independent_rows_of, scale_of
+from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow
 from lagjax.jaxtools import WATCHED, compiled, is_eager, is_traced, numpy_of
 from lagjax.mechanics import are_angles, explain_failure, invariance
 from lagjax.system import State, System, check_system, coordinates, model_of, traced_system
@@ -61,8 +62,8 @@ class Reasons(NamedTuple):
         )
 
 
-def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array, "r k"]:
-    """The directions of `reasons.names`, in coordinates of the tangent space; zero if there is none."""
+def directions(flow: Flow | SwitchingFlow, reasons: Reasons, t, z, rate, scale, basis) -> Float[Array, "r k"]:
+    """The directions of `reasons.names`, in coordinates of the tangent space; zero if there is none. `rate`: of z."""
     n, rows = flow.size, []
     shifts = [jnp.eye(2 * n, dtype=z.dtype)[i] for i in np.flatnonzero(reasons.ignorable)]
 
@@ -70,7 +71,7 @@ def directions(flow: Flow, reasons: Reasons, t, z, scale, basis) -> Float[Array,
         return jax.grad(flow.model.lagrangian, argnums=2)(t, z[:n], z[n:])
 
     if reasons.autonomous:
-        rows.append(flow.rate(t, z) / scale)
+        rows.append(rate / scale)
     if reasons.energy:
         rows.append(jax.grad(lambda z: momentum(z) @ z[n:] - flow.model.lagrangian(t, z[:n], z[n:]))(z) * scale)
     rows += shifts
@@ -137,7 +138,10 @@ class Period(NamedTuple):
 
 
 class OrbitProblem(NamedTuple):
-    """A checked system and its state, and what its programs show; all but these two are static."""
+    """A checked system and its state, and what its programs show; all but these two are static.
+
+    `system`: a `System`, or what `problem_with_switches` makes of a motion in phases or with elements.
+    """
 
     system: object
     state: State
@@ -154,7 +158,7 @@ def problem_of(system: System, given: State) -> OrbitProblem:
     state = coordinates.state(*s)
     model = model_of(system, *state)
     rows = independent_rows_of(model, state)
-    _check_freedom(model.n, len(all_rows(model) if rows is None else rows), rows is not None)
+    check_freedom(model.n, len(all_rows(model) if rows is None else rows), rows is not None)
     known = invariance(model)
     conserves = not system.is_forced and system.is_holonomic
     reasons = Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
@@ -169,7 +173,7 @@ def refuse_singular(problem: OrbitProblem):
         raise ValueError(words)
 
 
-def _check_freedom(n: int, rows: int, known: bool) -> None:
+def check_freedom(n: int, rows: int, known: bool) -> None:
     """Raise if `rows` equations leave nothing to move; `known`: they are known to be independent."""
     if rows < 2 * n:
         return
@@ -194,8 +198,13 @@ def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, 
     in_a_loop = not WATCHED.value or sum(np.size(x) for x in jax.tree.leaves(s.q)) > 1
     rtol, period = tolerance_of(rtol, s.t.dtype), numpy_of(period).asarray(period, s.t.dtype)
 
+    # With switches only the flow is a program, which searches for orbits share.
+    follow = _followed if system.in_phases and eager else _period
+    if follow is _followed:
+        s, nodes, period, rtol = jax.tree.map(jnp.asarray, (s, nodes, period, rtol))
+
     def run(rtol: Array):
-        return _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
+        return follow(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)
 
     first = run(rtol)
     if eager:
@@ -204,12 +213,18 @@ def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, 
         return first, jnp.asarray(error)
     # Only the product of the multipliers is known independently; the error is at least the tolerance of the steps.
     off = jnp.abs(jnp.linalg.det(lax.stop_gradient(first.reduced)) * jnp.exp(-lax.stop_gradient(first.log_volume)) - 1)
+    # Where there are switches, not even that.
+    off = jnp.where(jnp.isnan(off), 0.0, off)
     return first, jnp.maximum(off, LOOSER * rtol) * jnp.maximum(1.0, jnp.max(jnp.abs(lax.stop_gradient(first.reduced))))
 
 
 @compiled
-def _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, differentiable) -> Period:
-    flow, t = flow_of(model_of(system, *s), rtol, rows, in_a_loop), s.t
+def _period(*given) -> Period:
+    return _followed(*given)
+
+
+def _followed(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, differentiable) -> Period:
+    flow, t = any_flow(system, s, rtol, rows, in_a_loop), s.t
     first = flow.vector(s.q, s.v)
     scale = scale_of(first, period)
     first = flow.onto_constraints(t, first, scale)
@@ -228,8 +243,11 @@ def _period(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, 
     whole, after = jnp.eye(bases[0].shape[1], dtype=t.dtype), [*bases[1:], bases[0]]
     for basis, frame in zip(after, passed.frame):
         whole = basis.T @ frame @ whole
-    rows_of, there = orthonormal(reasons, directions(flow, reasons, t, first, scale, bases[0]), TURN / period)
+    rate = flow.rates(times, nodes, passed, period / count)[0]
+    rows_of, there = orthonormal(reasons, directions(flow, reasons, t, first, rate, scale, bases[0]), TURN / period)
     ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))
+    if passed.returns is not None:
+        ended = ended & jnp.all(passed.returns)
     multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
     matrix = scale[:, None] * (bases[0] @ whole @ bases[0].T) / scale[None]
     multipliers = jnp.where(ended, multipliers, jnp.nan)

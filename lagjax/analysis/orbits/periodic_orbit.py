@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from lagjax.analysis.orbits import shooting
-from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular, tolerance_of
+from lagjax.analysis.orbits.monodromy import tolerance_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest
+from lagjax.analysis.orbits.switching_problem import any_problem_of, refuse_unfollowed, user_system
 from lagjax.integrate import RESULTS, Report, reported
 from lagjax.jaxtools import hashable_partition, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import listed
-from lagjax.system import State, System, coordinates
+from lagjax.system import Hybrid, State, System, coordinates
 
 # A driven system may change from one period to the next by this fraction of what it does in one.
 SAME = 1e-5
@@ -31,7 +32,7 @@ class OrbitWarning(UserWarning):
 
 
 def periodic_orbit(
-    system: System,
+    system: System | Hybrid,
     start: tuple[PyTree[ArrayLike], PyTree[ArrayLike]],
     period: ArrayLike,
     params: PyTree = None,
@@ -43,6 +44,7 @@ def periodic_orbit(
     parts: int = 1,
     rtol: ArrayLike | None = None,
     most: int = shooting.MOST,
+    phase: str | int | None = None,
 ) -> PeriodicOrbit:
     """Find a motion that comes back to its start, near a guess: Newton's method on the flow.
 
@@ -55,11 +57,12 @@ def periodic_orbit(
 
     **Main arguments:**
 
-    - `system`, `params`: a `System`, with or without constraints, and its parameters.
+    - `system`, `params`: a `System`, with or without constraints and elements, or a `Hybrid`, and its parameters.
     - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. With constraints it is replaced by the nearest state
-      that satisfies them.
+      that satisfies them. Where the motion has switches (impacts, sticking), a state between two of them.
     - `period`: the approximate period, `[t]`. If the system depends on time, the period is kept, and must be a multiple
-      of that of the drive; otherwise it is found with the orbit.
+      of that of the drive; otherwise it is found with the orbit. Where there are switches it is not searched for among
+      several returns.
     - `t`: the time of the start, `[t]`, for a system that depends on it.
     - `hold`: what the orbit keeps of the guess, where orbits form a family: `"energy"` (the Jacobi integral; the
       default where it is conserved), `"period"`, or coordinates and velocities of the start by name: `"theta"`,
@@ -69,12 +72,13 @@ def periodic_orbit(
     **Other arguments:**
 
     - `turns`: the whole turns that angles make in a period, by name. By default those of the guess, rounded. (A
-      coordinate is an angle if it appears only in sines and cosines.)
+      coordinate is an angle if it appears only in sines and cosines.) Where there are switches, by default none.
     - `relative`: coordinates that need not come back, for relative periodic orbits; the system must not depend on them.
     - `parts`: into how many parts the period is divided, with unknown states at all their ends (multiple shooting); for
       orbits so unstable that a guess does not come near its start again.
     - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: the largest number of
       flows to try.
+    - `phase`: the phase of a `Hybrid` in which the orbit starts and ends, by name or number; by default the first one.
 
     **Returns:** a `PeriodicOrbit`; the best candidate where the search did not converge. Both modes differentiate `q`,
     `v`, `period` and `nodes` by `params` and by what is held.
@@ -83,15 +87,23 @@ def periodic_orbit(
 
     - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for unknown names, for quantities that cannot
       be held, and where a driven system is not the same after `period`.
+    - `ValueError`, `RuntimeError` where the motion of the guess ends early, as `lj.integrate` raises them.
     - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and `vmap` check `converged`.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4 (shooting, phase condition); Meyer & Offin, §9.
     """
     q, v = _pair(start)
-    problem = problem_of(system, State(t, q, v, params))
+    problem = any_problem_of(system, State(t, q, v, params), phase)
     s = problem.state
     dtype, names = s.t.dtype, coordinates.names(s.q)
     asked = _asked(problem, names, hold, relative)
+    if problem.system.in_phases:
+        if parts != 1:
+            raise ValueError(
+                f"parts={parts}: a motion with switches is not divided, since the parts may begin in other phases.\n"
+                "Fix: leave parts out."
+            )
+        asked = asked._replace(angles=tuple(name in (turns or {}) for name in names))
     rtol, period = tolerance_of(rtol, dtype), numpy_of(period).asarray(period, dtype)
     if not is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
         raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
@@ -187,8 +199,10 @@ def _raise_or_warn(found, period, problem):
             'Fix: period=2 * jnp.pi / params["omega"] for a drive cos(ωt), or a multiple of it.'
         )
     if not np.isfinite(float(found.evaluation.size)):
-        refuse_singular(problem)
-    if not bool(found.converged):
+        refuse_unfollowed(problem, period)
+    if not bool(found.converged) and problem.system.in_phases:
+        warnings.warn(_switching_words(found), OrbitWarning, stacklevel=3)
+    elif not bool(found.converged):
         warnings.warn(
             f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back "
             f"to {float(found.evaluation.size):.2g} of its size, with the period {float(found.candidate.period):.9g}. "
@@ -201,6 +215,26 @@ def _raise_or_warn(found, period, problem):
         )
 
 
+def _switching_words(found) -> str:
+    """Why no orbit of a motion with switches was found."""
+    evaluation, period = found.evaluation, float(found.candidate.period)
+    words = (
+        f"no periodic orbit was found near this start: after {int(found.iterations)} flows the motion comes back to "
+        f"{float(evaluation.size):.2g} of its size, with the period {period:.9g} and {int(evaluation.switches.count)} "
+        "switches in it. The best candidate is returned.\n"
+    )
+    if not bool(evaluation.returns) and float(evaluation.size) < SAME:
+        last = evaluation.switches.names[int(evaluation.switches.to[int(evaluation.switches.count) - 1])]
+        return words + (
+            f"Usual cause: it comes back in the phase '{last}', in which it did not start.\nFix: phase=\"{last}\"."
+        )
+    return words + (
+        "Usual cause: a start at a switch, such as just after an impact: whether that one is in the period, round-off "
+        "decides; a guess too far away, or with other switches than an orbit near it; a state of rest.\n"
+        "Fix: a start between two switches; traj = lj.integrate(...) from the guess shows them, and where it settles."
+    )
+
+
 def _orbit(problem, found, asked) -> PeriodicOrbit:
     s, xp = problem.state, numpy_of(found)
     if xp is np:
@@ -209,9 +243,9 @@ def _orbit(problem, found, asked) -> PeriodicOrbit:
     like = partial(coordinates.like, s.q)
     z, n = found.candidate.nodes[0], found.guess.turns.shape[0]
     shift = xp.where(np.array(asked.relative), found.evaluation.displacement[:n], xp.zeros_like(z[:n]))
-    arrays, static = hashable_partition((problem.system, coordinates.state(*s).params))
+    arrays, static = hashable_partition((user_system(problem), coordinates.state(*s).params))
     return PeriodicOrbit(
         xp.asarray(s.t), like(z[:n]), like(z[n:]), found.candidate.period, like(found.guess.turns),
         like(shift), found.evaluation.size, found.converged, found.iterations, found.candidate.nodes, arrays, static,
-        asked,
+        asked, found.evaluation.switches,
     )  # fmt: skip

@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.analysis.orbits.shooting import OrbitRequest
-from lagjax.integrate import Trajectory, integrate
+from lagjax.integrate import Switches, Trajectory, integrate
 from lagjax.jaxtools import HashablePart, is_traced
 from lagjax.mechanics import describe
-from lagjax.system import System, coordinates
+from lagjax.system import Hybrid, System, coordinates
 
 POINTS = 401
 
@@ -24,6 +24,7 @@ class PeriodicOrbit(eqx.Module):
     - `converged`: whether the residual is within the tolerance; if not, this is the best orbit that was found.
     - `iterations`: the number of steps of Newton's method.
     - `nodes` (K, 2n): the states q and v, in the order of their names, at K equal parts of the period.
+    - `switches`: the `Switches` in one period, where the system has phases or elements; else None.
 
     Under `vmap` every array has the batch's axes in front.
     """
@@ -41,9 +42,10 @@ class PeriodicOrbit(eqx.Module):
     arrays: PyTree
     static: HashablePart = eqx.field(static=True)
     asked: OrbitRequest = eqx.field(static=True)
+    switches: Switches | None = None
 
     @property
-    def system(self) -> System:
+    def system(self) -> System | Hybrid:
         return self._problem()[0]
 
     @property
@@ -87,6 +89,9 @@ class PeriodicOrbit(eqx.Module):
             (label, moved) for label, tree in (("turns", self.turns), ("shift", self.shift)) if (moved := _moved(tree))
         ]
         rows.append(("residual", f"{float(self.residual):.1e} (relative), after {int(self.iterations)} iterations"))
+        if self.switches is not None:
+            rows.append(("switches", self.switches.in_words()))
+            rows += [("", row) for row in self.switches.in_rows()]
         if not bool(self.converged):
             rows.append(("WARNING", "not converged: this is the best that was found"))
         return "\n".join(["Periodic orbit", *(f"  {label:<9}  {value}" for label, value in rows)])

@@ -33,10 +33,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.orbits.flow import Flow, flow_of, scale_of
-from lagjax.jaxtools import compiled
-from lagjax.numerics import damped_newton
-from lagjax.system import model_of
+from lagjax.analysis.orbits.flow import Flow, scale_of
+from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow, no_switches
+from lagjax.integrate import Switches
+from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.numerics import damped_newton, while_in_python
 
 TURN = 2 * np.pi
 # Points of the path in a given period, and the number of given periods searched for a better one.
@@ -76,9 +77,12 @@ class Guess(NamedTuple):
     turns: Float[Array, " n"]
 
 
-def guessed(flow: Flow, t, z, period, asked: OrbitRequest, parts: int, turns) -> Guess:
+def guessed(flow: Flow | SwitchingFlow, t, z, period, asked: OrbitRequest, parts: int, turns) -> Guess:
     """Follow a guess; `turns` (n,): the turns of the angles, or None to count those of the guess."""
     z = flow.onto_constraints(t, z, scale_of(z, period))
+    if isinstance(flow, SwitchingFlow):
+        # The rates of one phase do not lead through a period.
+        return Guess(z, z[None], period, scale_of(z, period), jnp.zeros(flow.size, z.dtype) if turns is None else turns)
     find_period = asked.free and parts == 1
     reach = REACH if find_period else 1
     path = lax.stop_gradient(flow.path(t, z, reach * period, reach * PIECES))
@@ -163,7 +167,8 @@ class OrbitEvaluation(NamedTuple):
 
     The columns of `matrix` are coordinates along the `bases`. `amplified`: the largest entry of a tangent frame.
     `displacement`: the state at the end minus that at the start. `moves`: how far the state would go in a period at its
-    initial rate, without relative coordinates.
+    initial rate, without relative coordinates. Of a motion with switches these, and whether it `returns` to the phase
+    of its start.
     """
 
     size: Float[Array, ""]
@@ -173,6 +178,8 @@ class OrbitEvaluation(NamedTuple):
     amplified: Float[Array, ""]
     displacement: Float[Array, " 2n"]
     moves: Float[Array, ""]
+    switches: Switches | None
+    returns: Bool[Array, ""] | None
 
 
 class SearchResult(NamedTuple):
@@ -208,16 +215,31 @@ class Goal(NamedTuple):
     z: Float[Array, " 2n"]
 
 
-@compiled
 def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, most) -> SearchResult:
     """Search for an orbit near a state; `turns` (n,): the turns of the angles, or None for those of the guess."""
-    flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
+    if system.in_phases and is_eager() and not is_traced((s, period)):
+        # Only the flow, which takes long to compile, is a program, which Floquet multipliers share.
+        given = jax.tree.map(jnp.asarray, (s, period, rtol))
+        return _searched(system, *given, asked, rows, parts, turns, most, while_in_python)
+    return _closed(system, s, period, rtol, asked, rows, parts, turns, most)
+
+
+@compiled
+def _closed(*given) -> SearchResult:
+    return _searched(*given, lax.while_loop)
+
+
+def _searched(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, most, loop) -> SearchResult:
+    flow, t = any_flow(system, s, rtol, rows), s.t
     guess = guessed(flow, t, flow.vector(s.q, s.v), period, asked, parts, turns)
     goal = Goal(integral_at(flow, t, guess.z), guess.z)
     zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
-    unevaluated = OrbitEvaluation(zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero)
+    returns = zero > 0 if system.in_phases else None
+    unevaluated = OrbitEvaluation(
+        zero + jnp.inf, matrix[:, 0], matrix, bases, zero + 1, guess.z, zero, no_switches(system, s), returns
+    )
 
     def unfinished(search):
         limit, damping = rtol * jnp.maximum(1.0, search.at.amplified), search.memory.damping
@@ -237,19 +259,23 @@ def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, mos
         lambda candidate: _evaluate(flow, t, candidate, asked, goal, guess),
         lambda search: _next_candidate(flow, t, search, asked, guess.scale),
         judge, unfinished, OrbitCandidate(guess.nodes, guess.period), unevaluated,
-        OrbitSearch(zero + FIRST_DAMPING, zero),
+        OrbitSearch(zero + FIRST_DAMPING, zero), loop,
     )  # fmt: skip
     converged = search.at.size <= CONVERGED_BELOW * rtol * jnp.maximum(1.0, search.at.amplified)
     if asked.moves:
         # A state of rest comes back after any time.
         converged = converged & (search.at.moves > jnp.sqrt(rtol))
-    apart = zero if asked.moves else _changed(flow, t, search.y, guess.scale)
+    if isinstance(flow, SwitchingFlow):
+        converged = converged & search.at.returns
+        apart = zero if asked.moves or loop is lax.while_loop else _changed_flow(flow, t, search, guess.scale)
+    else:
+        apart = zero if asked.moves else _changed(flow, t, search.y, guess.scale)
     return SearchResult(search.y, guess, search.at, converged, search.steps, apart)
 
 
 def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) -> SearchResult:
     """The same orbit with its derivatives by the system, parameters and held quantities, from one more Newton step."""
-    flow, t = flow_of(model_of(system, *s), rtol, rows), s.t
+    flow, t = any_flow(system, s, rtol, rows), s.t
     found = lax.stop_gradient(found)
     evaluation, scale = found.evaluation, found.guess.scale
     goal_z = flow.onto_constraints(t, flow.vector(s.q, s.v), scale)
@@ -305,16 +331,16 @@ def _evaluate(flow, t, candidate, asked, goal, guess) -> OrbitEvaluation:
         return jnp.where(finished, x, 0.0)
 
     amplified, size = clean(jnp.max(jnp.abs(passed.frame))), jnp.where(finished, size, jnp.inf)
-    return OrbitEvaluation(size, clean(residual), clean(matrix), bases, amplified, displacement, moves)
+    of_switches = jax.tree.map(lambda x: x[-1], (passed.switches, passed.returns))
+    return OrbitEvaluation(size, clean(residual), clean(matrix), bases, amplified, displacement, moves, *of_switches)
 
 
 def _equations(flow, t, candidate, passed, bases, scale, asked):
     """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves in a period."""
     count, size, k = len(candidate.nodes), 2 * flow.size, bases.shape[2]
     comes_back = _comes_back(asked, t.dtype)
-    times = _times(t, candidate)
-    both = jnp.concatenate([times, times + candidate.period / count]), jnp.concatenate([candidate.nodes, passed.z])
-    rates = jax.vmap(flow.rate)(*both) * candidate.period / scale[None]
+    rates = flow.rates(_times(t, candidate), candidate.nodes, passed, candidate.period / count)
+    rates = rates * candidate.period / scale[None]
     here, rates = rates[0], rates[count:] / count
     blocks = []
     for j in range(count):
@@ -398,3 +424,10 @@ def _changed(flow: Flow, t, candidate, scale):
     times = t + candidate.period * jnp.asarray([0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912], t.dtype)
     rate = jax.vmap(lambda t: flow.rate(t, candidate.nodes[0]) / scale)
     return jnp.max(jnp.abs(rate(times) - rate(times + candidate.period))) * candidate.period
+
+
+def _changed_flow(flow: SwitchingFlow, t, search, scale):
+    """How far apart motions from one state end that begin a period apart, in units of `scale`."""
+    candidate, evaluation = search.y, search.at
+    later = flow.passage(t + candidate.period, candidate.nodes[0], candidate.period, evaluation.bases[0], scale)
+    return jnp.max(jnp.abs(later.z - candidate.nodes[0] - evaluation.displacement) / scale)

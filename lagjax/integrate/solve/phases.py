@@ -59,6 +59,13 @@ class Reset(eqx.Module):
         at_rest = self.settle(t, q, v, params)
         return q, jtu.tree_map(lambda x, y: jnp.where(rests, x, y), at_rest, v), rests
 
+    def changes_positions(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree) -> bool:
+        """Whether the whole state is reset, not the velocities alone; found on shapes."""
+        if self.function is None:
+            return False
+        given = {"t": t, "q": q, "v": v, "multipliers": multipliers, "params": params}
+        return not _alike(jax.eval_shape(self.function, *(given[name] for name in self.takes)), v)
+
     def _reset(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], params: PyTree):
         if self.function is None:
             return q, v

@@ -198,7 +198,7 @@ def if_any(next_leg: Callable, way: Any, _: None) -> tuple[Any, None]:
 
 
 def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phase, settings: Settings):
-    dtype, many, room = ts.dtype, ts.shape[0], hybrid.most_switches
+    dtype, many = ts.dtype, ts.shape[0]
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
     met, modes = None, None
@@ -208,14 +208,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         multipliers = multipliers | phase.meeting.laws.forces(ts[0], q0, v0, phase.given(params, modes))
     of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
     rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
-    none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q0, v0), room)
-    switches = Switches(
-        t=unknown(ts[0], room), way=none, to=none, q=of_q, v=of_v, q_after=of_q, v_after=of_v, impulse=of_v,
-        count=jnp.asarray(0), uncertain=jnp.asarray(False), names=hybrid.names,
-        ways=tuple(s.phase for s in hybrid.switches) if phase.meeting is None else phase.meeting.laws.names,
-        modes=None if modes is None else jnp.zeros((room, modes.modes.size), jnp.int32),
-        kinds=() if phase.meeting is None else phase.meeting.laws.kinds,
-    )  # fmt: skip
+    switches = switches_before_any(hybrid, q0, v0, None if phase.meeting is None else phase.meeting.laws)
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
@@ -231,6 +224,19 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
         scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
         result=RESULTS.where(exists, RESULTS.successful, refused), modes=modes,
+    )  # fmt: skip
+
+
+def switches_before_any(hybrid: Hybrid, q: PyTree, v: PyTree, laws: Any = None) -> Switches:
+    """The switches of a motion before the first one; `laws`: those of elements, if there are any."""
+    room = hybrid.most_switches
+    none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q, v), room)
+    return Switches(
+        t=jnp.full(room, jnp.nan, jnp.result_type(jax.tree.leaves(of_q)[0])), way=none, to=none, q=of_q, v=of_v,
+        q_after=of_q, v_after=of_v, impulse=of_v, count=jnp.asarray(0), uncertain=jnp.asarray(False),
+        names=hybrid.names, ways=tuple(s.phase for s in hybrid.switches) if laws is None else laws.names,
+        modes=None if laws is None else jnp.zeros((room, laws.size), jnp.int32),
+        kinds=() if laws is None else laws.kinds,
     )  # fmt: skip
 
 

@@ -76,6 +76,11 @@ class Switches(eqx.Module):
         """Return the number of switches, and whether some may be missing."""
         return f"{int(self.count)}" + ("; some may be missing" if bool(self.uncertain) else "")
 
+    def in_rows(self, most: int = 6) -> list[str]:
+        """Return a row for each of the first switches."""
+        found = [row.strip() for row in self._rows()]
+        return found[:most] + (["..."] if len(found) > most else [])
+
     def _rows(self):
         times, ways, to = map(np.asarray, (self.t, self.way, self.to))
         if self.modes is not None:
@@ -194,13 +199,11 @@ class HybridTrajectory(Trajectory):
             lines = [("worst constraint residual", f"{float(self.residual()):.1e} (relative, at the outputs)")]
         else:
             lines = []
-        found = [row.strip() for row in self.switches._rows()]
-        shown = found[:6] + (["..."] if len(found) > 6 else [])
         return [
             *lines,
             self._of_phases(),
             ("switches", self.switches.in_words()),
-            *(("", row) for row in shown),
+            *(("", row) for row in self.switches.in_rows()),
             *((f"event '{name}'", found.in_words()) for name, found in self.events.items() if name != SWITCHES),
         ]
 
