@@ -21,7 +21,7 @@ its size. They are therefore removed first: M then acts on states of the same h,
 Source: Meyer & Offin, *Introduction to Hamiltonian Dynamical Systems*, §8.2-8.3 (multipliers 1 of integrals and flows).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -143,7 +143,7 @@ class OrbitProblem(NamedTuple):
     `system`: a `System`, or what `problem_with_switches` makes of a motion in phases or with elements.
     """
 
-    system: object
+    system: Any
     state: State
     reasons: Reasons
     rows: tuple[int, ...] | None

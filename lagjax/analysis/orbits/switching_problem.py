@@ -26,22 +26,22 @@ def any_problem_of(system: System | Hybrid, given: State, phase: str | int | Non
         return problem_of(system, given)
     for each in system.phases:
         check_system(each, states=False, elements=True)
-    if system.in_phases and is_traced(system.first):
+    if isinstance(system, Hybrid) and is_traced(system.first):
         raise ValueError(
             "the phase in which an orbit starts must be known while JAX is tracing, since it decides what may move.\n"
             'Fix: phase="flying", or a Python number; a loop over phases in place of vmap.'
         )
     s = coordinates.prepared(*given)
-    # A Python number is not traced.
-    system = traced_phases(system, s)
-    system = replace_fields(system, first=int(system.first))
+    hybrid: Hybrid = traced_phases(system, s)
+    # As a Python number it is known where JAX is tracing.
+    hybrid = replace_fields(hybrid, first=int(hybrid.first))
     state = coordinates.state(*s)
-    first = model_of(system.first_phase, *state)
+    first = model_of(hybrid.first_phase, *state)
     rows = independent_rows_of(first, state)
     check_freedom(first.n, len(all_rows(first) if rows is None else rows), rows is not None)
-    timeless, unseen = _invariance(system, state)
+    timeless, unseen = _invariance(hybrid, state)
     # Forces and impacts do work, so that nothing is conserved; and no coordinate is known to be an angle for guards.
-    return OrbitProblem(system, s, Reasons(timeless, False, unseen, False), rows, (False,) * first.n)
+    return OrbitProblem(hybrid, s, Reasons(timeless, False, unseen, False), rows, (False,) * first.n)
 
 
 def user_system(problem: OrbitProblem) -> System | Hybrid:

@@ -1,5 +1,7 @@
 """Orbits with switches: bouncing, sticking and slipping, walking and striking, by closed forms and SciPy."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -179,9 +181,7 @@ def test_stick_slip_with_a_stribeck_curve():
     def rate(t, y):
         return [y[1], -k * y[0] + mu + (static - mu) * np.exp(-(V - y[1]) / p["slow"])]
 
-    def sticks(t, y):
-        return y[1] - V
-
+    sticks: Any = lambda t, y: y[1] - V
     sticks.terminal, sticks.direction = True, 1
     # It starts at the end of sticking, where the acceleration is zero, too.
     slip = integrate.solve_ivp(
@@ -283,7 +283,7 @@ def test_impact_oscillator():
         end = steady(phase) + flow(period) @ (np.array([0.1, -e * speed]) - steady(phase))
         return end - [0.1, speed]
 
-    phase, speed = optimize.fsolve(left, [1.0, 2.0], xtol=1e-12)
+    phase, speed = optimize.root(left, [1.0, 2.0], tol=1e-14).x
     assert speed > 0 and np.abs(left([phase, speed])).max() < 1e-12
     after = 0.4 * period
     at = phase + after
