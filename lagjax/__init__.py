@@ -137,6 +137,28 @@ if TYPE_CHECKING:
     from lagjax.analysis.orbits import floquet, periodic_orbit
     from lagjax.analysis.symmetry import is_symmetry
 
+    # Rigid bodies.
+    from lagjax.bodies import (
+        Body,
+        Load,
+        Marker,
+        Pose,
+        applied,
+        cylindrical,
+        fixed,
+        ground,
+        motor,
+        multibody,
+        prismatic,
+        revolute,
+        rolling,
+        rolling_sphere,
+        spherical,
+        spring,
+        universal,
+        weight,
+    )
+
     # Import and export.
     from lagjax.exchange import export, from_sympy, result_codes
 
@@ -174,6 +196,10 @@ LATER = {
         "Floquet LyapunovExponents OrbitWarning PeriodicOrbit floquet lyapunov_exponents periodic_orbit"
     ),
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
+    "lagjax.bodies": (
+        "Body Load Marker Pose applied cylindrical fixed ground motor multibody prismatic revolute rolling "
+        "rolling_sphere spherical spring universal weight"
+    ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
     "lagjax.two_points": (
@@ -210,6 +236,24 @@ __all__ = [
     "Stop",
     "SampledControl",
     "Elements",
+    "Body",
+    "Pose",
+    "ground",
+    "Marker",
+    "multibody",
+    "spherical",
+    "revolute",
+    "universal",
+    "cylindrical",
+    "prismatic",
+    "fixed",
+    "rolling",
+    "rolling_sphere",
+    "Load",
+    "weight",
+    "spring",
+    "motor",
+    "applied",
     "touches",
     "releases",
     "slips",

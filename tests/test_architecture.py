@@ -20,7 +20,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own room or from those before it.
 ROOMS = (
     "jaxtools", "numerics", "display", "files", "system", "mechanics", "learned", "steps", "integrate", "exchange",
-    "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report", "mechanisms", "scenes",
+    "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report", "bodies", "mechanisms", "scenes",
     "stability",
 )  # fmt: skip
 TOP = {"__init__", "__main__", "job"}

@@ -77,5 +77,5 @@ from lagjax.jaxtools.tracing import (
     numpy_of,
     takes_for_regular,
 )
-from lagjax.jaxtools.trees import like, stop_gradient, where, without_init
+from lagjax.jaxtools.trees import decided, like, stop_gradient, where, without_init
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one

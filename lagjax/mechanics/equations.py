@@ -16,7 +16,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools import WATCHED, compiled, jitted, kept_as_call, once
+from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, once
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
@@ -203,4 +203,4 @@ def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):
 def all_finite(tree: PyTree) -> Bool[Array, ""]:
     """Whether nothing in a tree of floats is NaN or infinite."""
     # One sum instead of a reduction per leaf: zero times NaN or infinity is NaN.
-    return jnp.asarray(sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0)
+    return decided(jnp.asarray(sum(jnp.sum(0 * x) for x in jtu.tree_leaves(tree)) == 0))

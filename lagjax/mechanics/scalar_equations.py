@@ -22,7 +22,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import TooLong, is_array, is_plain
+from lagjax.jaxtools import TooLong, decided, is_array, is_plain
 from lagjax.mechanics.first_order import completed, resolved
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
@@ -89,7 +89,7 @@ def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
     a = completed(model, t, x, u, a)
     valid = solver.valid if linear.response is None else solver.valid & unique
-    return model.tree(a if diagonal else jnp.where(valid, a, jnp.nan)), multipliers
+    return model.tree(a if diagonal else jnp.where(decided(valid), a, jnp.nan)), multipliers
 
 
 def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
@@ -111,7 +111,7 @@ def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
         last_u, _ = solver.solve(no_force, -constraints.velocity_residual(model, t, x, u), refine=False)
         u = u + last_u
     near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
-    return model.tree(jnp.where(near, x, jnp.nan)), model.tree(resolved(model, t, x, u))
+    return model.tree(jnp.where(decided(near), x, jnp.nan)), model.tree(resolved(model, t, x, u))
 
 
 def _tiny(correction, y: Array) -> Array:

@@ -1,0 +1,76 @@
+"""A system of bodies: the sum of their kinetic energies, and the constraints of their joints."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import jax
+
+from lagjax.bodies.body import Body
+from lagjax.bodies.joints import named
+from lagjax.bodies.loads import Load, generalized_force
+from lagjax.system import Holonomic, Nonholonomic, System
+
+
+def multibody(
+    bodies: Iterable[Body],
+    joints: Mapping[str, Holonomic | Nonholonomic | Mapping] | None = None,
+    loads: Iterable[Load] = (),
+    lagrangian: Callable | None = None,
+    **others,
+) -> System:
+    """Return the system of some bodies, their joints and what acts on them.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> bob = lj.Body("bob", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    >>> pendulum = multibody(
+    ...     [bob], {"pivot": lj.spherical(lj.ground.at(), bob.at((0.0, 0.0, 1.0)))}, [lj.weight([bob])]
+    ... )
+    >>> pose = lj.Pose.at((0.0, 0.0, -1.0))
+    >>> force = lj.constraint_force(pendulum, 0.0, {"bob": pose}, {"bob": pose.moving()}, None)
+    >>> print(force["pivot"]["bob"].position[2].round(6))
+    9.81
+
+    **Arguments:**
+
+    - `bodies`: `lj.Body`s of different names; q and v are dicts of `lj.Pose` by these names. That their quaternions are
+      unit ones is a constraint of the system, of the body's name.
+    - `joints`: constraints by name, `lj.spherical(...)` and the like, or written by hand.
+    - `loads`: `lj.weight`, `lj.spring`, `lj.motor`, `lj.applied`.
+    - `lagrangian`: what L has besides, a function of (t, q, v, params); q may have further entries.
+    - `others`: `force`, `dissipation`, `states` and `elements` of `lj.System`.
+
+    Coordinates of a rough drawing become ones that joints allow by `lj.consistent_state`.
+
+    **Raises:** `ValueError` for two bodies or constraints of one name.
+    """
+    bodies, loads = tuple(bodies), tuple(loads)
+    units = {f"{body.name} is turned": body.unit for body in bodies}
+    joints = named(joints or {})
+    twice = {body.name for body in bodies if sum(body.name == other.name for other in bodies) > 1}
+    if twice or units.keys() & joints.keys():
+        name = sorted(twice or units.keys() & joints.keys())[0]
+        raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")
+    force, dissipation = others.pop("force", None), others.pop("dissipation", None)
+
+    def total(t, q, v, params):
+        kinetic = sum(body.kinetic(q, v, params) for body in bodies)
+        potential = sum(load.potential(t, q, v, params) for load in loads if load.potential is not None)
+        return kinetic - potential + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
+
+    def friction(t, q, v, params):
+        lost = sum(load.dissipation(t, q, v, params) for load in loads if load.dissipation is not None)
+        return lost + (0.0 if dissipation is None else dissipation(t, q, v, params))
+
+    def driven(t, q, v, params):
+        given = generalized_force(loads, t, q, v, params)
+        return given if force is None else jax.tree.map(lambda x, y: x + y, given, force(t, q, v, params))
+
+    has_dissipation = any(load.dissipation is not None for load in loads)
+    has_power = any(load.power is not None for load in loads)
+    return System(
+        total,
+        units | joints,
+        force=driven if has_power else force,
+        dissipation=friction if has_dissipation else dissipation,
+        **others,
+    )

@@ -1,0 +1,251 @@
+"""Rigid bodies, as functions of q and v to write Lagrangians and constraints with.
+
+    T = ½ m |ṙ|² + ½ Ωᵀ I Ω + ½ k (2 e·ė)²,      Ω = 2 vec(e* ė),      k = tr(I)/3
+
+r is the centre of mass, e the quaternion (`rotation.py`), I the inertia about the centre of mass along the body's axes.
+The last term vanishes with the constraint |e|² = 1. It is there so that the mass matrix is regular for all rates of e.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space
+from lagjax.system import Holonomic
+
+# By how much of their sum moments of inertia may miss the triangle inequality: those of thin plates reach it.
+ROUNDED = 1e-9
+
+
+class Pose(NamedTuple):
+    """Where a body is: its centre of mass, and the unit quaternion (w, x, y, z) that turns its axes into space's.
+
+    >>> pose = Pose.at((0.0, 0.0, 1.0), axis=(1.0, 0.0, 0.0), angle=jnp.pi)
+    >>> print(pose.quaternion.round(6))
+    [0. 1. 0. 0.]
+
+    In `v`, the same fields hold their rates; `moving` gives them for a velocity and an angular velocity.
+    """
+
+    position: Float[Array, "3"]
+    quaternion: Float[Array, "4"]
+
+    @classmethod
+    def at(cls, position: ArrayLike = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0), angle: ArrayLike = 0.0):
+        """The pose at a position, turned by an angle about an axis through it, both in space."""
+        return cls(jnp.asarray(position, float), about(axis, angle))
+
+    def turned(self, axis: ArrayLike, angle: ArrayLike) -> "Pose":
+        """The pose after a further turn about an axis of space through the centre of mass."""
+        return Pose(self.position, product(about(axis, angle), self.quaternion))
+
+    def moving(self, velocity: ArrayLike = (0.0, 0.0, 0.0), spin: ArrayLike = (0.0, 0.0, 0.0)) -> "Pose":
+        """The rates, for `v`, of a body here, by its centre's velocity and its angular velocity in space."""
+        spin = jnp.concatenate([jnp.zeros(1), jnp.asarray(spin, float)])
+        return Pose(jnp.asarray(velocity, float), product(spin, self.quaternion) / 2)
+
+
+def valued(x: ArrayLike | Callable, params: PyTree):
+    """A quantity that was given as numbers or as a function of params."""
+    return x(params) if callable(x) else x
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body in space, whose coordinates are `q[name]`, a `lj.Pose`.
+
+    >>> import lagjax as lj
+    >>> top = lj.Body("top", mass=2.0, inertia=(1.0, 1.0, 0.5))
+    >>> pose = lj.Pose.at((0.0, 0.0, 3.0))
+    >>> q, v = {"top": pose}, {"top": pose.moving(velocity=(1.0, 0.0, 0.0), spin=(0.0, 0.0, 2.0))}
+    >>> print(top.kinetic(q, v), top.point(q, (0.0, 1.0, 0.0)))
+    2.0 [0. 1. 3.]
+
+    **Arguments:** `name`, its entry in q; `mass`; `inertia` about the centre of mass, `[mass] [length]²`: the three
+    principal moments, if the body's axes are the principal ones, or the symmetric (3, 3) matrix. Both may be functions
+    of params.
+
+    **Raises:** `ValueError` for a mass or an inertia that no body has: each principal moment is at most the sum of the
+    two others.
+
+    Source: Goldstein, *Classical Mechanics*, §5.3.
+    """
+
+    name: str
+    mass: float | Callable
+    inertia: tuple | Callable
+
+    def __post_init__(self):
+        if not callable(self.inertia):
+            given = np.asarray(self.inertia, float)
+            object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
+            _check_inertia(self.name, given)
+        if not callable(self.mass) and not self.mass > 0:
+            raise ValueError(f"the mass of '{self.name}' must be positive, and is {self.mass}.")
+
+    @property
+    def unit(self) -> Holonomic:
+        """The constraint |e|² = 1 of its quaternion, which `lj.multibody` puts into the system."""
+
+        def unit_quaternion(t, q, params):
+            return (jnp.sum(self.pose(q).quaternion ** 2) - 1) / 2
+
+        return Holonomic(unit_quaternion)
+
+    def pose(self, q: PyTree) -> Pose:
+        """Where it is."""
+        return q[self.name]
+
+    def rates(self, v: PyTree) -> Pose:
+        """The rates of its pose."""
+        return v[self.name]
+
+    def point(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
+        """Where a point of the body is in space, given from the centre of mass along the body's axes."""
+        return self.pose(q).position + self.direction(q, r)
+
+    def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
+        """A vector in space that is fixed in the body."""
+        e = self.pose(q).quaternion
+        return rotation_matrix(e) @ jnp.asarray(r, e.dtype)
+
+    def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
+        """The velocity in space of a point of the body."""
+        return self.rates(v).position + jnp.cross(self.spin(q, v), self.direction(q, r))
+
+    def spin(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
+        """The angular velocity along the axes of space, `1/[t]`."""
+        return spin_in_space(self.pose(q).quaternion, self.rates(v).quaternion)
+
+    def spin_in_body(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
+        """The angular velocity along the body's axes, `1/[t]`."""
+        return spin_in_body(self.pose(q).quaternion, self.rates(v).quaternion)
+
+    def angular_momentum(self, q: PyTree, v: PyTree, params: PyTree = None) -> Float[Array, "3"]:
+        """The angular momentum about the centre of mass, in space."""
+        spin = self.spin_in_body(q, v)
+        return self.direction(q, self._inertia(params, spin.dtype) @ spin)
+
+    def kinetic(self, q: PyTree, v: PyTree, params: PyTree = None) -> Float[Array, ""]:
+        """The kinetic energy; `params` where mass or inertia are functions of them."""
+        spin = self.spin_in_body(q, v)
+        inertia = self._inertia(params, spin.dtype)
+        rates = self.rates(v)
+        growth = 2 * jnp.dot(self.pose(q).quaternion, rates.quaternion)
+        of_rotation = jnp.dot(spin, inertia @ spin) + jnp.trace(inertia) / 3 * growth**2
+        return (valued(self.mass, params) * jnp.sum(rates.position**2) + of_rotation) / 2
+
+    def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
+        """A place on the body for joints and springs: see `lj.Marker`."""
+        return Marker.on(self, point, axis)
+
+    def _inertia(self, params: PyTree, dtype) -> Float[Array, "3 3"]:
+        inertia = jnp.asarray(valued(self.inertia, params), dtype)
+        return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What does not move: joints, springs and wheels hold on to it as to a body. `lj.ground` is the one there is."""
+
+    name: str = "ground"
+
+    def pose(self, q: PyTree) -> Pose:
+        """The origin."""
+        return Pose(jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))
+
+    def rates(self, v: PyTree) -> Pose:
+        """Zero."""
+        return Pose(jnp.zeros(3), jnp.zeros(4))
+
+    def point(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
+        """The point itself."""
+        return jnp.asarray(r, float)
+
+    def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
+        """The vector itself."""
+        return jnp.asarray(r, float)
+
+    def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
+        """Zero."""
+        return jnp.zeros(3)
+
+    def spin(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
+        """Zero."""
+        return jnp.zeros(3)
+
+    def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
+        """A place in space: see `lj.Marker`."""
+        return Marker.on(self, point, axis)
+
+
+ground = Ground()
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A place on a body, with an axis: what joints join and springs pull. `body.at(point, axis)` makes one.
+
+    `point` is given from the centre of mass along the body's axes (for `lj.ground`, in space), and may be a function of
+    params; `frame` holds three unit vectors of the body, at right angles, of which the last is the axis. The first is
+    the nearest to the body's first coordinate axis, or to its second where the axis lies along the first.
+    """
+
+    body: Body | Ground
+    place: tuple[float, float, float] | Callable
+    frame: tuple[tuple[float, float, float], ...]
+
+    @classmethod
+    def on(cls, body: Body | Ground, point: ArrayLike | Callable, axis: ArrayLike) -> "Marker":
+        """A marker on a body."""
+        along = np.asarray(axis, float)
+        size = np.sqrt(np.sum(along**2))
+        if along.shape != (3,) or not size > 0:
+            raise ValueError(f"the axis of a marker on '{body.name}' must be three numbers, not all zero: {axis}.")
+        along = along / size
+        near = np.eye(3)[1 if abs(along[0]) > 0.9 else 0]
+        first = near - (near @ along) * along
+        first = first / np.sqrt(np.sum(first**2))
+        rows = np.stack([first, np.cross(along, first), along])
+        place = point if callable(point) else tuple(np.asarray(point, float).tolist())
+        if not callable(place) and len(place) != 3:
+            raise ValueError(f"a point of '{body.name}' must be three numbers, not {point}.")
+        return cls(body, place, tuple(map(tuple, rows.tolist())))
+
+    def position(self, q: PyTree, params: PyTree = None) -> Float[Array, "3"]:
+        """Where it is in space."""
+        return self.body.point(q, valued(self.place, params))
+
+    def velocity(self, q: PyTree, v: PyTree, params: PyTree = None) -> Float[Array, "3"]:
+        """Its velocity in space."""
+        return self.body.velocity(q, v, valued(self.place, params))
+
+    def axes(self, q: PyTree) -> Float[Array, "3 3"]:
+        """Its three unit vectors in space, as rows; the last one is the axis."""
+        return jnp.stack([self.body.direction(q, e) for e in self.frame])
+
+    def axis(self, q: PyTree) -> Float[Array, "3"]:
+        """Its axis in space."""
+        return self.body.direction(q, self.frame[2])
+
+
+def _check_inertia(name: str, given: np.ndarray):
+    if given.shape not in ((3,), (3, 3)) or (given.ndim == 2 and not np.allclose(given, given.T)):
+        raise ValueError(
+            f"the inertia of '{name}' must be three principal moments or a symmetric matrix (3, 3), and is "
+            f"{given.tolist()}."
+        )
+    moments = np.sort(given if given.ndim == 1 else np.linalg.eigvalsh(given))
+    if moments[0] < 0 or moments[2] > (moments[0] + moments[1]) * (1 + ROUNDED):
+        listed = ", ".join(f"{x:.6g}" for x in moments)
+        raise ValueError(
+            f"no body has the moments of inertia of '{name}', {listed}: each is at most the sum of the two others.\n"
+            "Usual cause: moments about a point that is not the centre of mass, or products of inertia with the wrong "
+            "sign.\n"
+            "Fix: inertia=(I_1, I_2, I_3) about the centre of mass."
+        )

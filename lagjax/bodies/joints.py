@@ -1,0 +1,156 @@
+"""Joints between bodies, each an ordinary constraint.
+
+A joint joins two markers: their points coincide, or their axes, or both. The multiplier of a point's row is a force
+along an axis of space; of a row of axes, a torque.
+"""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.bodies.body import Marker, valued
+from lagjax.system import Holonomic, Nonholonomic
+
+
+def spherical(a: Marker, b: Marker) -> Holonomic:
+    """Hold two points together, as a ball in its socket: three equations."""
+    _check_two(a, b)
+
+    def points_meet(t, q, params):
+        return _apart(a, b, q, params)
+
+    return Holonomic(points_meet)
+
+
+def revolute(a: Marker, b: Marker) -> Holonomic:
+    """Hold two points and two axes together, as a hinge: five equations.
+
+    >>> import lagjax as lj
+    >>> door = lj.Body("door", 20.0, (1.0, 2.0, 1.0))
+    >>> revolute(lj.ground.at((0.0, 0.0, 0.0)), door.at((0.5, 0.0, 0.0)))
+    Holonomic(hinge)
+    """
+    _check_two(a, b)
+
+    def hinge(t, q, params):
+        return jnp.concatenate([_apart(a, b, q, params), _tilt(a, b, q)])
+
+    return Holonomic(hinge)
+
+
+def universal(a: Marker, b: Marker) -> Holonomic:
+    """Hold two points together and two axes at right angles, those of the cross of a Cardan joint: four equations."""
+    _check_two(a, b)
+
+    def cross(t, q, params):
+        return jnp.concatenate([_apart(a, b, q, params), jnp.dot(a.axis(q), b.axis(q))[None]])
+
+    return Holonomic(cross)
+
+
+def cylindrical(a: Marker, b: Marker) -> Holonomic:
+    """Hold two axes together, along which and about which the bodies move: four equations."""
+    _check_two(a, b)
+
+    def same_axis(t, q, params):
+        return jnp.concatenate([a.axes(q)[:2] @ _apart(a, b, q, params), _tilt(a, b, q)])
+
+    return Holonomic(same_axis)
+
+
+def prismatic(a: Marker, b: Marker) -> Holonomic:
+    """Let a body slide along the other's axis without turning, the markers' frames alike: five equations."""
+    _check_two(a, b)
+
+    def slide(t, q, params):
+        return jnp.concatenate([a.axes(q)[:2] @ _apart(a, b, q, params), _turn(a, b, q)])
+
+    return Holonomic(slide)
+
+
+def fixed(a: Marker, b: Marker) -> Holonomic:
+    """Make two bodies one, their markers' points and frames alike: six equations."""
+    _check_two(a, b)
+
+    def one_body(t, q, params):
+        return jnp.concatenate([_apart(a, b, q, params), _turn(a, b, q)])
+
+    return Holonomic(one_body)
+
+
+def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
+    """Let the rim of a thin wheel roll on a plane without slipping: one equation for positions, two for velocities.
+
+    `wheel` is its centre and its axis, `floor` a point of the plane and the normal, `radius` a number or a function of
+    params. The rim's lowest point lies from the centre along d, the part of the normal at right angles to the axis a:
+
+        d = n - (n·a) a,      g = (c - p)·n - R |d|,      phi = (velocity of the wheel - that of the floor, there)
+
+    Not for a wheel that lies flat, where d = 0.
+
+    **Returns:** {"touches": `Holonomic`, "rolls": `Nonholonomic`}.
+
+    Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
+    """
+    return _on_plane(wheel, floor, radius, lambda n, a: n - jnp.dot(n, a) * a)
+
+
+def rolling_sphere(ball: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
+    """Let a sphere roll on a plane without slipping; `ball` is its centre, the rest as in `lj.rolling`."""
+    return _on_plane(ball, floor, radius, lambda n, a: n)
+
+
+def _on_plane(wheel: Marker, floor: Marker, radius, down) -> dict[str, Holonomic | Nonholonomic]:
+    _check_two(wheel, floor)
+
+    def arm(q: PyTree, params: PyTree) -> Array:
+        d = down(floor.axis(q), wheel.axis(q))
+        return -valued(radius, params) * d / jnp.sqrt(jnp.sum(d**2))
+
+    def touches(t, q, params):
+        return jnp.dot(wheel.position(q, params) + arm(q, params) - floor.position(q, params), floor.axis(q))
+
+    def rolls(t, q, v, params):
+        to_rim = arm(q, params)
+        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), to_rim)
+        from_floor = wheel.position(q, params) + to_rim - floor.position(q, params)
+        of_floor = floor.velocity(q, v, params) + jnp.cross(floor.body.spin(q, v), from_floor)
+        return floor.axes(q)[:2] @ (of_wheel - of_floor)
+
+    return {"touches": Holonomic(touches), "rolls": Nonholonomic(rolls)}
+
+
+def named(joints: Mapping[str, Holonomic | Nonholonomic | Mapping]) -> dict[str, Holonomic | Nonholonomic]:
+    """Joints by name, those of several parts as "wheel touches", "wheel rolls"."""
+    parts = {name: joint if isinstance(joint, Mapping) else {"": joint} for name, joint in joints.items()}
+    return {f"{name} {part}".strip(): x for name, joint in parts.items() for part, x in joint.items()}
+
+
+def _apart(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
+    return b.position(q, params) - a.position(q, params)
+
+
+def _tilt(a: Marker, b: Marker, q: PyTree) -> Float[Array, "2"]:
+    """The parts of the axis of b that are not along the axis of a."""
+    return a.axes(q)[:2] @ b.axis(q)
+
+
+def _turn(a: Marker, b: Marker, q: PyTree) -> Float[Array, "3"]:
+    """What turns the frame of a into that of b: the vector of sin(angle), where the angle is small."""
+    return jnp.sum(jnp.cross(a.axes(q), b.axes(q)), axis=0) / 2
+
+
+def _check_two(a: Marker, b: Marker):
+    for x in (a, b):
+        if not isinstance(x, Marker):
+            raise TypeError(
+                f"a joint joins two places on bodies, and {type(x).__name__} is none.\n"
+                "Fix: lj.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
+            )
+    if a.body == b.body:
+        raise ValueError(
+            f"a joint joins two bodies, and both places are on '{a.body.name}'.\n"
+            "Usual cause: a name that was copied.\n"
+            "Fix: one of the places on the other body, or on lj.ground."
+        )

@@ -1,0 +1,94 @@
+"""Springs, dampers, motors and weight: terms of L, of Rayleigh's function and of the forces.
+
+A force F on a point and a torque N on a body do the power F·v + N·Ω, which is linear in the rates of the coordinates:
+the generalized force is its derivative by these (Goldstein, §1.4, Eq. 1.49).
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
+
+from lagjax.bodies.body import Body, Marker, valued
+
+
+class Load(NamedTuple):
+    """What acts on bodies; each part a function of (t, q, v, params) or None.
+
+    `potential` is subtracted from L, `dissipation` a term of Rayleigh's function, `power` a function of
+    (t, q, w, v, params) that is linear in the rates w: the power of the forces in a motion with rates w instead of v.
+    """
+
+    potential: Callable | None = None
+    dissipation: Callable | None = None
+    power: Callable | None = None
+
+
+def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) -> Load:
+    """The weight of bodies in a uniform field `g`, `[length]/[t]²`, (3,) numbers or a function of params."""
+    bodies = tuple(bodies)
+
+    def potential(t, q, v, params):
+        centres = [body.pose(q).position for body in bodies]
+        field = jnp.asarray(valued(g, params), centres[0].dtype)
+        return -sum(valued(body.mass, params) * jnp.dot(field, r) for body, r in zip(bodies, centres))
+
+    return Load(potential)
+
+
+def spring(
+    a: Marker, b: Marker, stiffness: ArrayLike | Callable, length: ArrayLike | Callable = 0.0,
+    damping: ArrayLike | Callable = 0.0,
+) -> Load:  # fmt: skip
+    """A spring between two points, with a damper beside it.
+
+        V = ½ k (d - l)²,      R = ½ c ḋ²,      d = |b - a|
+
+    `stiffness` k, `length` l without load and `damping` c are numbers or functions of params. With l = 0 the points may
+    meet, without a damper.
+    """
+
+    def potential(t, q, v, params):
+        gap = b.position(q, params) - a.position(q, params)
+        k, squared = valued(stiffness, params), jnp.sum(gap**2)
+        if not callable(length) and length == 0:
+            return k * squared / 2
+        return k * (jnp.sqrt(squared) - valued(length, params)) ** 2 / 2
+
+    def dissipation(t, q, v, params):
+        gap = b.position(q, params) - a.position(q, params)
+        rate = jnp.dot(gap, b.velocity(q, v, params) - a.velocity(q, v, params)) / jnp.sqrt(jnp.sum(gap**2))
+        return valued(damping, params) * rate**2 / 2
+
+    damped = callable(damping) or not (jnp.ndim(damping) == 0 and damping == 0)
+    return Load(potential, dissipation if damped else None)
+
+
+def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
+    """A torque from body a on body b about the axis of a: a number, or a function of (t, q, v, params)."""
+
+    def power(t, q, w, v, params):
+        turning = torque(t, q, v, params) if callable(torque) else torque
+        return turning * jnp.dot(a.axis(q), b.body.spin(q, w) - a.body.spin(q, w))
+
+    return Load(power=power)
+
+
+def applied(at: Marker, force: ArrayLike | Callable) -> Load:
+    """A force in space on a point of a body: (3,) numbers, or a function of (t, q, v, params)."""
+
+    def power(t, q, w, v, params):
+        given = force(t, q, v, params) if callable(force) else force
+        velocity = at.velocity(q, w, params)
+        return jnp.dot(jnp.asarray(given, velocity.dtype), velocity)
+
+    return Load(power=power)
+
+
+def generalized_force(loads: Iterable[Load], t, q: PyTree, v: PyTree, params: PyTree) -> PyTree:
+    """The generalized force of loads' powers."""
+    powers = [load.power for load in loads if load.power is not None]
+    return jax.grad(lambda w: sum(power(t, q, w, v, params) for power in powers))(v)

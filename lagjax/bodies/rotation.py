@@ -1,0 +1,53 @@
+"""Rotations as unit quaternions e = (w, x, y, z), which turn a body's axes into those of space.
+
+    r_space = R(e) r_body,      Ω_space = 2 vec(ė e*),      Ω_body = 2 vec(e* ė),      ė = ½ Ω_space e = ½ e Ω_body
+
+R is written without dividing by |e|²: it is a rotation where |e| = 1, which a constraint of the body sees to, and a
+Lagrangian need be right there alone.
+
+Source: Goldstein, *Classical Mechanics*, §4.5; Diebel, *Representing Attitude* (2006), Eqs. 125, 146 and 160.
+"""
+
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+
+def product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The quaternion that turns as `b` and then as `a`."""
+    real = a[0] * b[0] - jnp.dot(a[1:], b[1:])
+    return jnp.concatenate([real[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
+
+
+def conjugate(e: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The rotation back."""
+    return jnp.concatenate([e[:1], -e[1:]])
+
+
+def rotation_matrix(e: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """R(e), whose columns are the body's axes in space."""
+    w, x, y, z = e
+    return jnp.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def spin_in_body(e: Float[Array, "4"], rate: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The angular velocity along the body's axes."""
+    return 2 * product(conjugate(e), rate)[1:]
+
+
+def spin_in_space(e: Float[Array, "4"], rate: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The angular velocity along the axes of space."""
+    return 2 * product(rate, conjugate(e))[1:]
+
+
+def about(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:
+    """The rotation by an angle about an axis of any length."""
+    axis = jnp.asarray(axis, float)
+    half = jnp.asarray(angle, float) / 2
+    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis / jnp.sqrt(jnp.sum(axis**2))])

@@ -1,0 +1,208 @@
+"""Rigid bodies and joints, against closed forms of textbooks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipj
+
+import lagjax as lj
+from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_space
+
+G = 9.81
+
+
+def angular_acceleration(body, q, a):
+    """Ω' in space: of ė e* + ... only 2 vec(ë e*) has a vector part."""
+    return spin_in_space(body.pose(q).quaternion, body.rates(a).quaternion)
+
+
+def test_rotations():
+    """R is a rotation about its axis by its angle; a product turns as both; Ω is the axis times the rate."""
+    e, f = about((0.0, 0.0, 2.0), 0.5), about((1.0, 2.0, -1.0), 1.2)
+    expected = [[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(rotation_matrix(e), expected, atol=1e-15)
+    np.testing.assert_allclose(rotation_matrix(product(e, f)), rotation_matrix(e) @ rotation_matrix(f), atol=1e-15)
+    assert np.abs(rotation_matrix(product(f, e)) - rotation_matrix(e) @ rotation_matrix(f)).max() > 0.1
+    np.testing.assert_allclose(rotation_matrix(conjugate(f)), rotation_matrix(f).T, atol=1e-15)
+    rate = jax.jvp(lambda angle: about((1.0, 2.0, -1.0), angle), (jnp.asarray(1.2),), (jnp.asarray(3.0),))[1]
+    np.testing.assert_allclose(spin_in_space(f, rate), 3.0 * np.array([1.0, 2.0, -1.0]) / np.sqrt(6.0), atol=1e-15)
+
+
+def test_poses_and_points():
+    """A turning body: velocity v + Ω × r of its points, Euler's T, one spin along both kinds of axes."""
+    body = lj.Body("b", 2.0, (1.0, 2.0, 2.5))
+    pose = lj.Pose.at((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), 0.7).turned((1.0, 0.0, 0.0), 0.4)
+    velocity, spin, r = np.array([0.1, 0.2, 0.3]), np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.2])
+    q, v = {"b": pose}, {"b": pose.moving(velocity, spin)}
+    np.testing.assert_allclose(body.spin(q, v), spin, atol=1e-15)
+    rotation = np.asarray(rotation_matrix(pose.quaternion))
+    np.testing.assert_allclose(body.spin_in_body(q, v), rotation.T @ spin, atol=1e-15)
+    np.testing.assert_allclose(body.velocity(q, v, r), velocity + np.cross(spin, rotation @ r), atol=1e-15)
+    moved = jax.jvp(lambda q: body.point(q, r), (q,), (v,))[1]
+    np.testing.assert_allclose(moved, velocity + np.cross(spin, rotation @ r), atol=1e-15)
+    inertia = rotation @ np.diag([1.0, 2.0, 2.5]) @ rotation.T
+    np.testing.assert_allclose(body.kinetic(q, v), velocity @ velocity + spin @ inertia @ spin / 2, rtol=1e-14)
+    np.testing.assert_allclose(body.angular_momentum(q, v), inertia @ spin, rtol=1e-14)
+    of_params = lj.Body("b", lambda p: p["m"], lambda p: jnp.diag(p["I"]))
+    params = {"m": 2.0, "I": jnp.array([1.0, 2.0, 2.5])}
+    np.testing.assert_allclose(of_params.kinetic(q, v, params), body.kinetic(q, v), rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_free_body():
+    """Ω of a tumbling asymmetric body by Jacobi's elliptic functions (Landau & Lifshitz, §37), and its L in space."""
+    i1, i2, i3 = moments = np.array([1.0, 2.0, 3.0])
+    start = np.array([0.6, 0.05, 0.9])
+    body = lj.Body("b", 1.0, tuple(moments))
+    pose = lj.Pose.at()
+    ts = jnp.linspace(0.0, 60.0, 61)
+    motion = lj.integrate(
+        lj.multibody([body]), {"b": pose}, {"b": pose.moving(spin=start)}, None, ts=ts, rtol=1e-11, estimate_error=False
+    )
+    energy, squared = np.sum(moments * start**2), np.sum((moments * start) ** 2)
+    assert squared > energy * i2
+    rate = np.sqrt((i3 - i2) * (squared - energy * i1) / (i1 * i2 * i3))
+    k2 = (i2 - i1) * (energy * i3 - squared) / ((i3 - i2) * (squared - energy * i1))
+    largest = np.sqrt([(energy * i3 - squared) / (i1 * (i3 - i1)), (energy * i3 - squared) / (i2 * (i3 - i2)),
+                       (squared - energy * i1) / (i3 * (i3 - i1))])  # fmt: skip
+    # The phase at the start, by Newton's method for sn.
+    phase = 0.0
+    for _ in range(20):
+        sn, cn, dn, _ = ellipj(phase, k2)
+        phase -= (sn - start[1] / largest[1]) / (cn * dn)
+    sn, cn, dn, _ = ellipj(rate * np.asarray(ts) + phase, k2)
+    exact = largest * np.stack([cn, sn, dn], axis=1)
+    spins = jax.vmap(body.spin_in_body)(motion.q, motion.v)
+    np.testing.assert_allclose(spins, exact, atol=1e-9)
+    assert np.abs(np.asarray(spins) - largest * np.stack([cn, -sn, dn], axis=1)).max() > 0.1
+    momenta = jax.vmap(body.angular_momentum)(motion.q, motion.v)
+    np.testing.assert_allclose(momenta, np.broadcast_to(moments * start, momenta.shape), atol=1e-9)
+
+
+def hinged(joint):
+    """A bar, its hinge at (0, 0, 1) of its axes, turned by 0.6 about y with a rate of 2, under its weight."""
+    bar = lj.Body("bar", 3.0, (0.5, 0.6, 0.2))
+    at, on = lj.ground.at((0.1, 0.2, 0.3), axis=(0.0, 1.0, 0.0)), bar.at((0.0, 0.0, 1.0), axis=(0.0, 1.0, 0.0))
+    system = lj.multibody([bar], {"hinge": joint(at, on)}, [lj.weight([bar])])
+    pose = lj.Pose.at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.6)
+    arm = -bar.direction({"bar": pose}, (0.0, 0.0, 1.0))
+    pose = pose._replace(position=jnp.array([0.1, 0.2, 0.3]) + arm)
+    spin = jnp.array([0.0, 2.0, 0.0])
+    return bar, system, {"bar": pose}, {"bar": pose.moving(jnp.cross(spin, arm), spin)}
+
+
+@pytest.mark.slow
+def test_a_hinge():
+    """A bar on a hinge is a physical pendulum: θ'' = -m g l sin θ/(I + m l²); the hinge carries what is left."""
+    bar, system, q, v = hinged(lj.revolute)
+    a, _ = lj.accelerations(system, 0.0, q, v, None)
+    expected = -3.0 * G * np.sin(0.6) / (0.6 + 3.0)
+    np.testing.assert_allclose(angular_acceleration(bar, q, a), [0.0, expected, 0.0], atol=1e-12)
+    # The force of the hinge on the bar, by Newton's law for its centre of mass.
+    force = lj.constraint_force(system, 0.0, q, v, None)["hinge"]["bar"].position
+    np.testing.assert_allclose(force, 3.0 * (a["bar"].position + jnp.array([0.0, 0.0, G])), atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", [lj.spherical, lj.cylindrical])
+def test_joints_of_a_plane_motion(joint):
+    """A ball joint and a sleeve leave more freedoms, which a motion in the plane does not use."""
+    bar, system, q, v = hinged(joint)
+    a, _ = lj.accelerations(system, 0.0, q, v, None)
+    np.testing.assert_allclose(angular_acceleration(bar, q, a)[1], -3.0 * G * np.sin(0.6) / 3.6, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_slide_with_a_spring_a_damper_and_a_motor():
+    """A slider on a spring: m x'' = F - k (x - l) - c x'; the same body on a hinge turns by torque over inertia."""
+    slider = lj.Body("slider", 2.0, (1.0, 1.0, 1.0))
+    along = (1.0, 0.0, 0.0)
+    rail = lj.prismatic(lj.ground.at(axis=along), slider.at(axis=along))
+    spring = lj.spring(lj.ground.at((-1.0, 0.0, 0.0)), slider.at(), stiffness=lambda p: p["k"], length=0.7, damping=0.4)
+    push = lj.applied(slider.at((0.0, 0.0, 0.1)), (3.0, 5.0, 0.0))
+    system = lj.multibody([slider], {"rail": rail}, [spring, push])
+    pose = lj.Pose.at((0.5, 0.0, 0.0))
+    a, _ = lj.accelerations(system, 0.0, {"slider": pose}, {"slider": pose.moving((0.2, 0.0, 0.0))}, {"k": 7.0})
+    np.testing.assert_allclose(a["slider"].position, [(3.0 - 7.0 * 0.8 - 0.4 * 0.2) / 2.0, 0.0, 0.0], atol=1e-12)
+    assert np.abs(a["slider"].quaternion).max() < 1e-12
+    wheel = lj.Body("slider", 2.0, (1.0, 1.0, 1.5))
+    torque = lj.motor(lj.ground.at(), wheel.at(), lambda t, q, v, p: 3.0 - wheel.spin(q, v)[2])
+    turning = lj.multibody([wheel], {"axle": lj.revolute(lj.ground.at(), wheel.at())}, [torque])
+    pose = lj.Pose.at(angle=0.3)
+    q, v = {"slider": pose}, {"slider": pose.moving(spin=(0.0, 0.0, 0.5))}
+    a, _ = lj.accelerations(turning, 0.0, q, v, None)
+    np.testing.assert_allclose(angular_acceleration(wheel, q, a), [0.0, 0.0, 2.5 / 1.5], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_rolling_down():
+    """Down a plane at an angle α a ball accelerates by 5/7, a disk by 2/3 of g sin α, and slipping by all of it."""
+    tilt, radius = 0.3, 0.4
+    normal, down = np.array([np.sin(tilt), 0.0, np.cos(tilt)]), np.array([np.cos(tilt), 0.0, -np.sin(tilt)])
+    floor = lj.ground.at((0.0, 0.0, 0.0), axis=normal)
+    for roll, inertia, share in (
+        (lj.rolling_sphere, 0.4 * radius**2 * np.ones(3), 5 / 7),
+        (lj.rolling, np.array([0.25, 0.5, 0.25]) * radius**2, 2 / 3),
+    ):
+        wheel = lj.Body("wheel", 1.0, tuple(inertia))
+        contact = roll(wheel.at(axis=(0.0, 1.0, 0.0)), floor, radius)
+        system = lj.multibody([wheel], {"wheel": contact}, [lj.weight([wheel])])
+        assert set(system.constraints) == {"wheel is turned", "wheel touches", "wheel rolls"}
+        pose = lj.Pose.at(radius * normal, (0.0, 1.0, 0.0), 1.1)
+        q, v = {"wheel": pose}, {"wheel": pose.moving(2.0 * down, (0.0, 2.0 / radius, 0.0))}
+        for residual in lj.constraint_residual(system, 0.0, q, v, None).values():
+            np.testing.assert_allclose(residual, 0.0, atol=1e-13)
+        a, _ = lj.accelerations(system, 0.0, q, v, None)
+        np.testing.assert_allclose(a["wheel"].position, share * G * np.sin(tilt) * down, atol=1e-12)
+        slipping = lj.multibody([wheel], {"wheel": contact["touches"]}, [lj.weight([wheel])])
+        a, _ = lj.accelerations(slipping, 0.0, q, v, None)
+        np.testing.assert_allclose(a["wheel"].position, G * np.sin(tilt) * down, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_cardan_joint_and_a_weld():
+    """The cross of a Cardan joint ties two shafts, tan θ2 = cos β tan θ1; a weld has no freedom left."""
+    bend = 0.5
+    tilted = (np.sin(bend), 0.0, np.cos(bend))
+    first, second = lj.Body("first", 1.0, (1.0, 1.0, 1.0)), lj.Body("second", 1.0, (1.0, 1.0, 1.0))
+    joint = lj.universal(first.at(axis=(0.0, 1.0, 0.0)), second.at(axis=(1.0, 0.0, 0.0)))
+
+    def cross(angle_1, angle_2):
+        start = lj.Pose.at(axis=(0.0, 1.0, 0.0), angle=bend)
+        q = {"first": lj.Pose.at(angle=angle_1), "second": start.turned(tilted, angle_2)}
+        return joint.g(0.0, q, None)
+
+    angle = 0.8
+    np.testing.assert_allclose(cross(angle, np.arctan(np.tan(angle) * np.cos(bend))), 0.0, atol=1e-15)
+    assert abs(cross(angle, angle)[3]) > 0.01
+    weld = lj.fixed(first.at((1.0, 0.0, 0.0)), second.at((-1.0, 0.0, 0.0)))
+    system = lj.multibody([first, second], {"weld": weld})
+    left, right = lj.Pose.at((-1.0, 0.0, 0.0)), lj.Pose.at((1.0, 0.0, 0.0))
+    q = {"first": left, "second": right}
+    spin = (0.0, 0.0, 2.0)
+    v = {"first": left.moving((0.0, -2.0, 0.0), spin), "second": right.moving((0.0, 2.0, 0.0), spin)}
+    force = lj.constraint_force(system, 0.0, q, v, None)["weld"]["first"]
+    # Each half is held on its circle of radius 1.
+    np.testing.assert_allclose(force.position, [4.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_bad_bodies_and_joints():
+    """What no body has, and joints that join nothing, are refused by name."""
+    with pytest.raises(ValueError, match="no body has the moments of inertia of 'rod', 1, 1, 3: each is at most"):
+        lj.Body("rod", 1.0, (3.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="three principal moments or a symmetric matrix"):
+        lj.Body("rod", 1.0, ((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(ValueError, match="mass of 'rod' must be positive"):
+        lj.Body("rod", 0.0, (1.0, 1.0, 1.0))
+    rod = lj.Body("rod", 1.0, (1.0, 1.0, 2.0))
+    with pytest.raises(ValueError, match="both places are on 'rod'"):
+        lj.spherical(rod.at((1.0, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))
+    with pytest.raises(TypeError, match="Body is none.\nFix: lj.spherical"):
+        lj.revolute(rod, lj.ground.at())
+    with pytest.raises(ValueError, match="axis of a marker on 'rod'"):
+        rod.at(axis=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="a point of 'rod' must be three numbers"):
+        rod.at((1.0, 0.0))
+    with pytest.raises(ValueError, match="two bodies or constraints are called 'rod'"):
+        lj.multibody([rod, lj.Body("rod", 2.0, (1.0, 1.0, 1.0))])
