@@ -27,7 +27,7 @@ def multibody(
     ... )
     >>> pose = lj.Pose.at((0.0, 0.0, -1.0))
     >>> force = lj.constraint_force(pendulum, 0.0, {"bob": pose}, {"bob": pose.moving()}, None)
-    >>> print(force["pivot"]["bob"].position[2].round(6))
+    >>> print(round(float(force["pivot"]["bob"].position[2]), 6))
     9.81
 
     **Arguments:**

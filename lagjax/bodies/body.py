@@ -151,7 +151,11 @@ class Body:
 
 @dataclass(frozen=True)
 class Ground:
-    """What does not move: joints, springs and wheels hold on to it as to a body. `lj.ground` is the one there is."""
+    """What does not move: joints, springs and wheels hold on to it as to a body. `lj.ground` is the one there is.
+
+    >>> print(Ground().at((1.0, 0.0, 0.0)).position({}))
+    [1. 0. 0.]
+    """
 
     name: str = "ground"
 
@@ -194,6 +198,12 @@ class Marker:
     `point` is given from the centre of mass along the body's axes (for `lj.ground`, in space), and may be a function of
     params; `frame` holds three unit vectors of the body, at right angles, of which the last is the axis. The first is
     the nearest to the body's first coordinate axis, or to its second where the axis lies along the first.
+
+    >>> import lagjax as lj
+    >>> rod = lj.Body("rod", 1.0, (1.0, 1.0, 0.1))
+    >>> end, q = rod.at((0.0, 0.0, 0.5)), {"rod": lj.Pose.at((2.0, 0.0, 0.0), (1.0, 0.0, 0.0), jnp.pi)}
+    >>> print(end.position(q).round(6), end.axis(q).round(6))
+    [ 2.  -0.  -0.5] [ 0. -0. -1.]
     """
 
     body: Body | Ground

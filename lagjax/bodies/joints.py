@@ -14,7 +14,19 @@ from lagjax.system import Holonomic, Nonholonomic
 
 
 def spherical(a: Marker, b: Marker) -> Holonomic:
-    """Hold two points together, as a ball in its socket: three equations."""
+    """Hold two points together, as a ball in its socket: three equations.
+
+    >>> import lagjax as lj
+    >>> bob = lj.Body("bob", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"bob": lj.Pose.at((0.1, 0.0, -1.0))}
+    >>> joint = spherical(lj.ground.at(), bob.at((0.0, 0.0, 1.0)))
+    >>> print(joint.g(0.0, q, None))
+    [0.1 0.  0. ]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     _check_two(a, b)
 
     def points_meet(t, q, params):
@@ -27,9 +39,15 @@ def revolute(a: Marker, b: Marker) -> Holonomic:
     """Hold two points and two axes together, as a hinge: five equations.
 
     >>> import lagjax as lj
-    >>> door = lj.Body("door", 20.0, (1.0, 2.0, 1.0))
-    >>> revolute(lj.ground.at((0.0, 0.0, 0.0)), door.at((0.5, 0.0, 0.0)))
-    Holonomic(hinge)
+    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"door": lj.Pose.at((-0.5, 0.0, 0.1))}
+    >>> joint = revolute(lj.ground.at(), door.at((0.5, 0.0, 0.0)))
+    >>> print(joint.g(0.0, q, None))
+    [0.  0.  0.1 0.  0. ]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
     _check_two(a, b)
 
@@ -40,7 +58,19 @@ def revolute(a: Marker, b: Marker) -> Holonomic:
 
 
 def universal(a: Marker, b: Marker) -> Holonomic:
-    """Hold two points together and two axes at right angles, those of the cross of a Cardan joint: four equations."""
+    """Hold two points together and two axes at right angles, those of the cross of a Cardan joint: four equations.
+
+    >>> import lagjax as lj
+    >>> shaft = lj.Body("shaft", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"shaft": lj.Pose.at((0.0, 0.0, 1.0))}
+    >>> joint = universal(lj.ground.at(), shaft.at((0.0, 0.0, -1.0), axis=(1.0, 0.0, 0.0)))
+    >>> print(joint.g(0.0, q, None))
+    [0. 0. 0. 0.]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     _check_two(a, b)
 
     def cross(t, q, params):
@@ -50,7 +80,19 @@ def universal(a: Marker, b: Marker) -> Holonomic:
 
 
 def cylindrical(a: Marker, b: Marker) -> Holonomic:
-    """Hold two axes together, along which and about which the bodies move: four equations."""
+    """Hold two axes together, along which and about which the bodies move: two equations for points, two for axes.
+
+    >>> import lagjax as lj
+    >>> ring = lj.Body("ring", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"ring": lj.Pose.at((0.2, 0.0, 3.0))}
+    >>> joint = cylindrical(lj.ground.at(), ring.at())
+    >>> print(joint.g(0.0, q, None))
+    [0.2 0.  0.  0. ]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     _check_two(a, b)
 
     def same_axis(t, q, params):
@@ -60,7 +102,19 @@ def cylindrical(a: Marker, b: Marker) -> Holonomic:
 
 
 def prismatic(a: Marker, b: Marker) -> Holonomic:
-    """Let a body slide along the other's axis without turning, the markers' frames alike: five equations."""
+    """Let a body slide along the other's axis without turning, the markers' frames alike: five equations.
+
+    >>> import lagjax as lj
+    >>> slider = lj.Body("slider", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"slider": lj.Pose.at((0.2, 0.0, 3.0))}
+    >>> joint = prismatic(lj.ground.at(), slider.at())
+    >>> print(joint.g(0.0, q, None))
+    [0.2 0.  0.  0.  0. ]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     _check_two(a, b)
 
     def slide(t, q, params):
@@ -70,7 +124,19 @@ def prismatic(a: Marker, b: Marker) -> Holonomic:
 
 
 def fixed(a: Marker, b: Marker) -> Holonomic:
-    """Make two bodies one, their markers' points and frames alike: six equations."""
+    """Make two bodies one, their markers' points and frames alike: six equations.
+
+    >>> import lagjax as lj
+    >>> lid = lj.Body("lid", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"lid": lj.Pose.at((0.0, 0.0, 1.0), angle=0.1)}
+    >>> joint = fixed(lj.ground.at((0.0, 0.0, 1.0)), lid.at())
+    >>> print(joint.g(0.0, q, None).round(4))
+    [0.     0.     0.     0.     0.     0.0998]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     _check_two(a, b)
 
     def one_body(t, q, params):
@@ -89,7 +155,17 @@ def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonho
 
     Not for a wheel that lies flat, where d = 0.
 
+    >>> import lagjax as lj
+    >>> wheel = lj.Body("wheel", 1.0, (1.0, 2.0, 1.0))
+    >>> upright = lj.Pose.at((0.0, 0.0, 0.5))
+    >>> q, v = {"wheel": upright}, {"wheel": upright.moving((2.0, 0.0, 0.0), spin=(0.0, 4.0, 0.0))}
+    >>> contact = rolling(wheel.at(axis=(0.0, 1.0, 0.0)), lj.ground.at(), radius=0.5)
+    >>> print(contact["touches"].g(0.0, q, None), contact["rolls"].phi(0.0, q, v, None))
+    0.0 [0. 0.]
+
     **Returns:** {"touches": `Holonomic`, "rolls": `Nonholonomic`}.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
@@ -97,7 +173,16 @@ def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonho
 
 
 def rolling_sphere(ball: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
-    """Let a sphere roll on a plane without slipping; `ball` is its centre, the rest as in `lj.rolling`."""
+    """Let a sphere roll on a plane without slipping; `ball` is its centre, the rest as in `lj.rolling`.
+
+    >>> import lagjax as lj
+    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> contact = rolling_sphere(ball.at(), lj.ground.at(), radius=1.0)
+    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
+    0.25
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
     return _on_plane(ball, floor, radius, lambda n, a: n)
 
 

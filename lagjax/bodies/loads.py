@@ -20,6 +20,9 @@ class Load(NamedTuple):
 
     `potential` is subtracted from L, `dissipation` a term of Rayleigh's function, `power` a function of
     (t, q, w, v, params) that is linear in the rates w: the power of the forces in a motion with rates w instead of v.
+
+    >>> Load(potential=lambda t, q, v, params: params["k"] * q["rod"].position[2] ** 2).power is None
+    True
     """
 
     potential: Callable | None = None
@@ -28,7 +31,15 @@ class Load(NamedTuple):
 
 
 def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) -> Load:
-    """The weight of bodies in a uniform field `g`, `[length]/[t]²`, (3,) numbers or a function of params."""
+    """The weight of bodies in a uniform field `g`, `[length]/[t]²`, (3,) numbers or a function of params.
+
+    >>> import lagjax as lj
+    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> print(weight([stone]).potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
+    58.86
+
+    **Raises:** nothing here; L's check names what is wrong with `g`.
+    """
     bodies = tuple(bodies)
 
     def potential(t, q, v, params):
@@ -49,6 +60,14 @@ def spring(
 
     `stiffness` k, `length` l without load and `damping` c are numbers or functions of params. With l = 0 the points may
     meet, without a damper.
+
+    >>> import lagjax as lj
+    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> pull = spring(lj.ground.at(), stone.at(), stiffness=lambda params: params["k"], length=1.0)
+    >>> print(pull.potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, {"k": 10.0}))
+    20.0
+
+    **Raises:** nothing here; L's check names what is wrong with the numbers.
     """
 
     def potential(t, q, v, params):
@@ -68,7 +87,16 @@ def spring(
 
 
 def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
-    """A torque from body a on body b about the axis of a: a number, or a function of (t, q, v, params)."""
+    """A torque from body a on body b about the axis of a: a number, or a function of (t, q, v, params).
+
+    >>> import lagjax as lj
+    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
+    >>> print(motor(lj.ground.at(), wheel.at(), 5.0).power(0.0, {"wheel": pose}, turning, turning, None))
+    15.0
+
+    **Raises:** nothing here; the check of forces names what is wrong with the torque.
+    """
 
     def power(t, q, w, v, params):
         turning = torque(t, q, v, params) if callable(torque) else torque
@@ -78,7 +106,17 @@ def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
 
 
 def applied(at: Marker, force: ArrayLike | Callable) -> Load:
-    """A force in space on a point of a body: (3,) numbers, or a function of (t, q, v, params)."""
+    """A force in space on a point of a body: (3,) numbers, or a function of (t, q, v, params).
+
+    >>> import lagjax as lj
+    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
+    >>> rim = wheel.at((1.0, 0.0, 0.0))
+    >>> print(applied(rim, (0.0, 2.0, 0.0)).power(0.0, {"wheel": pose}, turning, turning, None))
+    6.0
+
+    **Raises:** nothing here; the check of forces names what is wrong with the force.
+    """
 
     def power(t, q, w, v, params):
         given = force(t, q, v, params) if callable(force) else force

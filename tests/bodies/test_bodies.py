@@ -104,7 +104,7 @@ def test_a_hinge():
     np.testing.assert_allclose(force, 3.0 * (a["bar"].position + jnp.array([0.0, 0.0, G])), atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("joint", [lj.spherical, lj.cylindrical])
 def test_joints_of_a_plane_motion(joint):
     """A ball joint and a sleeve leave more freedoms, which a motion in the plane does not use."""
