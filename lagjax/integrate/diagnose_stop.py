@@ -44,7 +44,7 @@ from lagjax.mechanics import (
     indefinite_mass,
     unreachable_ahead,
 )
-from lagjax.numerics import EqualSteps, Gauss
+from lagjax.numerics import EqualSteps, Gauss, Splitting
 from lagjax.system import Model, State, coordinates
 
 # The number of steps that are examined, and the first of these, which only find their length.
@@ -55,6 +55,8 @@ SAFETY, SHORTEST, LONGEST = 0.9, 0.2, 10.0
 LIMITED, FAST = 0.3, 30.0
 # The same product for the stability of an explicit method, which ends at two to six.
 UNSTABLE = 1.5
+# The radians of an oscillation in a step of `lj.Splitting` above which it grows.
+STABLE, STABLE_OF_ORDER_2 = 3.0, 2.0
 # Velocities or accelerations grew and steps shrank by these factors; growth that is a singularity in any case.
 GREW, SHRANK, BLOWN_UP = 3.0, 0.3, (1e4, 1e6)
 # Above so many missing steps max_steps is not advised; above so many times those taken, only as the second advice.
@@ -99,6 +101,8 @@ def stopped_early(trajectory: Trajectory, settings: Settings, guards: str = "") 
     first = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
     last = State(end.t, end.q, end.v, trajectory.params)
     mass = indefinite_mass(trajectory.model, State(*first, trajectory.params), last)
+    if isinstance(settings.method, Splitting) and (found := _grows_by_steps(trajectory, settings)):
+        return _with_cause(f"{what}.", found)
     reason = None if mass and mass.crossed else explain_failure(trajectory.model, last) or unreachable_ahead(trajectory)
     if reason:
         return f"{what}: {reason}"
@@ -184,13 +188,32 @@ def _of_equal_steps(trajectory: Trajectory, settings: Settings):
             return f"a pace that is positive and finite: there it is {pace:.3g}"
     ahead = np.array([0.0, longest * pace], np.asarray(end.t).dtype)
     ts = end.t + np.sign(float(trajectory.t[-1] - end.t)) * ahead
-    newton = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else ""
+    others = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else "; or method=lj.Gauss(3)"
     for part in (2, 4, 8, 16, 32):
         shorter = replace(settings, dt0=settings.dt0 / part, repeated_up_to=np.zeros((), np.int32))
         found = trajectory.static.integrate(trajectory.system, end.q, end.v, trajectory.params, ts, None, shorter)
         if is_among(found.result, ENDED_WELL):
-            return f"dt0={longest / part:.3g}, with which a step is solved there{newton}"
-    return f"look at the motion near its end: there even a step of dt0 / 32 = {longest / 32:.3g} is not solved{newton}"
+            return f"dt0={longest / part:.3g}, with which a step is solved there{others}"
+    return f"look at the motion near its end: there even a step of dt0 / 32 = {longest / 32:.3g} is not solved{others}"
+
+
+def _grows_by_steps(trajectory: Trajectory, settings: Settings) -> tuple[str, str] | None:
+    """Why an oscillation grew under equal steps, and shorter ones; None if they were short enough for the start."""
+    assert settings.dt0 is not None and isinstance(settings.method, Splitting)
+    if trajectory.model.m:
+        return None
+    t, *y = jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v))
+    rates = np.linalg.eigvals(np.asarray(_jacobian(trajectory.model, jnp.asarray(t), y)))
+    rate = float(np.max(np.abs(np.imag(rates)), initial=0.0))
+    pace = 1.0 if settings.method.pace is None else float(settings.method.pace(t, y[0], trajectory.params))
+    most, turned = STABLE if settings.method.order > 2 else STABLE_OF_ORDER_2, float(settings.dt0) * pace * rate
+    if not turned > most:
+        return None
+    return (
+        f"steps of {float(settings.dt0) * pace:.3g}, in which the fastest oscillation at the start, of the period "
+        f"{2 * np.pi / rate:.3g}, turns by {turned:.2g} radians: above {most:g} it grows",
+        f"dt0={most / 2 / rate / pace:.2g}; or method=lj.Gauss(2, newton=True)",
+    )
 
 
 def _rounded_up(count: int):

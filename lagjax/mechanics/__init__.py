@@ -31,6 +31,7 @@ from lagjax.mechanics.structure import (
     is_autonomous,
     is_free_of_velocities,
     sees_time,
+    sees_velocities,
     structure,
     what_changes_jacobi_integral,
     what_changes_momentum,

@@ -167,12 +167,14 @@ def is_diagonal(model: Model) -> bool:
 def is_free_of_velocities(model: Model) -> bool:
     """Whether accelerations are known not to depend on the velocities."""
     return not any(
-        phase.m or with_first_order(phase).form.first_order is not None or _sees_velocities(phase)
+        phase.m or with_first_order(phase).form.first_order is not None or sees_velocities(phase)
         for phase in model.phases
     )
 
 
-def _sees_velocities(model: Model) -> bool:
+def sees_velocities(model: Model) -> bool:
+    """Whether M or F is not known to be free of velocities, constraints aside."""
+
     def equations(t: Array, q: PyTree, v: PyTree, params: PyTree) -> LinearEquation:
         return mass_and_forcing(model.of(params), t, *model.vectors(q, v))
 

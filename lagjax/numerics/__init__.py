@@ -9,7 +9,7 @@ from lagjax.numerics.methods.gauss import EqualSteps, Gauss, Tableau, tableau
 from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, Quintic, evaluations_a_step
 from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, tolerance_of_the_controller, with_tolerances
 from lagjax.numerics.methods.runge_kutta import RK4, Dopri8, ExplicitRungeKutta, Interpolation, Tsit5, in_our_form
-from lagjax.numerics.methods.splitting import Splitting, sequence
+from lagjax.numerics.methods.splitting import Splitting, lengths, sequence
 from lagjax.numerics.newton import (
     MOST,
     damped_newton,

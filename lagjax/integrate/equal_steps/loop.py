@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.integrate.equal_steps.gauss_step import GaussStep
 from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
+from lagjax.integrate.equal_steps.rattle_step import RattleStep
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
 from lagjax.integrate.settings import Settings
 from lagjax.jaxtools import one_function, where
@@ -145,6 +146,8 @@ class EquallyLong(NamedTuple):
 
 def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, differentiated: bool):
     if isinstance(method, Splitting):
+        if model.m:
+            return RattleStep.of(model, method.order, t, x, u, differentiated)
         return SplittingStep.of(model, method.order, t, x, u)
     assert isinstance(method, Gauss)
     return GaussStep(model, tableau(method.stages), method.newton, differentiated)

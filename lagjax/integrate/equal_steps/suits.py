@@ -1,6 +1,6 @@
 """Whether a system can be stepped by a method of equal steps."""
 
-from lagjax.mechanics import is_free_of_velocities, structure, with_first_order
+from lagjax.mechanics import sees_velocities, structure, with_first_order
 from lagjax.numerics import EqualSteps, Splitting
 from lagjax.system import Model
 
@@ -30,14 +30,17 @@ def is_suited(method: EqualSteps, model: Model) -> bool:
 
 
 def _check_can_be_split(model: Model):
-    """Raise unless L = T(v) - V(q), and forces do not depend on velocities."""
-    found = structure(model) if not model.m else None
+    """Raise unless L = T(v) - V(q), forces do not depend on velocities, and constraints restrict positions."""
+    found = structure(model)
     depends = "" if found is None else ", ".join(found.mass_depends_on)
-    if model.m or depends or not is_free_of_velocities(model):
-        why = "there are constraints" if model.m else f"the mass matrix depends on {depends}" if depends else "they do"
+    rolling = [f"'{residual.name}'" for residual in model.form.residuals if not residual.of_positions]
+    if rolling or depends or sees_velocities(model):
+        why = "they do"
+        if rolling or depends:
+            why = f"{', '.join(rolling)} restricts velocities" if rolling else f"the mass matrix depends on {depends}"
         raise ValueError(
-            "lj.Splitting is for L = T(v) - V(q) with a constant mass matrix and forces that do not depend on "
-            f"velocities, and {why}.\n"
-            "Usual cause: polar coordinates, joint angles, friction, a magnetic field, a rotating frame.\n"
+            "lj.Splitting is for L = T(v) - V(q) with a constant mass matrix, forces that do not depend on velocities "
+            f"and constraints on positions, and {why}.\n"
+            "Usual cause: polar coordinates, joint angles, friction, a magnetic field, a rotating frame, rolling.\n"
             "Fix: method=lj.Gauss(3), which takes any L."
         )

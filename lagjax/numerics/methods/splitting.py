@@ -4,10 +4,12 @@
     order 4, 6  Runge-Kutta-Nyström splittings with 6 and 11 kicks per step, made for F that does not depend on v
     order 8     17 steps of order 2 after each other
 
-Each is symmetric, begins and ends with a kick, whose force serves two steps. The cost is that of its kicks.
+Each is symmetric, begins and ends with a kick, whose force serves two steps. The cost is that of its kicks. With
+constraints on positions a step of order 2 is one of RATTLE, and those of higher orders are 5, 9 and 17 of these.
 
 Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313, Table 3 (orders 4 and 6); Kahan & Li, Math. Comput. 66
-(1997) 1089, s17odr8a (order 8).
+(1997) 1089, s17odr8a (order 8) and s9odr6a (order 6 with constraints); Suzuki, Phys. Lett. A 146 (1990) 319 (order 4
+with constraints).
 """
 
 from collections.abc import Callable
@@ -33,7 +35,12 @@ DRIFTS = {
         0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075, 0.357208872795928
     ),
 }  # fmt: skip
-STEPS = (
+# The first lengths of steps of order 2 after each other.
+SIX = (
+    0.39216144400731413927925056, 0.33259913678935943859974864, -0.70624617255763935980996482,
+    0.08221359629355080023149045,
+)  # fmt: skip
+EIGHT = (
     0.13020248308889008087881763, 0.56116298177510838456196441, -0.38947496264484728640807860,
     0.15884190655515560089621075, -0.39590389413323757733623154, 0.18453964097831570709183254,
     0.25837438768632204729397911, 0.29501172360931029887096624,
@@ -42,7 +49,8 @@ ORDERS = 2, 4, 6, 8
 
 
 class Splitting(EqualSteps):
-    """An explicit symplectic method of order 2, 4, 6 or 8, for L = T(v) - V(q) with a constant mass matrix.
+    """An explicit symplectic method of order 2, 4, 6 or 8, for L = T(v) - V(q) with a constant mass matrix, also with
+    constraints on positions.
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
@@ -54,11 +62,15 @@ class Splitting(EqualSteps):
     True
 
     It keeps the energy to about the error of one step, however long the motion is, and momenta of linear symmetries to
-    round-off. `dt0` is the length of its steps, as for `lj.Gauss`. Forces may depend on time.
+    round-off. `dt0` is the length of its steps, as for `lj.Gauss`. Forces and
+    constraints may depend on time. With constraints a step consists of steps of RATTLE; they hold at the ends of all
+    steps to round-off, and may depend on each other.
 
-    **Arguments:** `order`: 2, 4, 6 or 8, with 1, 6, 11 or 17 forces per step; `pace`: as for `lj.Gauss`.
+    **Arguments:** `order`: 2, 4, 6 or 8, with 1, 6, 11 or 17 forces per step, and with constraints 1, 5, 9 or 17;
+    `pace`: as for `lj.Gauss`.
 
-    Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313; Kahan & Li, Math. Comput. 66 (1997) 1089.
+    Source: Blanes & Moan, J. Comput. Appl. Math. 142 (2002) 313; Kahan & Li, Math. Comput. 66 (1997) 1089; Andersen,
+    J. Comput. Phys. 52 (1983) 24 (RATTLE).
     """
 
     order: int = eqx.field(static=True, default=4)
@@ -85,6 +97,17 @@ class Sequence(NamedTuple):
     drifts: np.ndarray
 
 
+def lengths(order: int) -> np.ndarray:
+    """The lengths of symmetric steps of order 2, as parts of a step, that are of this order after each other.
+
+    >>> [len(lengths(order)) for order in ORDERS], abs(float((lengths(6) ** 3).sum())) < 1e-15
+    ([1, 5, 9, 17], True)
+    """
+    suzuki = 1 / (4 - 4 ** (1 / 3))
+    first = {2: (), 4: (suzuki, suzuki), 6: SIX, 8: EIGHT}[order]
+    return np.array([*first, 1 - 2 * sum(first), *first[::-1]])
+
+
 def sequence(order: int) -> Sequence:
     """The kicks and drifts of a step.
 
@@ -92,7 +115,7 @@ def sequence(order: int) -> Sequence:
     [(2, 1.0, 1.0), (7, 1.0, 1.0), (12, 1.0, 1.0), (18, 1.0, 1.0)]
     """
     if order == 8:
-        drifts = np.array([*STEPS, 1 - 2 * sum(STEPS), *STEPS[::-1]])
+        drifts = lengths(8)
         return Sequence((np.append(0.0, drifts) + np.append(drifts, 0.0)) / 2, drifts)
     kicks, drifts = KICKS[order], DRIFTS[order]
     if len(kicks) > len(drifts):
