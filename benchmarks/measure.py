@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-PACKAGES = ("lagjax", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "casadi", "scikit-sundae", "mujoco")
+PACKAGES = ("lagjax", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "casadi", "scikit-sundae", "mujoco", "rebound")
 
 ROOT = Path(__file__).parent.parent
 # The clock of `in_turn`; `main` changes it for `--processor-time`.
@@ -117,11 +117,12 @@ def main(rows, doc, draw=None):
     for line in rows(lambda what: options.only.lower() in what.lower()):
         found.append(line)
         print(written(line), flush=True)
+        if options.json:
+            # After each row: an interrupted run keeps what it has.
+            result = {"machine": machine(), "clock": clock, "versions": versions(), "rows": found}
+            Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
     if not found:
         parser.error(f"no row's name contains {options.only!r}")
-    if options.json:
-        result = {"machine": machine(), "clock": clock, "versions": versions(), "rows": found}
-        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
     if draw and options.plot:
         draw(options.plot)
 

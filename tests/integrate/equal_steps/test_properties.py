@@ -1,0 +1,108 @@
+"""What steps of equal length keep: symplecticity, orders, and derivatives through many of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import lagjax as lj
+from lagjax.integrate.equal_steps import loop
+from lagjax.numerics import tableau
+from tests.integrate.equal_steps.test_equal_steps import TURN, ellipse, kepler, of_momenta
+
+# Steps that are too long for the tolerance are meant.
+pytestmark = pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+
+
+def departs(change, x0):
+    """‖DᵀJD - J‖, with D the derivative of a change of (q, p)."""
+    D = np.asarray(jax.jit(jax.jacfwd(change))(x0))
+    return np.max(np.abs(D.T @ J @ D - J))
+
+
+def motion(system, start, params, ts, method, dt):
+    """A motion whose program serves all lengths of steps."""
+    options = {"method": method, "dt0": jnp.asarray(dt), "estimate_error": False}
+    return lj.integrate(system, *start, params, ts=np.asarray(ts), **options)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("order", [2, 4, 6, 8])
+def test_splitting_is_symplectic(order):
+    """One step and sixty of an ellipse."""
+    for span in (0.1, 6.0):
+        change = lambda x: of_momenta(x, kepler, 1.0, lj.Splitting(order), span)
+        assert departs(change, jnp.concatenate(ellipse(0.3))) < 1e-12
+
+
+def slope(system, start, params, ts, method, steps, exact):
+    """The order, from the error in positions with so many steps per unit of time."""
+    found = [motion(system, start, params, ts, method, 1 / n).q for n in steps]
+    leaves = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+    errors = [np.linalg.norm(leaves(q) - leaves(exact)) for q in found]
+    return -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+
+
+# A pendulum.
+SWING = lj.System(lambda t, q, v, k: 0.5 * v**2 + k * jnp.cos(q))
+SPAN = np.linspace(0.0, 6.0, 7)
+
+
+def swing_by_scipy():
+    """Its motion by the textbook's equation."""
+    rates = lambda t, y: [y[1], -np.sin(y[0])]
+    return solve_ivp(rates, (0, 6), [1.0, 0.5], "DOP853", SPAN, rtol=2.5e-14, atol=1e-15).y[0]
+
+
+@pytest.mark.slow
+def test_a_wrong_order_is_seen_on_a_pendulum(monkeypatch):
+    """Order 4 of Gauss(2). Failing twin: nodes that are a little off, by which it would still be symplectic."""
+    exact, steps = swing_by_scipy(), (4, 6, 8)
+    right = slope(SWING, (1.0, 0.5), 1.0, SPAN, lj.Gauss(2), steps, exact)
+    off = tableau(2)._replace(mixed=tableau(2).mixed + np.array([[0.0, 0.05], [-0.05, 0.0]]))
+    monkeypatch.setattr(loop, "tableau", lambda stages: off)
+    method = dataclasses.replace(lj.Gauss(2), newton=True)
+    wrong = slope(SWING, (1.0, 0.5), 1.0, SPAN, method, steps, exact)
+    assert abs(right - 4) < 0.35 < abs(wrong - 4)
+
+
+@pytest.mark.exhaustive
+def test_orders_on_a_knife_edge():
+    """A knife edge on a slope: with v = (a/ω) sin ωt along it, its path is a cycloid (Neimark & Fufaev)."""
+    edge = lj.System(
+        lambda t, q, v, a: 0.5 * jnp.sum(v**2) + a * q[0],
+        constraints={"edge": lj.Nonholonomic(lambda t, q, v, a: jnp.sin(q[2]) * v[0] - jnp.cos(q[2]) * v[1])},
+    )
+    a, w, ts = 1.5, 2.0, np.linspace(0.0, 4.0, 5)
+    exact = np.stack(
+        [a / (2 * w**2) * np.sin(w * ts) ** 2, a / (2 * w**2) * (w * ts - np.sin(2 * w * ts) / 2), w * ts], 1
+    )
+    start = np.zeros(3), np.array([0.0, 0.0, w])
+    for stages, steps in {1: (20, 30, 40), 2: (6, 8, 12), 3: (4, 5, 6)}.items():
+        found = slope(edge, start, a, ts, lj.Gauss(stages), steps, exact)
+        assert abs(found - 2 * stages) < 0.35, (stages, found)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_through_a_hundred_thousand_steps():
+    """d(end)/d(sun) in both modes to 1e-8; reverse mode's memory is that of outputs and of some steps, not of all.
+
+    The sun is in thirty parts: with up to 24 numbers reverse mode would push tangents forward.
+    """
+    parts = lj.System(lambda t, q, v, k: 0.5 * jnp.sum(v**2) + jnp.sum(k) / jnp.sqrt(jnp.sum(q**2)))
+    sun, more, sizes = jnp.full(30, 1 / 30), jnp.arange(30.0), []
+
+    def end(k, steps):
+        span = np.linspace(0.0, steps * TURN / 200, 11)
+        return motion(parts, ellipse(0.6), k, span, lj.Gauss(2), TURN / 200).q[-1, 0]
+
+    for steps in (1000, 100_000):
+        reverse = jax.jit(jax.grad(lambda k: end(k, steps))).lower(sun).compile()
+        sizes.append(reverse.memory_analysis().temp_size_in_bytes)
+    forward = jax.jit(lambda k: jax.jvp(lambda k: end(k, 100_000), (k,), (more,))[1])(sun)
+    np.testing.assert_allclose(reverse(sun) @ more, forward, rtol=1e-8)
+    assert sizes[1] < 2 * sizes[0] and sizes[1] < 2**23
