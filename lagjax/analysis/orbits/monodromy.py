@@ -140,7 +140,7 @@ class Period(NamedTuple):
 class OrbitProblem(NamedTuple):
     """A checked system and its state, and what its programs show; all but these two are static.
 
-    `system`: a `System`, or what `problem_with_switches` makes of a motion in phases or with elements.
+    `system`: a `System`, or what `any_problem_of` makes of a motion in phases or with elements.
     """
 
     system: Any
@@ -201,7 +201,8 @@ def period_of(problem: OrbitProblem, period, rtol, nodes=None) -> tuple[Period, 
     # With switches only the flow is a program, which searches for orbits share.
     follow = _followed if system.in_phases and eager else _period
     if follow is _followed:
-        s, nodes, period, rtol = jax.tree.map(jnp.asarray, (s, nodes, period, rtol))
+        s, period, rtol = coordinates.state(*s), jnp.asarray(period), jnp.asarray(rtol)
+        nodes = None if nodes is None else jnp.asarray(nodes)
 
     def run(rtol: Array):
         return follow(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop, not eager)

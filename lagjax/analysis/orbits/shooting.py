@@ -38,6 +38,7 @@ from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow, no_sw
 from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.numerics import damped_newton, while_in_python
+from lagjax.system import coordinates
 
 TURN = 2 * np.pi
 # Points of the path in a given period, and the number of given periods searched for a better one.
@@ -219,7 +220,7 @@ def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, mos
     """Search for an orbit near a state; `turns` (n,): the turns of the angles, or None for those of the guess."""
     if system.in_phases and is_eager() and not is_traced((s, period)):
         # Only the flow, which takes long to compile, is a program, which Floquet multipliers share.
-        given = jax.tree.map(jnp.asarray, (s, period, rtol))
+        given = coordinates.state(*s), jnp.asarray(period), jnp.asarray(rtol)
         return _searched(system, *given, asked, rows, parts, turns, most, while_in_python)
     return _closed(system, s, period, rtol, asked, rows, parts, turns, most)
 
