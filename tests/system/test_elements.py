@@ -101,4 +101,6 @@ def test_bad_systems():
         lj.integrate(lifted, {"x": 1.0, "lift": 0.0}, {"x": 0.0}, ts=[0.0, 1.0])
     with pytest.raises(TypeError, match="(?s)'brake', 'floor'.*lj.integrate takes elements"):
         lj.accelerations(rubbed, 0.0, 0.0, 0.0, None)
+    with pytest.raises(ValueError, match="(?s)modes in which a motion with elements starts follow from q0.*Fix: leave"):
+        lj.integrate(rubbed, 0.0, 0.0, ts=[0.0, 1.0], start="floor")
     assert repr(rubbed) == "System(lagrangian; elements: brake (Friction), floor (Contact))"

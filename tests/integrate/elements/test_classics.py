@@ -116,6 +116,40 @@ def blocks(count: int) -> lj.System:
 
 
 @pytest.mark.exhaustive
+def test_an_oblique_impact_of_two_discs():
+    """Their impulses are m (1 + e) γ/2 along the line of centres, and across it μ of that, or m s/6 where that stops
+    the sliding. Twin: for one coefficient they slide through the impact, for the other they do not."""
+    m, radius, e = 1.3, 0.1, 0.7
+    inertia = 0.5 * m * radius**2
+
+    def across(q):
+        line = q["x"][1] - q["x"][0]
+        return jnp.sqrt(jnp.sum(line**2)), jnp.stack([-line[1], line[0]]) / jnp.sqrt(jnp.sum(line**2))
+
+    def sliding(t, q, v, mu):
+        return (v["x"][1] - v["x"][0]) @ across(q)[1] - radius * jnp.sum(v["phi"])
+
+    gap = lambda t, q, mu: across(q)[0] - 2 * radius
+    discs = lj.System(
+        lambda t, q, v, mu: 0.5 * m * jnp.sum(v["x"] ** 2) + 0.5 * inertia * jnp.sum(v["phi"] ** 2),
+        elements={"discs": lj.Contact(gap, restitution=e, friction=lambda mu: mu, sliding=sliding)},
+    )
+    x, v, spin = np.array([[0.0, 0.0], [1.0, radius]]), np.array([[2.0, 0.3], [0.0, 0.3]]), np.array([-30.0, 2.0])
+    line, along = np.array([np.sqrt(3) / 2, 0.5]), np.array([-0.5, np.sqrt(3) / 2])
+    closing, s, slid = -(v[1] - v[0]) @ line, (v[1] - v[0]) @ along - radius * spin.sum(), []
+    for mu in (0.2, 3.0):
+        start = {"x": x, "phi": np.zeros(2)}, {"x": v, "phi": spin}
+        traj = moved(discs, *start, jnp.asarray(mu), ts=jnp.array([0.0, 1.0]))
+        normal = m * (1 + e) * closing / 2
+        tangential = -np.clip(m * s / 6, -mu * normal, mu * normal)
+        impulse = normal * line + tangential * along
+        np.testing.assert_allclose(traj.v["x"][-1], [v[0] - impulse / m, v[1] + impulse / m], atol=1e-12)
+        np.testing.assert_allclose(traj.v["phi"][-1], spin - radius * tangential / inertia, atol=1e-11)
+        slid.append(abs(tangential) < abs(m * s / 6))
+    assert slid == [True, False]
+
+
+@pytest.mark.exhaustive
 def test_a_block_on_a_moving_block():
     """The upper block slides on the lower one until both have one speed, and then they stop together, or go on where
     the floor is smooth. Twin: with another mass they meet elsewhere."""

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 import lagjax as lj
 from lagjax.integrate.elements.complementarity import ContactProblem, solved
@@ -151,3 +151,63 @@ def test_a_sphere_with_spin():
     np.testing.assert_allclose(after[1], [*(v0[:2] - mu * 1.5 * down * side), 0.5 * down], atol=1e-12)
     np.testing.assert_allclose(after[2], [*(v0[:2] - 2 / 7 * s0), 0.5 * down], atol=1e-12)
     assert np.linalg.norm(v[3, 2] - v[0, 2]) > 0.5
+
+
+def slid(system, speed, mu) -> lj.HybridTrajectory:
+    """A body that moves at the origin, from t = 0 to 3."""
+    ts = jnp.array([0.0, 3.0])
+    at = jnp.zeros(speed.size)
+    traj = lj.integrate(system, at, speed, mu, ts=ts, rtol=1e-11, estimate_error=False)
+    assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
+    return traj
+
+
+@pytest.mark.exhaustive
+def test_stribeck_in_a_plane():
+    """With μ that falls with the speed it stops where quadrature says, v dv/μ(v) g. Twin: another μ, another place."""
+    falls = lambda speed, mu: mu * (0.6 + 0.4 * jnp.exp(-speed))
+    floor = lj.Friction(lambda t, q, v, mu: v, falls, normal=G)
+    system = lj.System(lambda t, q, v, mu: 0.5 * jnp.sum(v**2), elements={"floor": floor})
+    way, _ = quad(lambda u: u / (0.4 * (0.6 + 0.4 * np.exp(-u)) * G), 0, 2.5, epsabs=1e-13)
+    found = [slid(system, jnp.array([2.0, 1.5]), jnp.asarray(mu)).q[-1] for mu in (0.4, 0.41)]
+    np.testing.assert_allclose(found[0], way * np.array([0.8, 0.6]), atol=1e-11)
+    assert np.linalg.norm(found[1] - found[0]) > 1e-3
+
+
+@pytest.mark.exhaustive
+def test_static_friction_in_a_plane():
+    """At rest on a tilt it stays below the static coefficient; above it slides by the kinetic one. Twin: both tilts."""
+    tilt = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - G * p * q[1]
+    floor = lj.Friction(lambda t, q, v, p: v, 0.4, normal=G, static=0.5)
+    system = lj.System(tilt, elements={"floor": floor})
+    stays, goes = (slid(system, jnp.zeros(2), jnp.asarray(tan)) for tan in (0.45, 0.55))
+    assert not np.any(stays.q[-1])
+    np.testing.assert_allclose(goes.q[-1], [0.0, -0.5 * 0.15 * G * 9.0], atol=1e-7)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.optimised
+def test_a_spring_presses_in_a_plane():
+    """On a spring in equilibrium it stops after v²/2 μ g. Twin: another μ, another place."""
+    mat = lj.CompliantContact(
+        lambda t, q, mu: q[2] - M * G / 1e3, 1e3, friction=lambda mu: mu, sliding=lambda t, q, v, mu: v[:2]
+    )
+    system = lj.System(lambda t, q, v, mu: 0.5 * M * jnp.sum(v**2) - M * G * q[2], elements={"mat": mat})
+    found = [slid(system, jnp.array([1.2, 1.6, 0.0]), jnp.asarray(mu)).q[-1] for mu in (0.3, 0.31)]
+    np.testing.assert_allclose(found[0], 4.0 / (2 * 0.3 * G) * np.array([0.6, 0.8, 0.0]), atol=1e-11)
+    assert np.linalg.norm(found[1] - found[0]) > 1e-3
+
+
+@pytest.mark.exhaustive
+def test_float32_in_a_plane():
+    """In float32 it stops where it does in float64, within that precision. Twin: another μ, another place."""
+    place, _ = by_scipy([2.0, 1.5], 0.4, 0.2, 3.0)
+    half = lambda x: jnp.asarray(x, jnp.float32)
+    system, start, ts = on_a_tilt(), (half([0.0, 0.0]), half([2.0, 1.5])), half([0.0, 3.0])
+    found = [
+        lj.integrate(system, *start, {"mu": half(mu), "tan": half(0.2)}, ts=ts, estimate_error=False)
+        for mu in (0.4, 0.41)
+    ]
+    assert all(traj.q.dtype == np.float32 for traj in found)
+    np.testing.assert_allclose(found[0].q[-1], place, atol=2e-5)
+    assert np.linalg.norm(found[1].q[-1] - found[0].q[-1]) > 1e-3
