@@ -186,19 +186,6 @@ def test_static_friction_in_a_plane():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.optimised
-def test_a_spring_presses_in_a_plane():
-    """On a spring in equilibrium it stops after v²/2 μ g. Twin: another μ, another place."""
-    mat = lj.CompliantContact(
-        lambda t, q, mu: q[2] - M * G / 1e3, 1e3, friction=lambda mu: mu, sliding=lambda t, q, v, mu: v[:2]
-    )
-    system = lj.System(lambda t, q, v, mu: 0.5 * M * jnp.sum(v**2) - M * G * q[2], elements={"mat": mat})
-    found = [slid(system, jnp.array([1.2, 1.6, 0.0]), jnp.asarray(mu)).q[-1] for mu in (0.3, 0.31)]
-    np.testing.assert_allclose(found[0], 4.0 / (2 * 0.3 * G) * np.array([0.6, 0.8, 0.0]), atol=1e-11)
-    assert np.linalg.norm(found[1] - found[0]) > 1e-3
-
-
-@pytest.mark.exhaustive
 def test_float32_in_a_plane():
     """In float32 it stops where it does in float64, within that precision. Twin: another μ, another place."""
     place, _ = by_scipy([2.0, 1.5], 0.4, 0.2, 3.0)
