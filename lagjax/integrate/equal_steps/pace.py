@@ -12,7 +12,7 @@ dt0, and dσ/dt = d(log σ)/ds. The logarithm keeps ρ positive, and its error i
 
 Outputs do not change the steps: each is the end of one more step, from the last state before it.
 
-Source: Hairer & Söderlind, SIAM J. Sci. Comput. 26 (2005) 1838, Eq. (11)-(13) (with 1/ρ in place of log ρ).
+Source: Hairer & Söderlind, SIAM J. Sci. Comput. 26 (2005) 1838 (with 1/ρ in place of log ρ).
 """
 
 from collections.abc import Callable

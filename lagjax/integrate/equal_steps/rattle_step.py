@@ -11,8 +11,8 @@ It is symmetric and, on the constraints, symplectic, of order 2; steps of the le
 x1, and is h/2 times the multiplier there. Of constraints that depend on each other a largest independent set is kept in
 each step, chosen at its start: the others then hold as well.
 
-Source: Andersen, J. Comput. Phys. 52 (1983) 24; Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VII.1.4,
-Eq. (1.26); Leimkuhler & Skeel, J. Comput. Phys. 112 (1994) 117 (symplecticity).
+Source: Andersen, J. Comput. Phys. 52 (1983) 24; Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §VII.1.4;
+Leimkuhler & Skeel, J. Comput. Phys. 112 (1994) 117 (symplecticity).
 """
 
 from typing import NamedTuple

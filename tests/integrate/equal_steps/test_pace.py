@@ -32,7 +32,7 @@ def ellipse(e):
 def on_ellipse(e, ts):
     """Positions by Kepler's equation, M = E - e sin E, solved by halving: E lies within e of M."""
     M = np.mod(ts + np.pi, TURN) - np.pi
-    low, high = M - e, M + e
+    E, low, high = M, M - e, M + e
     for _ in range(60):
         E = (low + high) / 2
         late = E - e * np.sin(E) > M
