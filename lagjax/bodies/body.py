@@ -8,7 +8,7 @@ The last term vanishes with the constraint |e|² = 1. It is there so that the ma
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +50,7 @@ class Pose(NamedTuple):
         return Pose(jnp.asarray(velocity, float), product(spin, self.quaternion) / 2)
 
 
-def valued(x: ArrayLike | Callable, params: PyTree):
+def valued(x: ArrayLike | Callable, params: PyTree) -> Any:
     """A quantity that was given as numbers or as a function of params."""
     return x(params) if callable(x) else x
 
