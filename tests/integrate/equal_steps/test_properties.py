@@ -1,4 +1,4 @@
-"""What steps of equal length keep: symplecticity, orders, and derivatives through many of them."""
+"""What steps of equal length keep: symplecticity, the way back, orders, and derivatives through many of them."""
 
 import dataclasses
 
@@ -11,7 +11,10 @@ from scipy.integrate import solve_ivp
 import lagjax as lj
 from lagjax.integrate.equal_steps import loop
 from lagjax.numerics import tableau
+from lagjax.scenes import cross_rails
+from tests.behaviour.test_orders import ROD_SWING
 from tests.integrate.equal_steps.test_equal_steps import TURN, ellipse, kepler, of_momenta
+from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods
 
 # Steps that are too long for the tolerance are meant.
 pytestmark = pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
@@ -30,6 +33,21 @@ def motion(system, start, params, ts, method, dt):
     return lj.integrate(system, *start, params, ts=np.asarray(ts), **options)
 
 
+def at_swing():
+    """The double pendulum's start as (q, p)."""
+    q0, v0 = DOUBLE_SWING
+    return jnp.concatenate([q0, jax.grad(lambda v: double_pendulum.lagrangian(0.0, q0, v, DOUBLE_PARAMS))(v0)])
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("stages", [2, 3, 4])
+def test_gauss_is_symplectic(stages):
+    """One step and thirty of a double pendulum by angles. Twin: `test_equal_steps.test_steps_are_symplectic`."""
+    for span in (0.1, 3.0):
+        change = lambda x: of_momenta(x, double_pendulum, DOUBLE_PARAMS, lj.Gauss(stages), span)
+        assert departs(change, at_swing()) < 1e-12
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_splitting_is_symplectic(order):
@@ -37,6 +55,23 @@ def test_splitting_is_symplectic(order):
     for span in (0.1, 6.0):
         change = lambda x: of_momenta(x, kepler, 1.0, lj.Splitting(order), span)
         assert departs(change, jnp.concatenate(ellipse(0.3))) < 1e-12
+
+
+def way_back(system, start, params, method):
+    """How far the start is, after a hundred steps, the velocities turned round, and a hundred steps."""
+    there = motion(system, start, params, [0.0, 2.0], method, 0.02).end
+    back = motion(system, (there.q, jax.tree.map(jnp.negative, there.v)), params, [0.0, 2.0], method, 0.02).end
+    return max(float(np.max(np.abs(a - b))) for a, b in zip(jax.tree.leaves(back.q), jax.tree.leaves(start[0])))
+
+
+@pytest.mark.exhaustive
+def test_the_way_back():
+    """A motion returns to its start, by angles, by rods, on an ellipse. Twin: with friction it does not."""
+    assert way_back(double_pendulum, DOUBLE_SWING, DOUBLE_PARAMS, lj.Gauss(3)) < 1e-11
+    assert way_back(double_rods, ROD_SWING, DOUBLE_PARAMS, lj.Gauss(3)) < 1e-11
+    assert way_back(kepler, ellipse(0.6), 1.0, lj.Splitting(6)) < 1e-11
+    braked = lj.System(kepler.lagrangian, dissipation=lambda t, q, v, params: 0.01 * jnp.sum(v**2))
+    assert way_back(braked, ellipse(0.6), 1.0, lj.Gauss(3)) > 1e-3
 
 
 def slope(system, start, params, ts, method, steps, exact):
@@ -68,6 +103,18 @@ def test_a_wrong_order_is_seen_on_a_pendulum(monkeypatch):
     method = dataclasses.replace(lj.Gauss(2), newton=True)
     wrong = slope(SWING, (1.0, 0.5), 1.0, SPAN, method, steps, exact)
     assert abs(right - 4) < 0.35 < abs(wrong - 4)
+
+
+@pytest.mark.exhaustive
+def test_orders_on_cross_rails():
+    """The carriage in the laboratory, where L depends on time, against its closed form."""
+    params, ts = cross_rails.PARAMS, np.linspace(0.0, 4.0, 5)
+    rotating = jax.vmap(lambda t: cross_rails.exact_motion(params, cross_rails.Q0, cross_rails.V0, t))(ts)
+    exact = jax.vmap(lambda t, q, v: cross_rails.to_lab(params, t, q, v)[0])(ts, *rotating)
+    start = cross_rails.to_lab(params, 0.0, cross_rails.Q0, cross_rails.V0)
+    for stages, steps in {2: (20, 30, 40), 3: (8, 12, 16), 4: (6, 8, 10)}.items():
+        found = slope(cross_rails.lab_system, start, params, ts, lj.Gauss(stages), steps, exact)
+        assert abs(found - 2 * stages) < 0.35, (stages, found)
 
 
 @pytest.mark.exhaustive
