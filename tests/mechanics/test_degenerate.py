@@ -135,7 +135,9 @@ def test_a_triangle_and_leapfrogging_pairs():
         )  # fmt: skip
 
     errors = [np.inf]
-    for s, steps in {2: (0.5, 0.25), 3: (0.5, 0.25), 4: (0.375, 0.25)}.items():
+    # Between close steps the order wavers: errors of the phase of two passages partly cancel.
+    steps = 0.5, 0.25
+    for s in (2, 3, 4):
         errors = [np.max(np.abs(plane(run(lj.Gauss(s), dt))[-1] - exact)) for dt in steps]
         order = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
         assert abs(order - 2 * s) < 0.6, (s, errors, order)
