@@ -66,7 +66,7 @@ TOGETHER = 256
 PRODUCT = 4096
 AT_ANY_SIZE = ELEMENTWISE | MOVING | EQUINOX_PRIMITIVES | {
     "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "empty2", "reduce_precision", "sincos",
-    "tile", "xla_metadata_value",
+    "tile", "xla_metadata_value", "added",
 }  # fmt: skip
 SMALL = REDUCING | ACCUMULATING - {"cumlogsumexp"} | {"argmax", "argmin"}
 WITH_BODIES = CALLS | CALLS_WITH_RULES | CONTROL_FLOW | {"one_function"}
@@ -234,7 +234,33 @@ def _equation_without_library(equation: JaxprEqn):
         return equation.replace(
             primitive=_product_p, params={"dimension_numbers": numbers, "like": equation.outvars[0].aval}
         )
+    if name == "scatter-add" and _adds_to_entries(equation):
+        numbers = equation.params["dimension_numbers"]
+        (axis,), windows = numbers.scatter_dims_to_operand_dims, numbers.update_window_dims
+        (of_added,) = set(range(equation.invars[2].aval.ndim)) - set(windows)
+        clips = equation.params["mode"] == lax.GatherScatterMode.CLIP
+        return equation.replace(primitive=_added_p, params={"axes": (axis, of_added), "clips": clips})
     return equation
+
+
+def _adds_to_entries(equation: JaxprEqn) -> bool:
+    """Whether it adds a few entries along one axis of a small array, as does the derivative of `q[i]` for many i."""
+    array, places, added = (x.aval for x in equation.invars)
+    numbers = equation.params["dimension_numbers"]
+    along = numbers.scatter_dims_to_operand_dims
+    return (
+        len(along) == 1 and numbers.inserted_window_dims == along and not numbers.operand_batching_dims
+        and places.ndim == 2 and added.ndim == array.ndim and added.size * array.shape[along[0]] <= LARGE
+    )  # fmt: skip
+
+
+def _added(array: Array, places: Array, added: Array, axes: tuple[int, int], clips: bool):
+    """The array with entries added along an axis, without a scatter; those outside are left out, or moved (`clips`)."""
+    rows, added = jnp.moveaxis(array, axes[0], 0), jnp.moveaxis(added, axes[1], 0)
+    place = jnp.clip(places[:, 0], 0, rows.shape[0] - 1) if clips else places[:, 0]
+    here = place[:, None] == jnp.arange(rows.shape[0])[None]
+    here = here.reshape(here.shape + (1,) * (rows.ndim - 1))
+    return jnp.moveaxis(rows + jnp.sum(jnp.where(here, added[:, None], 0), axis=0, dtype=rows.dtype), 0, axes[0])
 
 
 def _product(left: Array, right: Array, dimension_numbers, like):
@@ -412,6 +438,11 @@ def _define(name: str, evaluate: Callable, on_cpu: Callable, shapes, batch: Call
 _product_p = Primitive("product")
 _product_p.def_abstract_eval(lambda left, right, like, **params: like)
 mlir.register_lowering(_product_p, mlir.lower_fun(_product, multiple_results=False))
+
+# Stands for `scatter-add` there.
+_added_p = Primitive("added")
+_added_p.def_abstract_eval(lambda array, places, added, **params: array)
+mlir.register_lowering(_added_p, mlir.lower_fun(_added, multiple_results=False))
 
 _one_function_p = _define("one_function", _unmarked, _marked, lambda *x, jaxpr, **params: jaxpr.out_avals, _batched)
 _in_blocks_p = _define("in_blocks", _lanes_together, _lanes_in_blocks, _lane_shapes, _batched_again)

@@ -178,13 +178,14 @@ class GaussStep(NamedTuple):
         x = way.x[None] + (way.x_rest[None] + mixed @ moves)
         momenta, pushes = jax.vmap(self._momentum_and_push)(times, x, z.velocities)
         lacks, impulses = jnp.zeros_like(z.multipliers), jnp.zeros_like(momenta)
-        holonomic = model.holonomic
+        # By products: XLA makes no machine function of a program that scatters.
+        holonomic, columns = model.holonomic, np.eye(model.m, dtype=dtype)
         if not holonomic.all():
             which = ~holonomic
             rows = jax.vmap(lambda t, x, u: constraints.jacobian(model, t, x, u)[which])(times, x, z.velocities)
             pushes = pushes + jnp.einsum("sm,smn->sn", z.multipliers[:, which], rows)
             slopes = jax.vmap(lambda t, x, u: constraints.velocity_residual(model, t, x, u)[which])
-            lacks = lacks.at[:, which].set(-slopes(times, x, z.velocities))
+            lacks -= slopes(times, x, z.velocities) @ columns[which]
         kicks = parts * pushes
         after = mixed @ kicks
         if holonomic.any():
@@ -196,7 +197,7 @@ class GaussStep(NamedTuple):
             impulses = jnp.einsum("sm,smn->sn", forces, rows(ends[:-1], starts))
             after = after + (1 - to_nodes[:-1].T) @ impulses
             gaps = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(ends[1:], at_ends)
-            lacks = lacks.at[:, holonomic].set(-_inverted(tab.inner_to_nodes, dtype) @ gaps / h)
+            lacks -= (_inverted(tab.inner_to_nodes, dtype) @ gaps / h) @ columns[holonomic]
         short = way.p[None] + (way.p_rest[None] + after) - momenta
         short = jax.vmap(self._of_first_order)(times, x, z.velocities, short)
         if model.m > 1:
@@ -235,10 +236,10 @@ class GaussStep(NamedTuple):
 
         def goes_on(state: tuple) -> Array:
             _, size, before, motion, solved, count = state
-            closer = (size < before) | ~solved
             # What is still missing, at the rate of the last two corrections.
             missing = size * jnp.where(jnp.isfinite(before) & (before > 0), jnp.minimum(size / before, 1.0), 1.0)
-            return jnp.any((missing > (ENOUGH * small) ** 2 * motion) & closer) & (count < MOST_ITERATIONS)
+            nearer = jnp.any((missing > (ENOUGH * small) ** 2 * motion) & (size < before))
+            return (nearer | ~solved) & jnp.all(jnp.isfinite(size)) & (count < MOST_ITERATIONS)
 
         infinite = jnp.full((2,) if first.any() else (), jnp.inf, h.dtype)
         start = better((guess, infinite, infinite, infinite, jnp.asarray(False), jnp.asarray(0)))

@@ -298,3 +298,16 @@ def test_a_thermostat_and_a_rod_given_three_times():
     shares = np.array([2.0, 4.0, 1.0]) / 21.0
     for name, share in zip(again, shares):
         np.testing.assert_allclose(swing.multipliers[name], 3 * 9.81 * swing.q[:, 1] * share, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_newtons_iteration_ends_at_every_length_of_a_step():
+    """A stiff spring pendulum by long and by short steps, against adaptive ones: an early end was taken for a failure."""
+    spring = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - 500.0 * (jnp.sqrt(jnp.sum(q**2)) - 1.0) ** 2)
+    given = spring, jnp.array([1.1, 0.0]), jnp.array([0.0, 1.0]), None
+    ts = jnp.array([0.0, 5.0, 10.0])
+    exact = lj.integrate(*given, ts=ts, rtol=1e-12, estimate_error=False).q[-1]
+    for dt, error in ((0.005, 1e-7), (0.01, 1e-6), (0.02, 3e-5)):
+        found = lj.integrate(*given, ts=ts, method=lj.Gauss(3, newton=True), dt0=dt, estimate_error=False).q[-1]
+        np.testing.assert_allclose(found, exact, atol=error)
+        assert np.abs(found - exact).max() > error / 1000
