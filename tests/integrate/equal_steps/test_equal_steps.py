@@ -302,7 +302,7 @@ def test_a_thermostat_and_a_rod_given_three_times():
 
 @pytest.mark.slow
 def test_newtons_iteration_ends_at_every_length_of_a_step():
-    """A stiff spring pendulum by long and by short steps, against adaptive ones: an early end was taken for a failure."""
+    """A stiff spring pendulum by long and short steps, against adaptive ones: an early end was taken for a failure."""
     spring = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - 500.0 * (jnp.sqrt(jnp.sum(q**2)) - 1.0) ** 2)
     given = spring, jnp.array([1.1, 0.0]), jnp.array([0.0, 1.0]), None
     ts = jnp.array([0.0, 5.0, 10.0])
