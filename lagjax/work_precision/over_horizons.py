@@ -141,15 +141,20 @@ def _cell(needed: Needed) -> str:
     return f"{in_ms(needed.seconds)} ({needed.setting:.1e})" if np.isfinite(needed.seconds) else "-"
 
 
+# Nobody follows a motion for so many periods.
+FAR = 1e8
+
+
 def _in_words(win: Win | None, last: float) -> str:
     if win is None:
         return "Equal steps do not win, however long the motion is."
     if win.measured:
         return f"From {win.periods:g} periods on {win.name} is the fastest."
-    return (
-        f"Up to {last:g} periods steps that adapt are faster. By how times grow, N^(1 + 2/order) and N^(1 + 1/order), "
-        f"{win.name} is from about {win.periods:.0e} periods on (not measured)."
-    )
+    law = "N^(1 + 2/order) and N^(1 + 1/order)"
+    adaptive = f"Up to {last:g} periods steps that adapt are faster, and by how times grow, {law},"
+    if win.periods > FAR:
+        return f"{adaptive}\nfar beyond a hundred million too (not measured)."
+    return f"{adaptive}\nup to about {win.periods:.0e}; from there on {win.name} is (not measured)."
 
 
 @by_name("lj.horizons(system, q0, v0, params, period=period)", "period")

@@ -65,7 +65,7 @@ def test_from_when_on_equal_steps_win():
     late = made((1.0, 10.0, 100.0), (2.0, 20.0, 200.0))
     # 2 = (N / 1000)^(1/8).
     assert late.win is not None and not late.win.measured and late.win.periods == pytest.approx(1000 * 2.0**8)
-    assert "about 3e+05 periods on (not measured)" in repr(late)
+    assert "up to about 3e+05; from there on" in repr(late)
     assert made((1.0, 10.0, 100.0), (np.inf, np.inf, np.inf)).win is None
     assert lj.Horizons({"Gauss(4)": lj.Gauss(4)}, {1.0: {"Gauss(4)": Needed(0.1, 1e-4, 1.0, 10)}}, 1e-3).win is None
     assert "do not win" in repr(made((1.0, 10.0, 100.0), (np.inf, np.inf, np.inf)))

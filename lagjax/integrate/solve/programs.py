@@ -201,6 +201,8 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
     found = [jumps for phase, s in starts if (jumps := jumps_found(phase, s)) is not None]
     if model.system.in_phases:
         why = "in the phases of a lj.Hybrid"
+    elif isinstance(settings.method, EqualSteps):
+        why = "in steps of equal length, which are less accurate where one goes across"
     elif settings.controller is not None or settings.event is not None:
         why = "with a stepsize_controller, or a condition for diffrax, of your own"
     elif isinstance(settings.adjoint, diffrax.BacksolveAdjoint):

@@ -1,4 +1,4 @@
-"""What steps of equal length keep: symplecticity, the way back, orders, and derivatives through many of them."""
+"""What steps of equal length keep: symplecticity, reversibility, orders on motions of every kind, derivatives."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from lagjax.numerics import tableau
 from lagjax.scenes import cross_rails
 from tests.behaviour.test_orders import ROD_SWING
 from tests.integrate.equal_steps.test_equal_steps import TURN, ellipse, kepler, of_momenta
-from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods
+from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
 
 # Steps that are too long for the tolerance are meant.
 pytestmark = pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
@@ -31,6 +31,21 @@ def motion(system, start, params, ts, method, dt):
     """A motion whose program serves all lengths of steps."""
     options = {"method": method, "dt0": jnp.asarray(dt), "estimate_error": False}
     return lj.integrate(system, *start, params, ts=np.asarray(ts), **options)
+
+
+def angles_and_momenta(x, span):
+    """(angles, their momenta) after a span of the rods' motion, of those before."""
+    mass = lambda q: jax.jacfwd(lambda v: momentum(q, v))(jnp.zeros_like(q))
+    momentum = lambda q, v: jax.grad(lambda v: double_pendulum.lagrangian(0.0, q, v, DOUBLE_PARAMS))(v)
+    q, p = jnp.split(x, 2)
+    start = rods_from_angles(q, jnp.linalg.solve(mass(q), p), DOUBLE_PARAMS)
+    end = motion(double_rods, start, DOUBLE_PARAMS, [0.0, span], lj.Gauss(3), 0.05).end
+    rods = jnp.stack([end.q["first"], end.q["second"] - end.q["first"]])
+    moves = jnp.stack([end.v["first"], end.v["second"] - end.v["first"]])
+    angles = jnp.arctan2(rods[:, 0], -rods[:, 1])
+    rates = jnp.sum(moves * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=1)
+    rates /= jnp.stack([DOUBLE_PARAMS["l1"], DOUBLE_PARAMS["l2"]])
+    return jnp.concatenate([angles, momentum(angles, rates)])
 
 
 def at_swing():
@@ -55,6 +70,15 @@ def test_splitting_is_symplectic(order):
     for span in (0.1, 6.0):
         change = lambda x: of_momenta(x, kepler, 1.0, lj.Splitting(order), span)
         assert departs(change, jnp.concatenate(ellipse(0.3))) < 1e-12
+
+
+@pytest.mark.exhaustive
+def test_constrained_steps_are_symplectic_where_they_move():
+    """Rods, seen by their angles and momenta: one step and twenty. Twin: the angles with the rates of the rods."""
+    for span in (0.05, 1.0):
+        assert departs(lambda x: angles_and_momenta(x, span), at_swing()) < 1e-12
+    rates = lambda x: angles_and_momenta(x, 1.0).at[2:].divide(jnp.array([1.0, 1.1]))
+    assert departs(rates, at_swing()) > 1e-2
 
 
 def way_back(system, start, params, method):
@@ -82,27 +106,44 @@ def slope(system, start, params, ts, method, steps, exact):
     return -np.polyfit(np.log(steps), np.log(errors), 1)[0]
 
 
-# A pendulum.
+# A pendulum, and the same with a force and friction, and explicit time.
 SWING = lj.System(lambda t, q, v, k: 0.5 * v**2 + k * jnp.cos(q))
+DRIVEN = lj.System(
+    lambda t, q, v, k: 0.5 * v**2 + k * jnp.cos(q) + 0.3 * q * jnp.sin(2 * t),
+    dissipation=lambda t, q, v, k: 0.1 * v**2 + 0.02 * v**4,
+)
 SPAN = np.linspace(0.0, 6.0, 7)
 
 
-def swing_by_scipy():
-    """Its motion by the textbook's equation."""
-    rates = lambda t, y: [y[1], -np.sin(y[0])]
+def swing_by_scipy(driven):
+    """Both by their textbook equations."""
+    force = lambda t, y: 0.3 * np.sin(2 * t) - 0.2 * y[1] - 0.08 * y[1] ** 3 if driven else 0.0
+    rates = lambda t, y: [y[1], -np.sin(y[0]) + force(t, y)]
     return solve_ivp(rates, (0, 6), [1.0, 0.5], "DOP853", SPAN, rtol=2.5e-14, atol=1e-15).y[0]
 
 
 @pytest.mark.slow
 def test_a_wrong_order_is_seen_on_a_pendulum(monkeypatch):
     """Order 4 of Gauss(2). Failing twin: nodes that are a little off, by which it would still be symplectic."""
-    exact, steps = swing_by_scipy(), (4, 6, 8)
+    exact, steps = swing_by_scipy(False), (4, 6, 8)
     right = slope(SWING, (1.0, 0.5), 1.0, SPAN, lj.Gauss(2), steps, exact)
     off = tableau(2)._replace(mixed=tableau(2).mixed + np.array([[0.0, 0.05], [-0.05, 0.0]]))
     monkeypatch.setattr(loop, "tableau", lambda stages: off)
     method = dataclasses.replace(lj.Gauss(2), newton=True)
     wrong = slope(SWING, (1.0, 0.5), 1.0, SPAN, method, steps, exact)
     assert abs(right - 4) < 0.35 < abs(wrong - 4)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("driven", [False, True])
+def test_orders_on_a_pendulum(driven):
+    """Orders 2, 4, 6, 8 of both methods, the second also with explicit time and friction (`lj.Splitting` without)."""
+    exact, system = swing_by_scipy(driven), DRIVEN if driven else SWING
+    for stages, steps in {1: (20, 30, 40), 2: (6, 8, 12), 3: (3, 4, 6), 4: (2, 3, 4)}.items():
+        assert abs(slope(system, (1.0, 0.5), 1.0, SPAN, lj.Gauss(stages), steps, exact) - 2 * stages) < 0.35
+    if not driven:
+        for order, steps in {2: (20, 30, 40), 4: (4, 6, 8), 6: (4, 6, 8), 8: (4, 5, 6)}.items():
+            assert abs(slope(system, (1.0, 0.5), 1.0, SPAN, lj.Splitting(order), steps, exact) - order) < 0.35
 
 
 @pytest.mark.exhaustive
