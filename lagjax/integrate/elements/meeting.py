@@ -295,7 +295,8 @@ class Meeting(eqx.Module):
         laws, normals, partners, eps = self.laws, closed.size, self.laws.partners, jnp.finfo(at.u.dtype).eps
         before, slack = at.given.modes[: len(laws.rows)], at.given.slack[: len(laws.rows)]
         if not laws.rows:
-            return Decided(before, slack, slack, jnp.asarray(True))
+            none = at.u[:0]
+            return Decided(before, none, none, jnp.asarray(True))
         zeros = self._zeros(at, scale)
         touching, slides = self._touching(at, closed, zeros), self._sliding(at, self._velocities(at)[normals:], zeros)
         problem = self._problem(at, rows, touching, slides)
