@@ -207,8 +207,8 @@ class System(eqx.Module):
         """The system itself; raise if `start` names a phase."""
         if start is not None and self.elements is not None:
             raise ValueError(
-                "start= names the first phase of a lj.Hybrid; the modes in which a motion with elements starts follow "
-                "from q0 and v0.\n"
+                f"{argument}= names the first phase of a lj.Hybrid; the modes in which a motion with elements starts "
+                "follow from q0 and v0.\n"
                 "Usual cause: a contact that should be closed, or slide, from the start on.\n"
                 "Fix: leave it out; a gap of zero in q0 is closed, and a sliding velocity in v0 slides to its side."
             )

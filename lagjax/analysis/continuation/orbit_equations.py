@@ -279,7 +279,7 @@ def _monodromy(frame, flow, t, z, frames, rate):
     basis, whole = flow.tangent_space(t, z, frame.scale), jnp.eye(z.size, dtype=z.dtype)
     for part in frames:
         whole = part @ whole
-    rows = directions(flow, frame.reasons, t, z, frame.scale, basis)
+    rows = directions(flow, frame.reasons, t, z, flow.rate(t, z), frame.scale, basis)
     trivial, there = orthonormal(frame.reasons, rows, jnp.maximum(TURN, 1e-3 * rate))
     return basis.T @ whole @ basis, trivial, there
 
