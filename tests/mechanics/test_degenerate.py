@@ -125,27 +125,23 @@ def test_a_triangle_and_leapfrogging_pairs():
         np.array([1.0, 1.0, -1.0, -1.0]),
     )
     y0 = np.concatenate([start["x"], start["y"]])
-    exact = solve_ivp(biot_savart, (0, 60), y0, "DOP853", args=(strengths,), rtol=1e-13, atol=1e-13).y[:, -1]
+    exact = solve_ivp(biot_savart, (0, 20), y0, "DOP853", args=(strengths,), rtol=1e-13, atol=1e-14).y[:, -1]
     exact = exact[:4] + 1j * exact[4:]
 
-    def run(method, dt, end=60.0):
+    def run(method, dt, end=20.0):
         return lj.integrate(
             vortices, start, still(start), strengths, ts=np.linspace(0.0, end, 11), method=method,
             dt0=jnp.asarray(dt), estimate_error=False,
         )  # fmt: skip
 
-    errors = [np.inf]
-    # Between close steps the order wavers: errors of the phase of two passages partly cancel.
-    steps = 0.5, 0.25
-    for s in (2, 3, 4):
+    for s, steps in {2: (0.25, 0.125), 3: (0.25, 0.125), 4: (0.25, 0.2)}.items():
         errors = [np.max(np.abs(plane(run(lj.Gauss(s), dt))[-1] - exact)) for dt in steps]
         order = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
-        assert abs(order - 2 * s) < 0.6, (s, errors, order)
-    assert errors[-1] < 1e-6
+        assert abs(order - 2 * s) < 0.35, (s, errors, order)
     long = run(lj.Gauss(3), 0.2, 20_000.0)
     h = np.asarray(long.jacobi_integral())
     assert int(long.stats["num_steps"]) == 100_000
-    assert np.ptp(h) < 1e-6 and abs(np.polyfit(np.asarray(long.t), h, 1)[0]) * 20_000 < 1e-10
+    assert np.ptp(h) < 2e-9 and abs(np.polyfit(np.asarray(long.t), h, 1)[0]) * 20_000 < 0.5 * np.ptp(h)
     first = impulses(long, strengths)
     assert np.max(np.abs(first[:2] - first[:2, :1])) < 1e-10
 
