@@ -62,7 +62,7 @@ def about_axis(x):
     )
 
 
-class Pose:
+class BicyclePose:
     """Both frames: rotations, angular velocities, and positions and velocities of their parts."""
 
     def __init__(self, q, v, params):
@@ -110,7 +110,7 @@ class Pose:
 
 def lagrangian(t, q, v, params):
     """Two frames and two wheels, each a rigid body."""
-    pose = Pose(q, v, params)
+    pose = BicyclePose(q, v, params)
     parts = (
         (params["body"], *pose.on_body(params["body"]["at"]), pose.body_rate @ params["body"]["I"] @ pose.body_rate),
         (params["fork"], *pose.on_fork(params["fork"]["at"]), pose.fork_rate @ params["fork"]["I"] @ pose.fork_rate),
@@ -131,14 +131,14 @@ def steepest(frame):
 def contact(t, q, params):
     """Heights of the lowest points of both wheels above the ground."""
     still = {name: jnp.zeros_like(x) for name, x in q.items()}
-    wheels = Pose(q, still, params).wheels(still, params)
+    wheels = BicyclePose(q, still, params).wheels(still, params)
     return jnp.stack([place[2] + wheel["r"] * steepest(frame)[1] for wheel, place, _, frame, _ in wheels])
 
 
 def slip(t, q, v, params):
     """Velocities along the ground of the points of contact."""
     rates = []
-    for wheel, _, rate, frame, turning in Pose(q, v, params).wheels(v, params):
+    for wheel, _, rate, frame, turning in BicyclePose(q, v, params).wheels(v, params):
         down, _ = steepest(frame)
         rates.append((rate + wheel["r"] * jnp.cross(frame @ turning, down))[:2])
     return jnp.concatenate(rates)

@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax.mechanisms import slider_crank
 from lagjax.mechanisms.mechanism import Mechanism
-from lagjax.mechanisms.slider_crank import Body, SliderCrankParts
+from lagjax.mechanisms.slider_crank import PlaneBody, SliderCrankParts
 from lagjax.system import Holonomic, System
 
 PARAMS = slider_crank.PARAMS | {"rate": 150.0}
@@ -49,13 +49,13 @@ def exact(t, params: PyTree):
     centre, block = l1 * s + l2 * w * s2 / 2, l1 * s + l2 * w * s2
     d_centre, d_block = l1 * c + l2 * (dw * s2 + w**2 * c2) / 2, l1 * c + l2 * (dw * s2 + w**2 * c2)
     q = SliderCrankParts(
-        crank=Body(l1 * c / 2, l1 * s / 2, angle),
-        rod=Body(l1 * c + l2 * c2 / 2, l1 * s / 2, np.arcsin(s2)),
+        crank=PlaneBody(l1 * c / 2, l1 * s / 2, angle),
+        rod=PlaneBody(l1 * c + l2 * c2 / 2, l1 * s / 2, np.arcsin(s2)),
         block=l1 * c + l2 * c2,
     )
     v = SliderCrankParts(
-        crank=Body(-rate * l1 * s / 2, rate * l1 * c / 2, rate * np.ones_like(angle)),
-        rod=Body(-rate * centre, rate * l1 * c / 2, rate * w),
+        crank=PlaneBody(-rate * l1 * s / 2, rate * l1 * c / 2, rate * np.ones_like(angle)),
+        rod=PlaneBody(-rate * centre, rate * l1 * c / 2, rate * w),
         block=-rate * block,
     )
     half_slope = J2 * w * dw + m2 * (centre * d_centre - l1**2 * c * s / 4) + m3 * block * d_block
@@ -74,13 +74,13 @@ MECHANISM = Mechanism(
     freedom=0,
     reference=(
         SliderCrankParts(
-            crank=Body(-0.0569765934644116, 0.04877158801178376, 15.0),
-            rod=Body(0.02789649478674791, 0.04877158801178376, -0.33116391346483814),
+            crank=PlaneBody(-0.0569765934644116, 0.04877158801178376, 15.0),
+            rod=PlaneBody(0.02789649478674791, 0.04877158801178376, -0.33116391346483814),
             block=0.16974617650231902,
         ),
         SliderCrankParts(
-            crank=Body(-7.315738201767564, -8.54648901966174, 150.0),
-            rod=Body(-11.692972514256255, -8.54648901966174, 60.25032214593665),
+            crank=PlaneBody(-7.315738201767564, -8.54648901966174, 150.0),
+            rod=PlaneBody(-11.692972514256255, -8.54648901966174, 60.25032214593665),
             block=-8.754468624977381,
         ),
     ),

@@ -34,7 +34,7 @@ from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system import Holonomic, System
 
 
-class Body(NamedTuple):
+class PlaneBody(NamedTuple):
     """Centre and angle of a body in a plane."""
 
     x: Float[Array, ""] | float
@@ -45,8 +45,8 @@ class Body(NamedTuple):
 class SliderCrankParts(NamedTuple):
     """The three bodies; the block has only x."""
 
-    crank: Body
-    rod: Body
+    crank: PlaneBody
+    rod: PlaneBody
     block: Float[Array, ""] | float
 
 
@@ -104,19 +104,19 @@ MECHANISM = Mechanism(
     system=system,
     params=PARAMS,
     # Crank and rod along the rail, the crank turning at 150 rad/s and so the rod at -ρ 150.
-    q0=SliderCrankParts(crank=Body(0.075, 0.0, 0.0), rod=Body(0.3, 0.0, 0.0), block=0.45),
-    v0=SliderCrankParts(crank=Body(0.0, 11.25, 150.0), rod=Body(0.0, 11.25, -75.0), block=0.0),
+    q0=SliderCrankParts(crank=PlaneBody(0.075, 0.0, 0.0), rod=PlaneBody(0.3, 0.0, 0.0), block=0.45),
+    v0=SliderCrankParts(crank=PlaneBody(0.0, 11.25, 150.0), rod=PlaneBody(0.0, 11.25, -75.0), block=0.0),
     end=0.1,
     freedom=1,
     reference=(
         SliderCrankParts(
-            crank=Body(0.046498324604522266, 0.05884645961289837, 13.468452708896843),
-            rod=Body(0.2309716258933242, 0.05884645961289837, -0.40314128439378855),
+            crank=PlaneBody(0.046498324604522266, 0.05884645961289837, 13.468452708896843),
+            rod=PlaneBody(0.2309716258933242, 0.05884645961289837, -0.40314128439378855),
             block=0.3689466025776039,
         ),
         SliderCrankParts(
-            crank=Body(-7.116416474761444, 5.62313256296388, 120.93193917823424),
-            rod=Body(-16.63110436957618, 5.62313256296388, -40.7547274012662),
+            crank=PlaneBody(-7.116416474761444, 5.62313256296388, 120.93193917823424),
+            rod=PlaneBody(-16.63110436957618, 5.62313256296388, -40.7547274012662),
             block=-19.029375789629476,
         ),
     ),

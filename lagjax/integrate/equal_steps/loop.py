@@ -51,7 +51,7 @@ def stepped(
 
         def interval(carried: tuple[Any, Any], row: tuple[Array, Array]):
             state, bar = carried
-            watched = Watched(meter, bar, ts, dt)
+            watched = Metered(meter, bar, ts, dt)
             state, output = (steps._replace(loop=watched.loop) if shown else steps).interval(state, row)
             return (state, watched.bar), output
 
@@ -83,7 +83,7 @@ def _checkpointed(goes_on: Callable, one: Callable, state: tuple, time: Callable
     return eqxi.while_loop(goes_on, one, state, kind="checkpointed", checkpoints=CHECKPOINTS)
 
 
-class Watched:
+class Metered:
     """A loop whose steps are made by a few hundred machine functions, between which a meter is moved.
 
     `bar` is the state of the meter, before a loop and after it.
