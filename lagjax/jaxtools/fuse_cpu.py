@@ -237,7 +237,7 @@ def _equation_without_library(equation: JaxprEqn):
     if name == "scatter-add" and _adds_to_entries(equation):
         numbers = equation.params["dimension_numbers"]
         (axis,), windows = numbers.scatter_dims_to_operand_dims, numbers.update_window_dims
-        (of_added,) = set(range(equation.invars[2].aval.ndim)) - set(windows)
+        (of_added,) = set(range(cast(Any, equation.invars[2].aval).ndim)) - set(windows)
         clips = equation.params["mode"] == lax.GatherScatterMode.CLIP
         return equation.replace(primitive=_added_p, params={"axes": (axis, of_added), "clips": clips})
     return equation
@@ -245,7 +245,7 @@ def _equation_without_library(equation: JaxprEqn):
 
 def _adds_to_entries(equation: JaxprEqn) -> bool:
     """Whether it adds a few entries along one axis of a small array, as does the derivative of `q[i]` for many i."""
-    array, places, added = (x.aval for x in equation.invars)
+    array, places, added = (cast(Any, x.aval) for x in equation.invars)
     numbers = equation.params["dimension_numbers"]
     along = numbers.scatter_dims_to_operand_dims
     return (
