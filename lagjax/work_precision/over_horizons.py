@@ -35,6 +35,8 @@ OUTPUTS = 8
 # From rough to fine: tolerances, and the number of steps in a period.
 TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(4, 27))
 STEPS = tuple(2.0 ** (k / 4) for k in range(6, 45))
+# Nobody follows a motion for so many periods.
+FAR = 1e8
 
 # Compared by default, where they suit the system.
 EQUAL = Splitting(6), Splitting(8), Gauss(4), Gauss(6)
@@ -139,10 +141,6 @@ class Horizons:
 
 def _cell(needed: Needed) -> str:
     return f"{in_ms(needed.seconds)} ({needed.setting:.1e})" if np.isfinite(needed.seconds) else "-"
-
-
-# Nobody follows a motion for so many periods.
-FAR = 1e8
 
 
 def _in_words(win: Win | None, last: float) -> str:
