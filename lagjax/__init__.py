@@ -155,6 +155,7 @@ if TYPE_CHECKING:
         rolling_sphere,
         spherical,
         spring,
+        torsion,
         universal,
         weight,
     )
@@ -198,7 +199,7 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
         "Body Load Marker Pose applied cylindrical fixed ground motor multibody prismatic revolute rolling "
-        "rolling_sphere spherical spring universal weight"
+        "rolling_sphere spherical spring torsion universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
@@ -252,6 +253,7 @@ __all__ = [
     "Load",
     "weight",
     "spring",
+    "torsion",
     "motor",
     "applied",
     "touches",

@@ -3,7 +3,7 @@
 from lagjax.bodies.assemble import multibody
 from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
 from lagjax.bodies.joints import cylindrical, fixed, prismatic, revolute, rolling, rolling_sphere, spherical, universal
-from lagjax.bodies.loads import Load, applied, motor, spring, weight
+from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
 
 __all__ = [
     "Body",
@@ -23,6 +23,7 @@ __all__ = [
     "rolling_sphere",
     "spherical",
     "spring",
+    "torsion",
     "universal",
     "weight",
 ]

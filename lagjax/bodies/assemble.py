@@ -4,10 +4,13 @@ from collections.abc import Callable, Iterable, Mapping
 
 import jax
 
-from lagjax.bodies.body import Body
+from lagjax.bodies.body import Body, check_bodies
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Load, generalized_force
 from lagjax.system import Holonomic, Nonholonomic, System
+
+# What else a system may have: arguments of `lj.System` that are passed on.
+OTHERS = ("force", "dissipation", "states", "elements")
 
 
 def multibody(
@@ -41,9 +44,12 @@ def multibody(
 
     Coordinates of a rough drawing become ones that joints allow by `lj.consistent_state`.
 
-    **Raises:** `ValueError` for two bodies or constraints of one name.
+    **Raises:** `ValueError` for two bodies or constraints of one name; `TypeError` for a body, joint or load that is
+    none, and for a keyword that is not among `others`.
     """
-    bodies, loads = tuple(bodies), tuple(loads)
+    bodies, loads = check_bodies("lj.multibody", bodies), _check_loads(loads)
+    _check_joints(joints)
+    _check_keywords(others)
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
     twice = {body.name for body in bodies if sum(body.name == other.name for other in bodies) > 1}
@@ -74,3 +80,43 @@ def multibody(
         dissipation=friction if has_dissipation else dissipation,
         **others,
     )
+
+
+def _check_loads(loads: Iterable[Load]) -> tuple[Load, ...]:
+    if isinstance(loads, Load):
+        raise TypeError("the loads of lj.multibody are a list, and one load was given.\nFix: loads=[lj.weight([rod])].")
+    loads = tuple(loads)
+    for i, load in enumerate(loads):
+        if not isinstance(load, Load):
+            raise TypeError(
+                f"load {i} of lj.multibody is no lj.Load, but {type(load).__name__}.\n"
+                "Usual cause: a function of (t, q, v, params) by itself, or a joint among the loads.\n"
+                "Fix: lj.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
+            )
+    return loads
+
+
+def _check_joints(joints: Mapping | None):
+    if not isinstance(joints or {}, Mapping):
+        raise TypeError(
+            f"the joints of lj.multibody are a dict by name, and {type(joints).__name__} was given.\n"
+            "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}."
+        )
+    for name, joint in (joints or {}).items():
+        parts = joint.values() if isinstance(joint, Mapping) else (joint,)
+        for part in parts:
+            if not isinstance(part, Holonomic | Nonholonomic):
+                raise TypeError(
+                    f"joint '{name}' of lj.multibody is no constraint, but {type(part).__name__}.\n"
+                    "Usual cause: a load among the joints, or a function without its kind.\n"
+                    "Fix: lj.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third argument."
+                )
+
+
+def _check_keywords(others: Mapping):
+    unknown = [name for name in others if name not in OTHERS]
+    if unknown:
+        raise TypeError(
+            f"lj.multibody has no argument '{unknown[0]}'.\n"
+            f"Fix: bodies, joints, loads, lagrangian, or one of lj.System's {', '.join(OTHERS)}."
+        )

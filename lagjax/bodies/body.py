@@ -6,7 +6,7 @@ r is the centre of mass, e the quaternion (`rotation.py`), I the inertia about t
 The last term vanishes with the constraint |e|² = 1. It is there so that the mass matrix is regular for all rates of e.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -242,6 +242,25 @@ class Marker:
     def axis(self, q: PyTree) -> Float[Array, "3"]:
         """Its axis in space."""
         return self.body.direction(q, self.frame[2])
+
+
+def check_markers(what: str, *given):
+    """Raise a `TypeError` that begins with `what`, unless all are markers."""
+    for x in given:
+        if not isinstance(x, Marker):
+            raise TypeError(
+                f"{what}, and {type(x).__name__} is none.\n"
+                "Fix: lj.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
+            )
+
+
+def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
+    """The bodies as a tuple; a `TypeError` that begins with `what`, unless they are a list of some."""
+    bodies = tuple(given) if isinstance(given, Iterable) else ()
+    if not bodies or not all(isinstance(body, Body) for body in bodies):
+        listed = ", ".join(type(body).__name__ for body in bodies) or type(given).__name__
+        raise TypeError(f"{what} takes a list of lj.Body, and was given {listed}.\nFix: {what}([crank, rod]).")
+    return bodies
 
 
 def _check_inertia(name: str, given: np.ndarray):

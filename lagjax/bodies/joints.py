@@ -1,15 +1,24 @@
 """Joints between bodies, each an ordinary constraint.
 
-A joint joins two markers: their points coincide, or their axes, or both. The multiplier of a point's row is a force
-along an axis of space; of a row of axes, a torque.
+A joint joins two markers, a and b: its rows are what must vanish, said for a place b seen from a place a.
+
+| row | equations | vanishes where |
+|---|---|---|
+| `apart` | 3 | the points are one |
+| `aside` | 2 | the point of b lies on the axis of a |
+| `tilt` | 2 | the axes are parallel |
+| `cross` | 1 | the axes are at right angles |
+| `turn` | 3 | the frames are parallel |
+
+The multiplier of a point's row is a force along an axis of space (`aside`: of a), of a row of axes a torque.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Marker, valued
+from lagjax.bodies.body import Marker, check_markers, valued
 from lagjax.system import Holonomic, Nonholonomic
 
 
@@ -27,12 +36,7 @@ def spherical(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def points_meet(t, q, params):
-        return _apart(a, b, q, params)
-
-    return Holonomic(points_meet)
+    return _joined(a, b, apart)
 
 
 def revolute(a: Marker, b: Marker) -> Holonomic:
@@ -49,12 +53,7 @@ def revolute(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def hinge(t, q, params):
-        return jnp.concatenate([_apart(a, b, q, params), _tilt(a, b, q)])
-
-    return Holonomic(hinge)
+    return _joined(a, b, apart, tilt)
 
 
 def universal(a: Marker, b: Marker) -> Holonomic:
@@ -71,12 +70,7 @@ def universal(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def cross(t, q, params):
-        return jnp.concatenate([_apart(a, b, q, params), jnp.dot(a.axis(q), b.axis(q))[None]])
-
-    return Holonomic(cross)
+    return _joined(a, b, apart, cross)
 
 
 def cylindrical(a: Marker, b: Marker) -> Holonomic:
@@ -93,12 +87,7 @@ def cylindrical(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def same_axis(t, q, params):
-        return jnp.concatenate([a.axes(q)[:2] @ _apart(a, b, q, params), _tilt(a, b, q)])
-
-    return Holonomic(same_axis)
+    return _joined(a, b, aside, tilt)
 
 
 def prismatic(a: Marker, b: Marker) -> Holonomic:
@@ -115,12 +104,7 @@ def prismatic(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def slide(t, q, params):
-        return jnp.concatenate([a.axes(q)[:2] @ _apart(a, b, q, params), _turn(a, b, q)])
-
-    return Holonomic(slide)
+    return _joined(a, b, aside, turn)
 
 
 def fixed(a: Marker, b: Marker) -> Holonomic:
@@ -137,12 +121,7 @@ def fixed(a: Marker, b: Marker) -> Holonomic:
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    _check_two(a, b)
-
-    def one_body(t, q, params):
-        return jnp.concatenate([_apart(a, b, q, params), _turn(a, b, q)])
-
-    return Holonomic(one_body)
+    return _joined(a, b, apart, turn)
 
 
 def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
@@ -212,27 +191,42 @@ def named(joints: Mapping[str, Holonomic | Nonholonomic | Mapping]) -> dict[str,
     return {f"{name} {part}".strip(): x for name, joint in parts.items() for part, x in joint.items()}
 
 
-def _apart(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
+def apart(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
+    """The way from the point of a to that of b."""
     return b.position(q, params) - a.position(q, params)
 
 
-def _tilt(a: Marker, b: Marker, q: PyTree) -> Float[Array, "2"]:
-    """The parts of the axis of b that are not along the axis of a."""
+def aside(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "2"]:
+    """The parts of that way at right angles to the axis of a."""
+    return a.axes(q)[:2] @ apart(a, b, q, params)
+
+
+def tilt(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "2"]:
+    """The parts of the axis of b at right angles to the axis of a."""
     return a.axes(q)[:2] @ b.axis(q)
 
 
-def _turn(a: Marker, b: Marker, q: PyTree) -> Float[Array, "3"]:
+def cross(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "1"]:
+    """The part of the axis of b along the axis of a."""
+    return jnp.dot(a.axis(q), b.axis(q))[None]
+
+
+def turn(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
     """What turns the frame of a into that of b: the vector of sin(angle), where the angle is small."""
     return jnp.sum(jnp.cross(a.axes(q), b.axes(q)), axis=0) / 2
 
 
+def _joined(a: Marker, b: Marker, *rows: Callable) -> Holonomic:
+    _check_two(a, b)
+
+    def joint(t, q, params):
+        return jnp.concatenate([row(a, b, q, params) for row in rows])
+
+    return Holonomic(joint)
+
+
 def _check_two(a: Marker, b: Marker):
-    for x in (a, b):
-        if not isinstance(x, Marker):
-            raise TypeError(
-                f"a joint joins two places on bodies, and {type(x).__name__} is none.\n"
-                "Fix: lj.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
-            )
+    check_markers("a joint joins two places on bodies", a, b)
     if a.body == b.body:
         raise ValueError(
             f"a joint joins two bodies, and both places are on '{a.body.name}'.\n"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from lagjax.bodies.body import Body, Marker, valued
+from lagjax.bodies.body import Body, Marker, check_bodies, check_markers, valued
 
 
 class Load(NamedTuple):
@@ -38,9 +38,9 @@ def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) 
     >>> print(weight([stone]).potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
     58.86
 
-    **Raises:** nothing here; L's check names what is wrong with `g`.
+    **Raises:** `TypeError` unless `bodies` is a list of them; L's check names what is wrong with `g`.
     """
-    bodies = tuple(bodies)
+    bodies = check_bodies("lj.weight", bodies)
 
     def potential(t, q, v, params):
         centres = [body.pose(q).position for body in bodies]
@@ -67,13 +67,14 @@ def spring(
     >>> print(pull.potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, {"k": 10.0}))
     20.0
 
-    **Raises:** nothing here; L's check names what is wrong with the numbers.
+    **Raises:** `TypeError` unless both are markers; L's check names what is wrong with the numbers.
     """
+    check_markers("a spring is held at two places on bodies", a, b)
 
     def potential(t, q, v, params):
         gap = b.position(q, params) - a.position(q, params)
         k, squared = valued(stiffness, params), jnp.sum(gap**2)
-        if not callable(length) and length == 0:
+        if _is_zero(length):
             return k * squared / 2
         return k * (jnp.sqrt(squared) - valued(length, params)) ** 2 / 2
 
@@ -82,8 +83,42 @@ def spring(
         rate = jnp.dot(gap, b.velocity(q, v, params) - a.velocity(q, v, params)) / jnp.sqrt(jnp.sum(gap**2))
         return valued(damping, params) * rate**2 / 2
 
-    damped = callable(damping) or not (jnp.ndim(damping) == 0 and damping == 0)
-    return Load(potential, dissipation if damped else None)
+    return Load(potential, None if _is_zero(damping) else dissipation)
+
+
+def torsion(
+    a: Marker, b: Marker, stiffness: ArrayLike | Callable, angle: ArrayLike | Callable = 0.0,
+    damping: ArrayLike | Callable = 0.0,
+) -> Load:  # fmt: skip
+    """A spring about the axis of a hinge, with a damper beside it.
+
+        V = ½ k (θ - α)²,      R = ½ c (n·(Ω_b - Ω_a))²
+
+    θ is the angle about a's axis n from the first vector of a's frame to that of b's (`lj.Marker`), between -π and π:
+    the spring of a hinge that turns further than that is one of a coordinate of its own. `stiffness` k, `angle` α
+    without load and `damping` c are numbers or functions of params.
+
+    >>> import lagjax as lj
+    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> closer = torsion(lj.ground.at(), door.at(), stiffness=3.0, angle=0.5)
+    >>> print(closer.potential(0.0, {"door": lj.Pose.at(angle=2.5)}, None, None))
+    6.0
+
+    **Raises:** `TypeError` unless both are markers; L's check names what is wrong with the numbers.
+    """
+    check_markers("a spring is held at two places on bodies", a, b)
+
+    def potential(t, q, v, params):
+        along, across, _ = a.axes(q)
+        first = b.axes(q)[0]
+        turned = jnp.arctan2(jnp.dot(across, first), jnp.dot(along, first))
+        return valued(stiffness, params) * (turned - valued(angle, params)) ** 2 / 2
+
+    def dissipation(t, q, v, params):
+        rate = jnp.dot(a.axis(q), b.body.spin(q, v) - a.body.spin(q, v))
+        return valued(damping, params) * rate**2 / 2
+
+    return Load(potential, None if _is_zero(damping) else dissipation)
 
 
 def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
@@ -95,8 +130,9 @@ def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
     >>> print(motor(lj.ground.at(), wheel.at(), 5.0).power(0.0, {"wheel": pose}, turning, turning, None))
     15.0
 
-    **Raises:** nothing here; the check of forces names what is wrong with the torque.
+    **Raises:** `TypeError` unless both are markers; the check of forces names what is wrong with the torque.
     """
+    check_markers("a motor is held at two places on bodies", a, b)
 
     def power(t, q, w, v, params):
         turning = torque(t, q, v, params) if callable(torque) else torque
@@ -115,8 +151,9 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     >>> print(applied(rim, (0.0, 2.0, 0.0)).power(0.0, {"wheel": pose}, turning, turning, None))
     6.0
 
-    **Raises:** nothing here; the check of forces names what is wrong with the force.
+    **Raises:** `TypeError` unless `at` is a marker; the check of forces names what is wrong with the force.
     """
+    check_markers("a force acts at a place on a body", at)
 
     def power(t, q, w, v, params):
         given = force(t, q, v, params) if callable(force) else force
@@ -130,3 +167,8 @@ def generalized_force(loads: Iterable[Load], t, q: PyTree, v: PyTree, params: Py
     """The generalized force of loads' powers."""
     powers = [load.power for load in loads if load.power is not None]
     return jax.grad(lambda w: sum(power(t, q, w, v, params) for power in powers))(v)
+
+
+def _is_zero(x: ArrayLike | Callable) -> bool:
+    """Whether something was given as the number 0, and not as an array that may be traced."""
+    return isinstance(x, int | float) and x == 0

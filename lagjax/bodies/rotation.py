@@ -3,7 +3,8 @@
     r_space = R(e) r_body,      Ω_space = 2 vec(ė e*),      Ω_body = 2 vec(e* ė),      ė = ½ Ω_space e = ½ e Ω_body
 
 R is written without dividing by |e|²: it is a rotation where |e| = 1, which a constraint of the body sees to, and a
-Lagrangian need be right there alone.
+Lagrangian need be right there alone. Three numbers would need no constraint, and have poses where they stop: charts
+that move would have to be known to all that reads q (outputs, events, fits), where a constraint is known already.
 
 Source: Goldstein, *Classical Mechanics*, §4.5; Diebel, *Representing Attitude* (2006), Eqs. 125, 146 and 160.
 """

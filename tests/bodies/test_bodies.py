@@ -206,3 +206,43 @@ def test_bad_bodies_and_joints():
         rod.at((1.0, 0.0))
     with pytest.raises(ValueError, match="two bodies or constraints are called 'rod'"):
         lj.multibody([rod, lj.Body("rod", 2.0, (1.0, 1.0, 1.0))])
+
+
+def test_bad_systems_of_bodies():
+    """Lists that are none, loads among joints, functions by themselves and unknown keywords, in the user's words."""
+    rod = lj.Body("rod", 1.0, (1.0, 1.0, 2.0))
+    hinge, pull = lj.revolute(lj.ground.at(), rod.at()), lj.weight([rod])
+    with pytest.raises(TypeError, match=r"lj.weight takes a list of lj.Body, and was given Body.\nFix: lj.weight\(\["):
+        lj.weight(rod)
+    with pytest.raises(TypeError, match="lj.multibody takes a list of lj.Body, and was given Body, Marker"):
+        lj.multibody([rod, rod.at()])
+    with pytest.raises(TypeError, match="one load was given"):
+        lj.multibody([rod], {"hinge": hinge}, pull)
+    with pytest.raises(TypeError, match="load 1 of lj.multibody is no lj.Load, but function"):
+        lj.multibody([rod], {"hinge": hinge}, [pull, lambda t, q, v, params: 0.0])
+    with pytest.raises(TypeError, match="joint 'hinge' of lj.multibody is no constraint, but Load"):
+        lj.multibody([rod], {"hinge": pull})
+    with pytest.raises(TypeError, match="joints of lj.multibody are a dict by name, and list was given"):
+        lj.multibody([rod], [hinge])
+    with pytest.raises(TypeError, match="lj.multibody has no argument 'forces'.\nFix: .*force, dissipation"):
+        lj.multibody([rod], {"hinge": hinge}, forces=lambda t, q, v, params: q)
+    for load in (lj.spring, lj.torsion, lj.motor):
+        with pytest.raises(TypeError, match="held at two places on bodies, and Body is none"):
+            load(lj.ground.at(), rod, 1.0)
+    with pytest.raises(TypeError, match="a force acts at a place on a body, and Body is none"):
+        lj.applied(rod, (1.0, 0.0, 0.0))
+
+
+def test_a_torsion_spring():
+    """A turn by 2.5 about a tilted axis with a rate of 3: V = ½ k (θ - α)², the power lost c times the rate squared."""
+    axis, point = np.array([1.0, 2.0, -0.5]), (0.2, 0.0, 0.0)
+    flap = lj.Body("flap", 1.0, (1.0, 1.0, 1.0))
+    for angle in (2.5, -2.5):
+        pose = lj.Pose.at(axis=axis, angle=angle)
+        q, v = {"flap": pose}, {"flap": pose.moving(spin=3.0 * axis / np.linalg.norm(axis))}
+        closer = lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0, lambda p: p["rest"], damping=0.5)
+        assert closer.potential is not None and closer.dissipation is not None
+        params = {"rest": 0.3}
+        np.testing.assert_allclose(closer.potential(0.0, q, v, params), 2.0 * (angle - 0.3) ** 2, rtol=1e-14)
+        np.testing.assert_allclose(closer.dissipation(0.0, q, v, params), 0.25 * 9.0, rtol=1e-14)
+    assert lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0).dissipation is None
