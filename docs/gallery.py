@@ -23,6 +23,8 @@ from lagjax.scenes import SCENES, woodpecker
 jax.config.update("jax_enable_x64", True)
 FOLDER = Path(__file__).parent / "gallery"
 STILLS, COLOURS = 9, 128
+# Of the axis of the spinning top at its start.
+TILT = np.pi / 3
 
 
 def moved(mechanism, end=None, count=121):
@@ -224,12 +226,38 @@ def draw_woodpecker():
     return fig
 
 
+def draw_spinning_top():
+    """A top on its tip, let go with its axis at rest: it nods between two angles and precesses."""
+    top = lj.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
+    tip = lj.spherical(lj.ground.at(), top.at((0.0, 0.0, -0.5)))
+    system = lj.multibody([top], {"tip": tip}, [lj.weight([top])])
+    start = lj.Pose.at().turned((0.0, 1.0, 0.0), TILT)
+    axis = top.direction({"top": start}, (0.0, 0.0, 1.0))
+    start = start._replace(position=0.5 * axis)
+    q, v = {"top": start}, {"top": start.moving(spin=80.0 * axis)}
+    traj = lj.integrate(system, q, v, ts=np.linspace(0.0, 4.3, 431), rtol=1e-8, estimate_error=False)
+    heights = np.asarray(jax.vmap(lambda q: top.direction(q, (0.0, 0.0, 1.0))[2])(traj.q))
+    # Goldstein, Eq. 5.75: x² + p x - q = 0, with a = I_3 ω/I_1, β = 2 m g l/I_1 about the tip.
+    a, beta = 0.05 * 80.0 / 0.35, 2 * 9.81 * 0.5 / 0.35
+    p = a**2 / beta - 2 * np.cos(TILT)
+    dip = (np.sqrt(p**2 + 4 * np.sin(TILT) ** 2) - p) / 2
+    print("lowest height", heights.min(), "known", np.cos(TILT) - dip)
+    end = top.at((0.0, 0.0, 0.3))
+    shapes = [
+        lj.cylinder(top, 0.3, 0.04, color=plots.COLOURS[0]),
+        lj.rod(top.at((0.0, 0.0, -0.5)), end, 0.02, color=plots.COLOURS[1]),
+        lj.trail(end, color=plots.COLOURS[2]),
+        lj.line(lj.ground),
+    ]
+    return traj.draw(shapes, times=[0.0, 1.4, 2.8], view=(-60.0, 24.0))
+
+
 def picture(name):
     """The figure of a scene or mechanism."""
     if name in SCENES:
         return SCENES[name].picture()
-    if name == "woodpecker":
-        return draw_woodpecker()
+    if name in ("woodpecker", "spinning_top"):
+        return globals()[f"draw_{name}"]()
     fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     globals()[f"draw_{name}"](*axes[0])
     return fig
@@ -245,6 +273,6 @@ def save(fig, file):
 
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
-    for name in sys.argv[1:] or [*SCENES, "woodpecker", *MECHANISMS]:
+    for name in sys.argv[1:] or [*SCENES, "woodpecker", *MECHANISMS, "spinning_top"]:
         save(picture(name), FOLDER / f"{name}.png")
         print(name, (FOLDER / f"{name}.png").stat().st_size, flush=True)

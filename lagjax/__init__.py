@@ -54,7 +54,7 @@ from lagjax.analysis import (
     poincare,
     turning_points,
 )
-from lagjax.display import Animation
+from lagjax.display import Animation, Drawing, Shape
 from lagjax.integrate import (
     RESULTS,
     AccuracyWarning,
@@ -144,18 +144,26 @@ if TYPE_CHECKING:
         Marker,
         Pose,
         applied,
+        box,
+        cylinder,
         cylindrical,
+        disk,
         fixed,
         ground,
+        line,
+        mesh,
         motor,
         multibody,
         prismatic,
         revolute,
+        rod,
         rolling,
         rolling_sphere,
+        sphere,
         spherical,
         spring,
         torsion,
+        trail,
         universal,
         weight,
     )
@@ -198,8 +206,8 @@ LATER = {
     ),
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
-        "Body Load Marker Pose applied cylindrical fixed ground motor multibody prismatic revolute rolling "
-        "rolling_sphere spherical spring torsion universal weight"
+        "Body Load Marker Pose applied box cylinder cylindrical disk fixed ground line mesh motor multibody prismatic "
+        "revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.sliders": "Knobs interact",
@@ -256,6 +264,14 @@ __all__ = [
     "torsion",
     "motor",
     "applied",
+    "box",
+    "cylinder",
+    "sphere",
+    "disk",
+    "mesh",
+    "rod",
+    "line",
+    "trail",
     "touches",
     "releases",
     "slips",
@@ -298,6 +314,8 @@ __all__ = [
     "energy_ledger",
     "EnergyLedger",
     "Animation",
+    "Drawing",
+    "Shape",
     "RESULTS",
     "AccuracyWarning",
     "PrecisionWarning",

@@ -4,6 +4,7 @@ from lagjax.bodies.assemble import multibody
 from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
 from lagjax.bodies.joints import cylindrical, fixed, prismatic, revolute, rolling, rolling_sphere, spherical, universal
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
+from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail
 
 __all__ = [
     "Body",
@@ -12,18 +13,26 @@ __all__ = [
     "Marker",
     "Pose",
     "applied",
+    "box",
+    "cylinder",
     "cylindrical",
+    "disk",
     "fixed",
     "ground",
+    "line",
+    "mesh",
     "motor",
     "multibody",
     "prismatic",
     "revolute",
+    "rod",
     "rolling",
     "rolling_sphere",
+    "sphere",
     "spherical",
     "spring",
     "torsion",
+    "trail",
     "universal",
     "weight",
 ]

@@ -7,6 +7,8 @@ import jax
 from lagjax.bodies.body import Body, check_bodies
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Load, generalized_force
+from lagjax.bodies.shapes import usual_shapes
+from lagjax.display import Drawing
 from lagjax.system import Holonomic, Nonholonomic, System
 
 # What else a system may have: arguments of `lj.System` that are passed on.
@@ -71,6 +73,8 @@ def multibody(
         given = generalized_force(loads, t, q, v, params)
         return given if force is None else jax.tree.map(lambda x, y: x + y, given, force(t, q, v, params))
 
+    looks_like = [*(joint.function for joint in joints.values()), *(load.potential for load in loads)]
+    setattr(total, "drawing", Drawing(lambda params: usual_shapes(bodies, looks_like, params)))
     has_dissipation = any(load.dissipation is not None for load in loads)
     has_power = any(load.power is not None for load in loads)
     return System(

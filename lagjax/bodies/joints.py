@@ -18,7 +18,8 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Marker, check_markers, valued
+from lagjax.bodies.body import Ground, Marker, check_markers, valued
+from lagjax.bodies.shapes import disk, line, looks, sphere
 from lagjax.system import Holonomic, Nonholonomic
 
 
@@ -148,7 +149,9 @@ def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonho
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
-    return _on_plane(wheel, floor, radius, lambda n, a: n - jnp.dot(n, a) * a)
+    contact = _on_plane(wheel, floor, radius, lambda n, a: n - jnp.dot(n, a) * a)
+    looks(contact["touches"].function, disk(wheel, radius))
+    return contact
 
 
 def rolling_sphere(ball: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
@@ -162,7 +165,9 @@ def rolling_sphere(ball: Marker, floor: Marker, radius) -> dict[str, Holonomic |
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    return _on_plane(ball, floor, radius, lambda n, a: n)
+    contact = _on_plane(ball, floor, radius, lambda n, a: n)
+    looks(contact["touches"].function, sphere(ball, radius))
+    return contact
 
 
 def _on_plane(wheel: Marker, floor: Marker, radius, down) -> dict[str, Holonomic | Nonholonomic]:
@@ -222,6 +227,7 @@ def _joined(a: Marker, b: Marker, *rows: Callable) -> Holonomic:
     def joint(t, q, params):
         return jnp.concatenate([row(a, b, q, params) for row in rows])
 
+    looks(joint, line(a), *(line(x.body, x) for x in (a, b) if not isinstance(x.body, Ground)))
     return Holonomic(joint)
 
 

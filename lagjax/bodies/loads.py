@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from lagjax.bodies.body import Body, Marker, check_bodies, check_markers, valued
+from lagjax.bodies.shapes import line, looks
 
 
 class Load(NamedTuple):
@@ -83,6 +84,7 @@ def spring(
         rate = jnp.dot(gap, b.velocity(q, v, params) - a.velocity(q, v, params)) / jnp.sqrt(jnp.sum(gap**2))
         return valued(damping, params) * rate**2 / 2
 
+    looks(potential, line(a, b))
     return Load(potential, None if _is_zero(damping) else dissipation)
 
 

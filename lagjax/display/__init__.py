@@ -1,7 +1,22 @@
 """Figures, films, progress."""
 
 from lagjax.display import plots
-from lagjax.display.animation import Animation, film
+from lagjax.display.animation import Animation, film, film_scripts
+from lagjax.display.in_space import (
+    CUBE,
+    CYLINDER,
+    DISK,
+    SPHERE,
+    TUBE,
+    Anchor,
+    Drawing,
+    InSpace,
+    Shape,
+    pose_in_q,
+    rotations,
+    stills_in_space,
+    surface,
+)
 from lagjax.display.plots import COLOURS, DrawnAxes
 from lagjax.display.printable import by_line, is_plain, printable
 from lagjax.display.progress import meter, waiting

@@ -1,8 +1,8 @@
-"""A film of points in the plane that plays in a notebook or a browser: one SVG, its numbers, and a short script.
+"""A film that plays in a notebook or a browser; of points in the plane one SVG, its numbers, and a short script.
 
 It needs no network, no encoder and no other file. If scripts do not run (an untrusted notebook, a preview), the first
 frame is shown. Coordinates are integers in tenths of a pixel, with two bytes each. A film may have several lanes; the
-page shows one of them.
+page shows one of them. Films in space are those of `in_space/film.py`.
 """
 
 import html
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from lagjax.display.in_space.film import film_in_space
+from lagjax.display.in_space.scenery import InSpace
 from lagjax.display.plots import COLOURS
 from lagjax.display.web_page import encoded, fragment, whole
 from lagjax.display.web_page.page import in_bytes
@@ -30,7 +32,8 @@ NOWHERE = -32768
 class Animation:
     """A motion that plays in a notebook, and in a browser from the page that `save` writes.
 
-    - `t` (F,): the time of each frame; `points`: the points drawn, by name, (F, k, 2).
+    - `t` (F,): the time of each frame; `points`: the points drawn, by name, (F, k, 2), or (F, k, 3) in space; or an
+      `InSpace`, what is drawn of bodies.
     - `rate`: frames per second; `trail`: the length of a trail in frames.
 
     >>> import numpy as np
@@ -40,7 +43,7 @@ class Animation:
     1.0
     """
 
-    def __init__(self, t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int):
+    def __init__(self, t: np.ndarray, points: dict[str, np.ndarray] | InSpace, rate: float, trail: int):
         self.t, self.points, self.rate, self.trail = t, points, rate, trail
 
     def save(self, path) -> None:
@@ -48,8 +51,10 @@ class Animation:
         Path(path).write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
 
     def _repr_html_(self):
-        body, spec = film(self.t, {name: x[None] for name, x in self.points.items()}, self.rate, self.trail)
-        return fragment(body, spec, ("decode.js", "film.js"), "film(root, spec);")
+        points = self.points
+        one = points.at(None) if isinstance(points, InSpace) else {name: x[None] for name, x in points.items()}
+        body, spec = film(self.t, one, self.rate, self.trail)
+        return fragment(body, spec, film_scripts(spec), "film(root, spec);")
 
     def __repr__(self):
         seconds = (len(self.t) - 1) / self.rate
@@ -59,12 +64,21 @@ class Animation:
         )
 
 
-def film(t: np.ndarray, points: dict[str, np.ndarray], rate: float, trail: int) -> tuple[str, dict[str, Any]]:
-    """A film as HTML with its first frame, and the data from which `film.js` plays it.
+def film_scripts(spec: dict[str, Any]) -> tuple[str, ...]:
+    """The scripts that play a film with this data, as `film(root, spec)`."""
+    return "decode.js", "player.js", "space.js" if "view" in spec else "film.js"
 
-    **Arguments:** `t` (F,); `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a motion; `rate`, `trail`
-    as in `Animation`.
+
+def film(t: np.ndarray, points: dict[str, np.ndarray] | InSpace, rate: float, trail: int) -> tuple[str, dict[str, Any]]:
+    """A film as HTML with its first frame, and the data from which `film_scripts` play it.
+
+    **Arguments:** `t` (F,); `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a motion; or
+    (N, F, k, 3); or an `InSpace` with lanes; `rate`, `trail` as in `Animation`.
     """
+    if not isinstance(points, InSpace) and next(iter(points.values())).shape[-1] == 3:
+        points = InSpace((), {}, points)
+    if isinstance(points, InSpace):
+        return film_in_space(t, points, rate, trail)
     low, size, scale = _field(points)
     parts = {name: _in_tenths_of_pixels(x, low, size, scale) for name, x in points.items()}
     step = float(t[1] - t[0])

@@ -122,6 +122,29 @@ def _draw_strips(axis, strips: dict[str, list[tuple[float, float, str]]]):
 
 
 @names_as_they_are()
+def stills(motion: dict[str, np.ndarray], chosen: dict[str, np.ndarray]):
+    """Draw some instants of points in the plane in one figure, earlier ones paler, and the path of each last point.
+
+    **Arguments:** `motion`, `chosen`: by name, (F, k, 2), all frames and those that are drawn.
+
+    **Returns:** a matplotlib `Figure`.
+    """
+    fig, axes = figure()
+    axis = axes[0, 0]
+    for i, (name, frames) in enumerate(chosen.items()):
+        color = COLOURS[i % len(COLOURS)]
+        axis.plot(*motion[name][:, -1].T, color=color, linewidth=0.8, alpha=0.4)
+        for shade, points in zip(np.linspace(0.25 if len(frames) > 1 else 1.0, 1.0, len(frames)), frames):
+            label = name if shade == 1.0 and len(chosen) > 1 else None
+            marked = "o-" if len(points) <= 8 else "-"
+            axis.plot(*points.T, marked, color=color, alpha=shade, markersize=4, linewidth=1.4, label=label)
+    axis.set(aspect="equal", xlabel="x", ylabel="y")
+    if len(chosen) > 1:
+        axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return fig
+
+
+@names_as_they_are()
 def families(label: str, x, ts, panels: dict[str, np.ndarray]):
     """Draw curves against time, one panel per coordinate, one curve per value of `x` (N,), which sets its shade.
 

@@ -140,6 +140,8 @@ lagjax.fit.search.search
   Misfit: times large curved doubtful
 lagjax.fit.search.search
   Evaluation: rows well covariance determined singular_values combinations chi2 freedom
+lagjax.bodies.body
+  Pose: position quaternion
 lagjax.fit.result.result
   Fit: problem unknowns cost steps rested misfit costs evaluation units
 """

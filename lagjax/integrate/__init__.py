@@ -21,9 +21,11 @@ from lagjax.integrate.solve.phases import phases_in, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for
 from lagjax.integrate.solve.segments import switches_before_any
 from lagjax.integrate.trajectory.dense_output import in_one_solve
-from lagjax.integrate.trajectory.drawing import curves, drawn, film_of_lanes
+from lagjax.integrate.trajectory.drawing import curves
 from lagjax.integrate.trajectory.error_report import angle_mask
+from lagjax.integrate.trajectory.films import film_of_lanes
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, in_words, is_among, message
 from lagjax.integrate.trajectory.save import described, parts
+from lagjax.integrate.trajectory.subject import drawn
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Snapshot, Trajectory

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display import COLOURS, Page, encoded, film, fragment, in_bytes
+from lagjax.display import COLOURS, Page, encoded, film, film_scripts, fragment, in_bytes
 from lagjax.integrate import RESULTS, Trajectory, film_of_lanes
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import NOT_RUN, TRUSTED
@@ -150,7 +150,7 @@ def page_of(
         f'<div data-controls=""></div><p data-status="" role="status">{notice}</p>\n{body}'
         f'<div data-views=""></div>{note}'
     )
-    page = fragment(body, spec, ("decode.js", "film.js", "chart.js", "sliders.js"))
+    page = fragment(body, spec, (*film_scripts(film_spec or {}), "chart.js", "sliders.js"))
     dims = " x ".join(f"{name} ({n})" for name, n in axes.dims.items())
     return Page(f"Sweep over {', '.join(axes.names)}", page, f"Page of {axes.size:,} points, {dims}")
 
@@ -229,7 +229,7 @@ def _film(
             "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds."
         )
     at, points, kept = film_of_lanes(trajs, positions, seconds, rate, trail, [code == EVENT for code in codes])
-    size = BASE64_FACTOR * 2 * sum(x.size for x in points.values())
+    size = BASE64_FACTOR * sum((2 if x.shape[-1] == 2 else 4) * x.size for x in points.values())
     if size > 1e6 * megabytes:
         raise ValueError(
             f"the film would take {in_bytes(size)}, but the page may have {megabytes:g} MB.\n"

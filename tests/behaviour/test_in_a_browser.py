@@ -9,10 +9,12 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import image
 
 import lagjax as lj
 from benchmarks.speed.browser import Browser, installed
-from lagjax.display.animation import Animation, film
+from lagjax.display import CUBE, SPHERE, TUBE, Anchor, InSpace, Shape
+from lagjax.display.animation import Animation, film, film_scripts
 from lagjax.display.web_page import fragment, whole
 
 pytestmark = [
@@ -201,7 +203,7 @@ def test_a_film_plays(browser, tmp_path):
 def test_films_of_several_lanes(browser, tmp_path):
     """Each lane has its own frames; a lane without a motion says so."""
     body, spec = film(*circle(3), 25.0, 10)
-    html = fragment(body, {"film": spec}, ("decode.js", "film.js"), "window.show = film(root, spec.film);")
+    html = fragment(body, {"film": spec}, film_scripts(spec), "window.show = film(root, spec.film);")
     page = opened(browser, tmp_path, whole("Lanes", html))
     reach = []
     for lane in (0, 1, 2, 0):
@@ -220,7 +222,8 @@ def test_for_everybody(browser, tmp_path, text, width):
     Animation(t, {name: x[0] for name, x in points.items()} | {"tip": points["rod"][0, :, 1:]}, 25.0, 10).save(
         tmp_path / "film.html"
     )
-    for file in ("sweep.html", "film.html"):
+    Animation(*tumbling(), 25.0, 10).save(tmp_path / "space.html")
+    for file in ("sweep.html", "film.html", "space.html"):
         assert browser.open(tmp_path / file, width=width).run(AUDIT) == []
     # Twin: a missing label and pale text are found.
     changed = text.replace('element(row, "label", {for: id}, axis.name);', "").replace("color: #222", "color: #aaa")
@@ -244,3 +247,126 @@ def test_the_browser_can_complain(browser, tmp_path):
     html = '<script>throw Error("twin")</script><img src="http://127.0.0.1:9/picture.png">'
     told = json.dumps(opened(browser, tmp_path, html).complaints())
     assert "twin" in told and "picture.png" in told
+
+
+def tumbling():
+    """A box that moves and turns, a ball on a rod, a line in space, and a trail."""
+    t = np.linspace(0.0, 2.0, 51)
+    turn = np.stack([np.cos(t), 0.6 * np.sin(t), 0 * t, 0.8 * np.sin(t)], axis=1)
+    poses = {
+        "box": np.concatenate([np.stack([t, 0 * t, 1 + t], axis=1), turn], axis=1),
+        "ball": np.concatenate([np.stack([t, 1 + t, 0 * t + 1], axis=1), turn], axis=1),
+    }
+    at = lambda name, *point: Anchor(name, np.array(point))
+    shapes = (
+        Shape("solid", (at("box", 0.0, 0.0, 0.0),), CUBE, np.array([1.0, 0.5, 0.2])),
+        Shape("solid", (at("ball", 0.0, 0.0, 0.0),), SPHERE, 0.4 * np.ones(3)),
+        Shape("rod", (at("box", 0.0, 0.0, 0.0), at("ball", 0.0, 0.0, 0.0)), TUBE, np.array([0.05, 0.05, 1.0])),
+        Shape("dot", (at("box", 0.5, 0.25, 0.1),), color="#000000"),
+        Shape("trail", (at("ball", 0.0, 0.0, 0.4),)),
+    )
+    return t, InSpace(shapes, poses, {"wire": np.stack([np.zeros((51, 3)), poses["box"][:, :3]], axis=1)})
+
+
+def pixels(page, tmp_path):
+    """What is visible, as numbers (rows, columns, 3)."""
+    page.picture(tmp_path / "seen.png")
+    return image.imread(tmp_path / "seen.png")[:, :, :3]
+
+
+def test_the_canvas_shows_what_the_first_frame_does(browser, tmp_path):
+    """Painted by the script, a frame has the pixels of the SVG that Python paints, but for edges.
+
+    Twins: seen from five degrees to the side, or with a sign wrong in the rotation, it has not.
+    """
+    t, motion = tumbling()
+    text = Animation(t[40:], motion.at(slice(40, None)), 25.0, 0)._repr_html_()
+    svg = re.search(r"<svg.*?</svg>", text, re.DOTALL)
+    assert svg is not None
+    size = {"width": 560, "height": 520}
+    by_python = pixels(opened(browser, tmp_path, f"<body style='margin:0'>{svg[0]}", **size), tmp_path)
+
+    def differ(text: str, *keys: str):
+        page = opened(browser, tmp_path, whole("Film", text), **size)
+        page.run("document.body.replaceChildren(document.querySelector('canvas')); document.body.style.margin = 0")
+        page.run("document.querySelector('canvas').focus({focusVisible: false})")
+        for key in keys:
+            page.press(key)
+        page.run("document.querySelector('canvas').blur()")
+        page.run("new Promise(done => setTimeout(done, 50))")
+        assert page.complaints() == []
+        return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250]))
+
+    near, sign = differ(text), "2 * (x * y + w * z)"
+    assert near < 0.002 and text.count(sign) == 1
+    assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(sign, "2 * (x * y - w * z)")) > 3 * near
+
+
+def test_a_film_in_space_turns_and_zooms(browser, tmp_path):
+    """By mouse, wheel, fingers and keys the picture changes; the first view comes back, pixel by pixel; it plays."""
+    Animation(*tumbling(), 25.0, 10).save(tmp_path / "film.html")
+    page = browser.open(tmp_path / "film.html", width=700, height=620)
+    canvas = "document.querySelector('canvas')"
+    words = page.run(f"{canvas}.ariaLabel")
+    assert words.startswith("Motion in space of box, ball, wire, t = 0.00") and "Arrow keys" in words
+    first, centre = pixels(page, tmp_path), "b => [b.x + b.width / 2, b.y + b.height / 2]"
+    x, y = page.run(f"({centre})({canvas}.getBoundingClientRect())")
+
+    def mouse(kind, dx=0.0, dy=0.0, **more):
+        page.ask("Input.dispatchMouseEvent", type=kind, x=x + dx, y=y + dy, button="left", clickCount=1, **more)
+
+    def fingers(kind, *places):
+        points = [{"x": x + dx, "y": y + dy, "id": i} for i, (dx, dy) in enumerate(places)]
+        page.ask("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+    def changed():
+        return np.mean(np.abs(pixels(page, tmp_path) - first))
+
+    def drag(**more):
+        mouse("mousePressed", **more)
+        mouse("mouseMoved", 80.0, 30.0, buttons=1, **more)
+        mouse("mouseReleased", 80.0, 30.0, **more)
+
+    def pinch():
+        fingers("touchStart", (-40, 0), (40, 0))
+        fingers("touchMove", (-90, 0), (90, 0))
+        fingers("touchEnd")
+
+    wheel = lambda: page.ask("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-300)
+    for act in (drag, lambda: drag(modifiers=8), wheel, pinch):
+        act()
+        page.run("new Promise(done => setTimeout(done, 50))")
+        assert changed() > 0.005
+        page.run(f"{canvas}.ondblclick()")
+        assert changed() == 0.0
+    page.run(f"{canvas}.focus({{focusVisible: false}})")
+    for key in ("ArrowLeft", "ArrowUp", "+"):
+        page.press(key)
+    assert changed() > 0.005
+    page.press("Home")
+    page.run(f"{canvas}.blur()")
+    assert changed() < 1e-3
+    page.run("document.querySelector('[data-film] input').focus()")
+    for _ in range(25):
+        page.press("ArrowRight")
+    assert page.run(f"{canvas}.ariaLabel").startswith("Motion in space of box, ball, wire, t = 1.00")
+    page.press(" ")
+    page.wait(f"!{canvas}.ariaLabel.includes('t = 1.00')")
+    assert page.complaints() == []
+
+
+def test_lanes_in_space(browser, tmp_path):
+    """A lane with twice the radius is drawn at twice the size; one without a motion says so."""
+    t, points = circle(3)
+    body, spec = film(t, {name: np.concatenate([x, 0 * x[..., :1]], axis=-1) for name, x in points.items()}, 25.0, 0)
+    html = fragment(body, {"film": spec}, film_scripts(spec), "window.show = film(root, spec.film);")
+    page = opened(browser, tmp_path, whole("Lanes", html), width=700)
+    blue = []
+    for lane in (0, 1):
+        page.run(f"show({lane})")
+        blue.append(np.sum(pixels(page, tmp_path)[..., 2] - pixels(page, tmp_path)[..., 0] > 0.5))
+    page.run("show(2)")
+    assert 1.4 < blue[1] / blue[0] < 2.1 and "no motion to draw" in page.run(
+        "document.querySelector('canvas').ariaLabel"
+    )
+    assert page.complaints() == []

@@ -90,7 +90,7 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
 
 
 def encoded(x, dtype: str) -> tuple[str, str]:
-    """An array in the form read by `decode`: its type, `"f4"`, `"f8"`, `"i1"` or `"i2"`, and little-endian base64."""
+    """An array in the form read by `decode`: its type, "f4", "f8", "i1", "i2" or "i4", and little-endian base64."""
     return dtype, b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
 
 

@@ -1,28 +1,19 @@
-"""What is drawn of a trajectory: its curves and charges by the user's names, and its film.
+"""What is plotted of a trajectory: its curves and charges by the user's names.
 
 Some charges follow from the structure of a system: the momenta of coordinates that neither L nor a constraint contains,
 and the Jacobi integral if nothing depends on time. `lj.symmetries` finds the others.
-
-Between outputs a film interpolates q by a cubic (Hermite's), with v as its slope:
-
-    q(t_i + s h) = (1 + 2 s)(1 - s)² q_i + s² (3 - 2 s) q_{i+1} + h s (1 - s)² v_i - h s² (1 - s) v_{i+1}
-
-The values at outputs are exact; between them the error falls with the fourth power of their distance, which is enough
-for pictures if outputs are dense. To check this, every other output is left out and interpolated from the rest: it is
-then wrong by about sixteen times the error.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display import Animation
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import Generator, NoetherCharge, conserved_momenta, conserves_jacobi_integral
-from lagjax.system import Call, check_arguments, coordinates
+from lagjax.system import coordinates
 
 
 def curves(tree: PyTree):
@@ -49,178 +40,6 @@ def columns(values):
     if values.ndim == 1:
         return [("", values)]
     return [(f"[{i}]", column) for i, column in enumerate(values.T)]
-
-
-# Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
-MAY_MISS = 0.16
-# The shortest and the longest film, in seconds, if the user does not give its length.
-SHORTEST, LONGEST = 2.0, 20.0
-
-
-def film(
-    traj, positions: Callable, seconds: float | None, rate: float, trail: float, ended_by_event: bool
-) -> Animation:
-    """Return the frames of one trajectory as they are drawn."""
-    _check_positions(positions)
-    t, q, v = _reached(traj, ended_by_event)
-    at, kept = _frames(t[0], t[-1], seconds, rate, trail)
-    points = drawn(positions, at, hermite(t, q, v, at), traj.params)
-    _check_dense(positions, t, q, v, traj.params, points)
-    return Animation(at, points, rate, kept)
-
-
-def film_of_lanes(
-    trajs: list, positions: Callable, seconds: float | None, rate: float, trail: float, by_event: Sequence[bool]
-) -> tuple[np.ndarray, dict[str, np.ndarray], int]:
-    """Return frames of several trajectories (None for a lane without one) at shared times, for `animation.film`.
-
-    A motion that ends before the others stays where it ended; one with fewer than three outputs is NaN.
-    """
-    _check_positions(positions)
-    lanes = []
-    for traj, ended in zip(trajs, by_event):
-        try:
-            lanes.append(None if traj is None else _reached(traj, ended))
-        except ValueError:
-            lanes.append(None)
-    ends = [(lane[0][0], lane[0][-1]) for lane in lanes if lane is not None]
-    if not ends:
-        raise ValueError("no point has a motion to draw.\nUsual cause: all failed at their start; see swept.counts().")
-    backward = ends[0][1] < ends[0][0]
-    first, last = (max, min) if backward else (min, max)
-    at, kept = _frames(first(start for start, _ in ends), last(end for _, end in ends), seconds, rate, trail)
-    found = []
-    for traj, lane in zip(trajs, lanes):
-        if traj is None or lane is None:
-            found.append(None)
-            continue
-        t, q, v = lane
-        here = np.clip(at, min(t[0], t[-1]), max(t[0], t[-1]))
-        found.append(drawn(positions, here, hermite(t, q, v, here), traj.params))
-        _check_dense(positions, t, q, v, traj.params, found[-1])
-    like = next(points for points in found if points is not None)
-    nothing = {name: np.full_like(x, np.nan) for name, x in like.items()}
-    found = [nothing if points is None else points for points in found]
-    shapes = {tuple((name, x.shape) for name, x in points.items()) for points in found}
-    if len(shapes) != 1:
-        raise ValueError(
-            "positions(t, q, params) must return the same points for all motions.\n"
-            "Fix: return points of one shape for each name, without if."
-        )
-    return at, {name: np.stack([points[name] for points in found]) for name in like}, kept
-
-
-def _check_positions(positions: Callable):
-    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
-
-
-def _frames(start, end, seconds: float | None, rate: float, trail: float):
-    """Return the times of the frames, and how many frames the trail keeps."""
-    seconds = float(np.clip(abs(end - start), SHORTEST, LONGEST)) if seconds is None else seconds
-    count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
-    if count < 2 or not trail >= 0:
-        raise ValueError(
-            f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is not a film.\n"
-            "Fix: traj.animate(positions, seconds=10.0), and a trail of zero or more seconds."
-        )
-    return np.linspace(start, end, count), int(min(trail * rate, count))
-
-
-def hermite(t: np.ndarray, q: PyTree, v: PyTree, at):
-    """Return q at the times `at`, from values and slopes at the times t; each leaf (T, ...) becomes (len(at), ...)."""
-    if t[-1] < t[0]:
-        t, q, v = jax.tree.map(lambda x: x[::-1], (t, q, v))
-    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    h = t[i + 1] - t[i]
-
-    def leaf(q: PyTree, v: PyTree):
-        width, s = (x.reshape(-1, *(1,) * (q.ndim - 1)) for x in (h, (at - t[i]) / h))
-        values = (1 + 2 * s) * (1 - s) ** 2 * q[i] + s**2 * (3 - 2 * s) * q[i + 1]
-        return values + width * s * (1 - s) * ((1 - s) * v[i] - s * v[i + 1])
-
-    return jax.tree.map(leaf, q, v)
-
-
-def _reached(traj, ended_by_event):
-    """Return times, q and v of the outputs that the motion reached, and of the event that ended it.
-
-    If it failed, the last state is left out: when steps collapse, its velocity is too large for interpolation.
-    """
-    outputs, end = (traj.t, traj.q, traj.v), (traj.end.t, traj.end.q, traj.end.v)
-    outputs, end = jax.tree.map(np.asarray, (outputs, end))
-    there = np.isfinite(np.concatenate([x.reshape(len(x), -1) for x in jax.tree.leaves(outputs)], axis=1)).all(axis=1)
-    t, q, v = jax.tree.map(lambda x: x[there], outputs)
-    if ended_by_event and abs(end[0] - t[0]) > abs(t[-1] - t[0]):
-        t, q, v = jax.tree.map(lambda x, last: np.concatenate([x, last[None]]), (t, q, v), end)
-    if len(t) < 3:
-        raise ValueError(
-            f"there are {len(t)} states to draw, but a film needs at least three.\n"
-            "Usual cause: ts of two times, or a motion that failed at its start (see traj.result).\n"
-            "Fix: ts=jnp.linspace(t0, t1, 201)."
-        )
-    return t, q, v
-
-
-def drawn(positions: Callable, t: np.ndarray, q: PyTree, params: PyTree) -> dict[str, np.ndarray]:
-    """Return the points that `positions` gives for each state: by name, (T, k, 2)."""
-    frames = []
-    for i, now in enumerate(t):
-        found = positions(now, jax.tree.map(lambda x: x[i], q), params)
-        found = found if isinstance(found, Mapping) else {"": found}
-        frames.append({name: _points(name, value) for name, value in found.items()})
-    shapes = {tuple((name, x.shape) for name, x in frame.items()) for frame in frames}
-    if len(shapes) != 1 or not frames[0]:
-        raise ValueError(
-            "positions(t, q, params) must return the same points, at least one, at all times.\n"
-            "Fix: return NaN-free points of one shape for each name, without if."
-        )
-    drawn = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
-    for name, x in drawn.items():
-        if not np.all(np.isfinite(x)):
-            first = t[~np.isfinite(x).all(axis=(1, 2))][0]
-            raise ValueError(
-                f"positions(t, q, params) returned NaN or infinity{_of(name)} at t = {first:.6g}.\n"
-                "Usual cause: a root or a quotient outside its domain, or NaN in params.\n"
-                "Fix: evaluate positions there, term by term."
-            )
-    return drawn
-
-
-def _points(name: str, value):
-    """Return one point or several as (k, 2), or raise."""
-    try:
-        x = np.asarray(value, float)
-        shape = f"an array of shape {x.shape}"
-    except (TypeError, ValueError):
-        x, shape = np.zeros(0), f"a {type(value).__name__} that is not an array of numbers"
-    if x.shape[-1:] != (2,) or x.ndim > 2 or x.size == 0:
-        raise ValueError(
-            f"positions(t, q, params) must return points of the plane, but returned {shape}{_of(name)}.\n"
-            "Usual cause: three coordinates in space, an angle in place of a point, or a coordinate of shape (1,).\n"
-            'Fix: return (x, y), points (k, 2) linked in order, or such points by name: {"rod": [(0, 0), (x, y)]}.'
-        )
-    return x.reshape(-1, 2)
-
-
-def _of(name: str):
-    return f" for '{name}'" if name else ""
-
-
-def _check_dense(positions: Callable, t: np.ndarray, q: PyTree, v: PyTree, params: PyTree, points):
-    """Raise if the outputs are too far apart to interpolate between them."""
-    every_other, skipped = slice(None, None, 2), slice(1, len(t) - 1, 2)
-    half_q, half_v = jax.tree.map(lambda x: x[every_other], (q, v))
-    guessed = drawn(positions, t[skipped], hermite(t[every_other], half_q, half_v, t[skipped]), params)
-    known = drawn(positions, t[skipped], jax.tree.map(lambda x: x[skipped], q), params)
-    size = max(np.ptp(x.reshape(-1, 2), axis=0).max() for x in points.values())
-    missed = max(np.abs(guessed[name] - known[name]).max() for name in known)
-    if missed > MAY_MISS * size:
-        raise ValueError(
-            f"{len(t)} outputs are too few to draw what happens between them: interpolated from every other one, the "
-            f"rest would be misplaced by {missed / size:.0%} of the picture.\n"
-            "Usual cause: fewer than about ten outputs for each oscillation.\n"
-            f"Fix: ts=jnp.linspace({t[0]:.6g}, {t[-1]:.6g}, {8 * len(t) + 1})."
-        )
 
 
 PANEL, LONG = "change of charges\nat the outputs", 28

@@ -1,7 +1,7 @@
 """The result of an integration: times, states, multipliers, and how it went."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from lagjax.display import Animation, printable
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
-from lagjax.integrate.trajectory import drawing, error_report
+from lagjax.integrate.trajectory import error_report, films
 from lagjax.integrate.trajectory.dense_output import at
 from lagjax.integrate.trajectory.drawing import curves, finite, panels
 from lagjax.integrate.trajectory.error_report import Errors, angle_mask
@@ -212,9 +212,9 @@ class Trajectory(eqx.Module):
         return plot.phase_portrait({name: (drawn[name], bool(yes)) for name, yes in zip(drawn, is_angle)})
 
     def animate(
-        self, positions: Callable, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
+        self, positions: Any = None, *, seconds: float | None = None, rate: float = 25.0, trail: float = 2.0
     ) -> Animation:
-        """Animate the motion: points in the plane, lines that link them, and trails.
+        """Animate the motion: points, lines that link them and trails, in the plane or in space; and bodies.
 
         >>> import jax.numpy as jnp
         >>> import lagjax as lj
@@ -226,21 +226,41 @@ class Trajectory(eqx.Module):
 
         **Arguments:**
 
-        - `positions`: `positions(t, q, params)` -> a point `(x, y)`; or points (k, 2), linked by lines in order; or a
-          dictionary of these, each name in its own colour. The last point of each leaves a trail. Plain NumPy works.
+        - `positions`: `positions(t, q, params)` -> a point `(x, y)` or `(x, y, z)`; or points (k, 2) or (k, 3), linked
+          by lines in order; or a dictionary of these, each name in its own colour. The last point of each leaves a
+          trail. Plain NumPy works. Or shapes, `[lj.box(body, size), lj.trail(body)]`, functions among them; a
+          `lj.Drawing`; or nothing for `lj.multibody`, whose bodies are drawn as boxes with their inertia.
         - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
         - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope: an impact or a
           pulse between two of them is smoothed away.
         - `trail`: how many seconds of playing the trails reach back.
 
+        In space z is up. Drag to turn, wheel or pinch to zoom, shift and drag to move.
+
         **Returns:** an `Animation`. It ends with the motion: at an event, or at the last output before it failed.
 
-        **Raises:** `ValueError` for a batched trajectory, positions that are not points of the plane, and outputs too
-        far apart to tell what happens between them.
+        **Raises:** `ValueError` for a batched trajectory, positions that are not points, bodies whose pose is not
+        known, and outputs too far apart to tell what happens between them; `TypeError` for what cannot be drawn.
         """
         self._check_alone("animate(positions)")
         ended_by_event = bool(self.result == RESULTS.event_occurred)
-        return drawing.film(self, positions, seconds, rate, trail, ended_by_event)
+        return films.film(self, positions, seconds, rate, trail, ended_by_event)
+
+    def draw(self, positions: Any = None, *, times: ArrayLike = 5, view: tuple[float, float] = (-60.0, 22.0)):
+        """Draw several instants of the motion in one figure, earlier ones paler; returns a matplotlib `Figure`.
+
+        **Arguments:**
+
+        - `positions`: what is drawn, as in `animate`.
+        - `times`: how many instants, equally far apart from the start to the end; or their times.
+        - `view`: from where it is seen, in space: azimuth and elevation of the eye, in degrees. z is up, and all axes
+          have one scale.
+
+        **Raises:** `ImportError` without matplotlib; `ValueError` as `animate`, and for times outside of the motion.
+        """
+        self._check_alone("draw(positions)")
+        ended_by_event = bool(self.result == RESULTS.event_occurred)
+        return films.figure(self, positions, times, view, ended_by_event)
 
     def _of_system(self):
         """The printed rows on the system and its events."""

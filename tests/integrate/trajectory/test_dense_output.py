@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 import lagjax as lj
-from lagjax.integrate.trajectory.drawing import hermite
+from lagjax.integrate.trajectory.films import hermite
 from tests.counting import compiles
 
 TS = np.linspace(0.0, 4.0, 9)

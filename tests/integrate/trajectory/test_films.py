@@ -1,4 +1,4 @@
-"""Interpolation between outputs for films: exact at outputs, of fourth order between, and refused if too coarse."""
+"""Films and figures: interpolation is exact at outputs, of fourth order between, and refused if too coarse; bodies."""
 
 import diffrax
 import jax
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.trajectory.drawing import hermite
+from lagjax.integrate.trajectory.films import hermite
 from tests.systems import PARAMS, TS, pendulum
 
 DENSE = np.linspace(0.0, 2.0, 41)
@@ -97,9 +97,11 @@ def test_a_batch_is_animated_lane_by_lane():
 
 
 def test_positions_that_are_no_points(traj):
-    """Three coordinates, a number, words, a changing number of points and NaN are refused by name, with a fix."""
-    with refused(r"shape \(3,\) for 'bob'", "Usual cause"):
-        traj.animate(lambda t, q, params: {"bob": (q, q, q)})
+    """Four coordinates, a number, words, a changing number of points and NaN are refused by name, with a fix."""
+    with refused(r"shape \(4,\) for 'bob'", "Usual cause"):
+        traj.animate(lambda t, q, params: {"bob": (q, q, q, q)})
+    with refused("of the plane or points of space"):
+        traj.animate(lambda t, q, params: {"bob": (q, q, q), "pin": (q, q)})
     with refused(r"shape \(\)"):
         traj.animate(lambda t, q, params: q)
     with refused("a str"):
@@ -128,6 +130,73 @@ def test_no_time_to_play(traj):
             traj.animate(bob, seconds=seconds)
     with refused("is not a film"):
         traj.animate(bob, trail=-1.0)
+
+
+ROD = lj.Body("rod", 1.0, (0.1, 0.1, 0.01))
+SHAPES = [lj.box(ROD, (0.1, 0.1, 1.0)), lj.trail(ROD.at((0.0, 0.0, -0.5))), lj.line(lj.ground, ROD)]
+
+
+def swung(name, q, params):
+    """The rod of a pendulum in the plane y = 0: down at q = 0, turned about -y."""
+    return lj.Pose.at((0.5 * jnp.sin(q), 0.0, -0.5 * jnp.cos(q)), axis=(0.0, -1.0, 0.0), angle=q)
+
+
+def test_bodies_by_their_poses(traj):
+    """Poses are those of the interpolated angle, in the order of shapes; the rod's end is where the function says."""
+    tip = lambda t, q, params: {"tip": (np.sin(q), 0.0, -np.cos(q))}
+    film = traj.animate(lj.Drawing([*SHAPES, tip], swung), seconds=4.0, rate=20.0)
+    drawn = film.points
+    assert len(drawn.shapes) == 3 and list(drawn.poses) == ["rod"] and drawn.poses["rod"].shape == (81, 7)
+    end = drawn.place(drawn.shapes[1].anchors[0])
+    np.testing.assert_allclose(end, drawn.points["tip"][:, 0], atol=1e-12)
+    # Twin: turned the other way it is elsewhere.
+    other = traj.animate(lj.Drawing(SHAPES, lambda name, q, params: swung(name, -q, params)), seconds=4.0, rate=20.0)
+    assert np.abs(other.points.place(drawn.shapes[1].anchors[0]) - drawn.points["tip"][:, 0]).max() > 0.1
+
+
+def test_sizes_by_params(traj):
+    """Lengths and points that are functions of params have their values; a single number is refused."""
+    disk = lj.disk(ROD.at(lambda params: (0.0, 0.0, -params["l"])), radius=lambda params: 0.1 * params["l"])
+    drawn = traj.animate(lj.Drawing(lambda params: [disk], swung)).points
+    np.testing.assert_allclose(drawn.shapes[0].size, 0.1 * PARAMS["l"])
+    np.testing.assert_allclose(drawn.shapes[0].anchors[0].point, [0.0, 0.0, -PARAMS["l"]])
+    with pytest.raises(ValueError, match="the size of a shape must be three finite numbers, and is 0.3"):
+        traj.animate(lj.Drawing([lj.box(ROD, 0.3)], swung))
+
+
+def test_shapes_that_cannot_be_drawn(traj):
+    """Unknown poses, bodies for shapes, nothing that moves, plane beside space, wrong poses: each says what to do."""
+    with refused("where the body 'rod' is", "lj.Drawing"):
+        traj.animate(SHAPES)
+    with refused("nothing says how this system is drawn"):
+        traj.animate()
+    with refused("fixed in space"):
+        traj.animate(lj.sphere(lj.ground, 1.0))
+    with refused("some in space"):
+        traj.animate(lj.Drawing([*SHAPES, bob], swung))
+    with pytest.raises(ValueError, match="'rod' is NaN or infinite at t = 0"):
+        traj.animate(lj.Drawing(SHAPES, lambda name, q, params: lj.Pose.at((jnp.nan * q, 0.0, 0.0))))
+    with pytest.raises(ValueError, match=r"has the shapes \(\) and \(\)"):
+        traj.animate(lj.Drawing(SHAPES, lambda name, q, params: (q, q)))
+    for wrong, word in ((ROD, "not Body"), ([ROD], "list of Body"), ([], "not list")):
+        with pytest.raises(TypeError, match=word):
+            traj.animate(wrong)
+
+
+def test_figures(traj):
+    """Instants by number or by time, in the plane and in space, of one state too; times outside are refused."""
+    for what in (bob, lj.Drawing(SHAPES, swung), lambda t, q, params: (q, q, q)):
+        assert len(traj.draw(what, times=[0.0, 0.7]).axes) == 1
+    (axis,) = traj.draw(bob, times=4).axes
+    drawn = [line.get_xydata() for line in axis.lines[1:]]
+    known = [bob(t, q, PARAMS)["rod"] for t, q in zip(traj.t, traj.q)]
+    np.testing.assert_allclose([drawn[0], drawn[-1]], [known[0], known[-1]], atol=1e-12)
+    assert len(drawn) == 4 and axis.get_aspect() == 1.0
+    for times in ([2.1], -0.1, 0, []):
+        with refused("between 0 and 2"):
+            traj.draw(bob, times=times)
+    start = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS[:2])
+    assert start.draw(bob, times=1).axes
 
 
 def test_prints_what_it_is(traj):

@@ -1,0 +1,171 @@
+"""What a film or a figure shows of a motion: points that a function gives, and shapes fixed in bodies."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from lagjax.display import Drawing, InSpace, Shape, pose_in_q
+from lagjax.system import Call, Traced, UnknownSystem, check_arguments
+
+# States whose poses are computed together.
+BLOCK = 256
+
+
+class Subject(NamedTuple):
+    """What is drawn: `functions` of (t, q, params) that give points, and `shapes`, with `pose` for their bodies."""
+
+    functions: tuple[Callable, ...]
+    shapes: tuple[Shape, ...]
+    pose: Callable
+    params: PyTree
+
+    def frames(self, t: np.ndarray, q: PyTree) -> dict[str, np.ndarray] | InSpace:
+        """What is drawn at times (F,) and states: points by name, (F, k, 2) or (F, k, 3); with shapes, an `InSpace`."""
+        points: dict[str, np.ndarray] = {}
+        for function in self.functions:
+            points |= drawn(function, t, q, self.params)
+        if len({x.shape[-1] for x in points.values()} | ({3} if self.shapes else set())) > 1:
+            raise ValueError(
+                "some of what is drawn is in the plane, and some in space.\nFix: three coordinates for each point."
+            )
+        if not self.shapes:
+            return points
+        names = tuple(dict.fromkeys(a.body for shape in self.shapes for a in shape.anchors if a.body is not None))
+        return InSpace(self.shapes, self._poses(names, t, q), points)
+
+    def _poses(self, names: tuple[str, ...], t: np.ndarray, q: PyTree) -> dict[str, np.ndarray]:
+        def at(q: PyTree):
+            return [tuple(self._pose(name, q)) for name in names]
+
+        # In whole blocks, so that all calls for one film are compiled once.
+        count = BLOCK * -(-len(t) // BLOCK)
+        padded = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], count - len(t), axis=0)]), q)
+        found = {}
+        for name, pose in zip(names, (at if self.pose is pose_in_q else jax.jit(jax.vmap(at)))(padded)):
+            position, quaternion = (np.asarray(x, float)[: len(t)] for x in pose)
+            if position.shape[1:] != (3,) or quaternion.shape[1:] != (4,):
+                raise ValueError(
+                    f"the pose of '{name}' must be a point of space (3,) and a quaternion (4,), and has the shapes "
+                    f"{position.shape[1:]} and {quaternion.shape[1:]}."
+                )
+            found[name] = np.concatenate([position, quaternion], axis=1)
+            if not np.all(np.isfinite(found[name])):
+                first = t[~np.isfinite(found[name]).all(axis=1)][0]
+                raise ValueError(
+                    f"the pose of '{name}' is NaN or infinite at t = {first:.6g}.\n"
+                    "Fix: evaluate it there, term by term."
+                )
+        return found
+
+    def _pose(self, name: str, q: PyTree):
+        try:
+            position, quaternion = self.pose(name, q, self.params)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"it is not known where the body '{name}' is.\n"
+                "Usual cause: a body of another system, or coordinates that are not poses.\n"
+                "Fix: lj.Drawing(shapes, pose=lambda name, q, params: (position, quaternion)) in place of the shapes."
+            ) from error
+        return position, quaternion
+
+
+def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
+    """The subject that a user asks for: None, a function, a shape, several of them, or a `lj.Drawing`."""
+    if what is None:
+        what = known_drawing(system)
+        if what is None:
+            raise ValueError(
+                "nothing says how this system is drawn.\n"
+                "Fix: traj.animate(lambda t, q, params: (q[0], q[1])), a function that gives points, or shapes, "
+                "traj.animate([lj.box(body, (1.0, 0.2, 0.2))])."
+            )
+    # Where its bodies are is known of a system whatever is drawn of it.
+    drawing = what if isinstance(what, Drawing) else (known_drawing(system) or Drawing(()))._replace(shapes=what)
+    if not isinstance(what, Drawing) and callable(what):
+        parts = [what]
+    else:
+        parts = drawing.shapes(params) if callable(drawing.shapes) else drawing.shapes
+    parts = [parts] if isinstance(parts, Shape) else parts
+    if not isinstance(parts, Sequence) or not all(isinstance(x, Shape) or callable(x) for x in parts) or not parts:
+        raise TypeError(
+            f"what is drawn must be a function positions(t, q, params) or shapes, not {type(parts).__name__}"
+            f"{' of ' + type(parts[0]).__name__ if isinstance(parts, Sequence) and len(parts) else ''}.\n"
+            "Usual cause: bodies in place of their shapes.\nFix: traj.animate([lj.box(body, (1.0, 0.2, 0.2))])."
+        )
+    functions = tuple(x for x in parts if not isinstance(x, Shape))
+    for function in functions:
+        check_positions(function)
+    shapes = tuple(x.with_params(params) for x in parts if isinstance(x, Shape))
+    if not functions and all(shape.owner is None for shape in shapes):
+        raise ValueError(
+            "nothing of what is drawn moves: all shapes are fixed in space.\n"
+            "Fix: give the bodies, too, traj.animate([lj.sphere(body, 0.1), lj.line(lj.ground, body)])."
+        )
+    return Subject(functions, shapes, drawing.pose, params)
+
+
+def known_drawing(system: Any) -> Drawing | None:
+    """How a system says that it is drawn: the attribute `drawing` of its Lagrangian, or None."""
+    if isinstance(system, UnknownSystem):
+        return None
+    lagrangian = system.phases[0].lagrangian
+    return getattr(lagrangian.program.function if isinstance(lagrangian, Traced) else lagrangian, "drawing", None)
+
+
+def check_positions(positions: Any) -> None:
+    """Raise unless this is a function of (t, q, params)."""
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+
+
+def drawn(positions: Callable, t: np.ndarray, q: PyTree, params: PyTree) -> dict[str, np.ndarray]:
+    """Return the points that `positions` gives for each state: by name, (T, k, 2) or (T, k, 3)."""
+    frames = []
+    for i, now in enumerate(t):
+        found = positions(now, jax.tree.map(lambda x: x[i], q), params)
+        found = found if isinstance(found, Mapping) else {"": found}
+        frames.append({name: _points(name, value) for name, value in found.items()})
+    shapes = {tuple((name, x.shape) for name, x in frame.items()) for frame in frames}
+    if len(shapes) != 1 or not frames[0]:
+        raise ValueError(
+            "positions(t, q, params) must return the same points, at least one, at all times.\n"
+            "Fix: return NaN-free points of one shape for each name, without if."
+        )
+    drawn = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
+    if len({x.shape[-1] for x in drawn.values()}) != 1:
+        raise ValueError(
+            "positions(t, q, params) must return points of the plane or points of space, not some of either.\n"
+            "Fix: three coordinates for each point."
+        )
+    for name, x in drawn.items():
+        if not np.all(np.isfinite(x)):
+            first = t[~np.isfinite(x).all(axis=(1, 2))][0]
+            raise ValueError(
+                f"positions(t, q, params) returned NaN or infinity{_of(name)} at t = {first:.6g}.\n"
+                "Usual cause: a root or a quotient outside its domain, or NaN in params.\n"
+                "Fix: evaluate positions there, term by term."
+            )
+    return drawn
+
+
+def _points(name: str, value):
+    """Return one point or several as (k, 2) or (k, 3), or raise."""
+    try:
+        x = np.asarray(value, float)
+        shape = f"an array of shape {x.shape}"
+    except (TypeError, ValueError):
+        x, shape = np.zeros(0), f"a {type(value).__name__} that is not an array of numbers"
+    if x.shape[-1:] not in ((2,), (3,)) or x.ndim > 2 or x.size == 0:
+        raise ValueError(
+            f"positions(t, q, params) must return points of the plane or of space, but returned {shape}{_of(name)}.\n"
+            "Usual cause: an angle in place of a point, or a coordinate of shape (1,).\n"
+            "Fix: return (x, y) or (x, y, z), points (k, 2) or (k, 3) linked in order, or such points by name: "
+            '{"rod": [(0, 0), (x, y)]}.'
+        )
+    return x.reshape(-1, x.shape[-1])
+
+
+def _of(name: str):
+    return f" for '{name}'" if name else ""

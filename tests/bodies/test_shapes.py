@@ -1,0 +1,88 @@
+"""What systems of bodies look like by themselves: boxes with the bodies' inertia, joints, springs and wheels."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.display import CUBE, DISK, SPHERE, InSpace
+from lagjax.integrate.trajectory.subject import subject_of
+
+A, B = lj.Body("a", 2.0, (0.1, 0.2, 0.25)), lj.Body("b", lambda params: params["m"], lambda params: (1.0, 1.0, 0.0))
+POSE = lj.Pose.at((1.0, 2.0, 3.0), axis=(1.0, 1.0, 0.0), angle=0.7)
+
+
+def drawn(system, params=None, **poses):
+    """What is drawn of a system at one state."""
+    q = {name: lj.Pose(*(x[None] for x in pose)) for name, pose in poses.items()}
+    frame = subject_of(None, system, params).frames(np.zeros(1), q)
+    assert isinstance(frame, InSpace)
+    return frame
+
+
+def test_boxes_have_the_inertia():
+    """Edges whose m (b² + c²)/12 are the moments, along principal axes. Twin: edges in another order are not."""
+    frame = drawn(lj.multibody([A]), a=POSE)
+    (box,) = frame.shapes
+    x, y, z = box.size**2
+    np.testing.assert_allclose([2 * (y + z) / 12, 2 * (x + z) / 12, 2 * (x + y) / 12], A.inertia, rtol=1e-12)
+    # With other axes of the body the box is turned in it: its second moments turn with the inertia.
+    rows = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    tilted = lj.Body("a", 2.0, rows @ np.diag(A.inertia) @ rows.T)
+    (found,) = drawn(lj.multibody([tilted]), a=POSE).shapes
+    axes = np.asarray(found.anchors[0].axes)
+    second = axes.T @ np.diag(found.size**2) @ axes
+    np.testing.assert_allclose(second, rows @ np.diag(box.size**2) @ rows.T, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0, rtol=1e-12)
+    assert np.abs(second - np.diag(box.size**2)).max() > 0.1
+
+
+def test_joints_springs_and_params():
+    """A dot and arms at a joint, a line for a spring; mass and inertia by params; a thin rod keeps a thickness."""
+    joint = lj.spherical(A.at((0.0, 0.0, 1.0)), B.at((1.0, 0.0, 0.0)))
+    spring = lj.spring(lj.ground.at(), B.at(), stiffness=1.0)
+    frame = drawn(lj.multibody([A, B], {"joint": joint}, [spring]), {"m": 12.0}, a=POSE, b=POSE)
+    assert [shape.kind for shape in frame.shapes] == ["solid", "solid", "dot", "line", "line", "line"]
+    np.testing.assert_allclose(frame.shapes[1].size, [0.04, 0.04, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(
+        frame.place(frame.shapes[2].anchors[0])[0], A.point({"a": POSE}, (0.0, 0.0, 1.0)), atol=1e-12
+    )
+
+
+def test_wheels():
+    """What rolls is drawn as a disk across its axis, or a sphere, in the place of a box."""
+    wheel = lj.rolling(A.at(axis=(0.0, 1.0, 0.0)), lj.ground.at(), radius=0.3)
+    (found,) = drawn(lj.multibody([A], {"wheel": wheel}), a=POSE).shapes
+    assert found.surface is DISK and found.size[0] == 0.3 and found.anchors[0].axes[2] == (0.0, 1.0, 0.0)
+    ball = lj.rolling_sphere(B.at(), lj.ground.at(), radius=lambda params: params["m"])
+    shapes = drawn(lj.multibody([A, B], {"ball": ball}), {"m": 0.5}, a=POSE, b=POSE).shapes
+    assert [shape.surface for shape in shapes] == [CUBE, SPHERE] and shapes[1].size[0] == 0.5
+
+
+def test_shapes_stand_where_bodies_are():
+    """The corners of a box on a marker are the points of the body; a mesh's are those given."""
+    marker = A.at((0.1, 0.2, 0.3), axis=(0.0, 1.0, 0.0))
+    box = lj.box(marker, (0.5, 0.6, 0.7))
+    mesh = lj.mesh(A, [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    frame = subject_of([box, mesh], lj.multibody([A]), None).frames(
+        np.zeros(1), {"a": lj.Pose(*(x[None] for x in POSE))}
+    )
+    assert isinstance(frame, InSpace)
+    corner = jnp.array([0.5, 0.6, 0.7]) / 2 @ jnp.array(marker.frame) + jnp.array([0.1, 0.2, 0.3])
+    known = np.asarray(A.point({"a": POSE}, corner))
+    found = frame.corners(frame.shapes[0])[0][0]
+    assert np.abs(found - known).max(axis=1).min() < 1e-12
+    np.testing.assert_allclose(
+        frame.corners(frame.shapes[1])[0][0, 1], A.point({"a": POSE}, (1.0, 0.0, 0.0)), atol=1e-12
+    )
+
+
+def test_what_is_no_place():
+    """Names in place of bodies, colours by name, and lines through nothing are refused."""
+    with pytest.raises(TypeError, match="(?s)not str.*Fix: lj.sphere"):
+        lj.sphere("a", 1.0)
+    with pytest.raises(ValueError, match="six hexadecimal digits, and is 'red'"):
+        lj.sphere(A, 1.0, color="red")
+    with pytest.raises(ValueError, match="needs places"):
+        lj.line()
+    assert repr(lj.line((0.0, 0.0, 1.0), A)) == "Shape(a line on the ground, 'a')"
