@@ -171,6 +171,9 @@ if TYPE_CHECKING:
     # Import and export.
     from lagjax.exchange import export, from_sympy, result_codes
 
+    # Mechanisms from files.
+    from lagjax.models import RobotModel, read_mjcf, read_urdf
+
     # Many motions, in a notebook.
     from lagjax.sliders import Knobs, interact
 
@@ -210,6 +213,7 @@ LATER = {
         "revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
+    "lagjax.models": "RobotModel read_mjcf read_urdf",
     "lagjax.sliders": "Knobs interact",
     "lagjax.two_points": (
         "Connection ConnectWarning Geodesic LQR Steering TrackingLQR connect exponential_map geodesic lqr "
@@ -272,6 +276,9 @@ __all__ = [
     "rod",
     "line",
     "trail",
+    "read_urdf",
+    "read_mjcf",
+    "RobotModel",
     "touches",
     "releases",
     "slips",

@@ -20,14 +20,14 @@ FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own room or from those before it.
 ROOMS = (
     "jaxtools", "numerics", "display", "files", "system", "mechanics", "learned", "steps", "integrate", "exchange",
-    "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report", "bodies", "mechanisms", "scenes",
-    "stability",
+    "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report", "bodies", "models", "mechanisms",
+    "scenes", "stability",
 )  # fmt: skip
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pandas", "sympy", "tqdm", "xarray"}
-OPTIONAL |= {"casadi", "zarr"}
+OPTIONAL |= {"casadi", "mujoco", "zarr"}
 
 
 def room(module):

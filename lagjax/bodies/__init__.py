@@ -2,8 +2,19 @@
 
 from lagjax.bodies.assemble import multibody
 from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
-from lagjax.bodies.joints import cylindrical, fixed, prismatic, revolute, rolling, rolling_sphere, spherical, universal
-from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
+from lagjax.bodies.joints import (
+    cylindrical,
+    fixed,
+    named,
+    prismatic,
+    revolute,
+    rolling,
+    rolling_sphere,
+    spherical,
+    universal,
+)
+from lagjax.bodies.loads import Load, applied, generalized_force, motor, spring, torsion, weight
+from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
 from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail
 
 __all__ = [

@@ -1,0 +1,343 @@
+"""URDF files: links with inertias and shapes, joints, and what is not taken, each by its line.
+
+The elements are those of `wiki.ros.org/urdf/XML`. A rotation `rpy="r p y"` turns about the fixed axes x, y, z in this
+order, R = Rz(y) Ry(p) Rx(r). Numbers are in the file's units, which are meant to be SI, angles in radians.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from xml.parsers import expat
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lagjax.models.parts import (
+    LinkShape,
+    NotTaken,
+    Placement,
+    RobotJoint,
+    RobotLink,
+    fault_of_inertia,
+    merged,
+    unmoved,
+)
+from lagjax.models.robot_model import RobotModel
+from lagjax.models.source import file_of
+
+# What stands in a file beside links and joints without being mechanics, and parts of joints that the model leaves out.
+BESIDE = {"gazebo", "transmission", "material", "sensor", "ros2_control", "mujoco", "plugin", "force_torque"}
+BESIDE_LINK = {"visual", "collision", "sensor", "self_collision_checking", "contact", "type"}
+BESIDE_JOINT = {"limit": "limits", "safety_controller": "safety controllers", "calibration": "calibrations"}
+TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "planar": "planar",
+         "floating": "floating", "fixed": "fixed"}  # fmt: skip
+SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
+
+
+@dataclass
+class XMLElement:
+    """An element of a file, with its line."""
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    inside: list["XMLElement"] = field(default_factory=list)
+
+    def all(self, tag: str) -> Iterator["XMLElement"]:
+        """What is inside under a name."""
+        return (x for x in self.inside if x.tag == tag)
+
+    def one(self, tag: str) -> "XMLElement | None":
+        """What is inside under a name, at most once."""
+        found = list(self.all(tag))
+        if len(found) > 1:
+            raise ValueError(f"line {found[1].line}: <{self.tag}> has a second <{tag}>.\nFix: leave one of them.")
+        return found[0] if found else None
+
+    def needed(self, tag: str) -> "XMLElement":
+        """What must be inside."""
+        found = self.one(tag)
+        if found is None:
+            raise ValueError(f"line {self.line}: {self.called} has no <{tag}>.\nFix: add it.")
+        return found
+
+    @property
+    def called(self) -> str:
+        """Its name for messages."""
+        name = self.attributes.get("name")
+        return f"<{self.tag}>" if name is None else f"<{self.tag}> '{name}'"
+
+    def text(self, attribute: str) -> str:
+        """An attribute that must be there."""
+        if attribute not in self.attributes:
+            raise ValueError(f"line {self.line}: {self.called} has no {attribute}=.\nFix: add it.")
+        return self.attributes[attribute]
+
+    def numbers(self, attribute: str, count: int, default=None) -> np.ndarray:
+        """An attribute of some numbers."""
+        if default is not None and attribute not in self.attributes:
+            return np.asarray(default, float)
+        words = self.text(attribute).split()
+        try:
+            found = np.array([float(word) for word in words])
+        except ValueError:
+            found = np.full(0, np.nan)
+        if found.shape != (count,) or not np.isfinite(found).all():
+            wanted = "a number" if count == 1 else f"{count} numbers"
+            raise ValueError(
+                f"line {self.line}: {attribute}= of {self.called} must be {wanted}, and is "
+                f"'{self.attributes[attribute]}'.\nUsual cause: a xacro expression that was not evaluated.\n"
+                "Fix: xacro robot.urdf.xacro > robot.urdf."
+            )
+        return found
+
+    def number(self, attribute: str, default=None) -> float:
+        """An attribute that is a number."""
+        return float(self.numbers(attribute, 1, None if default is None else [default])[0])
+
+    def only(self, *attributes: str):
+        """Refuse attributes that would be left out silently."""
+        for name in self.attributes.keys() - set(attributes):
+            raise ValueError(
+                f"line {self.line}: {name}= of {self.called} is not supported.\nFix: one of {', '.join(attributes)}."
+            )
+
+
+def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotModel:
+    """Read a mechanism from a URDF file.
+
+    >>> rod = '''<robot name="pendulum">
+    ...   <link name="post"/>
+    ...   <link name="rod">
+    ...     <inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
+    ...       <inertia ixx="0.2" iyy="0.2" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+    ...   </link>
+    ...   <joint name="hinge" type="revolute">
+    ...     <parent link="post"/><child link="rod"/><axis xyz="0 1 0"/><limit lower="-1" upper="1"/>
+    ...   </joint>
+    ... </robot>'''
+    >>> model = read_urdf(rod)
+    >>> model
+    pendulum: 1 body, 1 joint (hinge: revolute)
+      not taken: limits of 'hinge' (line 8)
+    >>> q, v = model.state({"hinge": 0.3}, {"hinge": 2.0})
+    >>> print(model.bodies["rod"].kinetic(q, v).round(12))  # (0.2 + 2.0 * 0.25) * 4 / 2
+    1.4
+
+    **Arguments:**
+
+    - `source`: the path of a file, or its text.
+    - `base`: "fixed", the root link is part of the ground; or "free", it flies, and its pose goes by the name of the
+      root link among the positions of joints.
+    - `gravity`: (3,), `[length]/[t]²`.
+
+    Links without freedom between them become one body of the name of the one that is nearest the root: a fixed joint
+    would cost seven coordinates and six equations. What changes which motions there are (a type of joint that is not
+    known, `<mimic>`, a loop) is refused, by its line; limits, friction, transmissions, contacts, sensors, plugins are
+    left out, and listed in `model.not_taken`.
+
+    **Returns:** a `lj.RobotModel`.
+
+    **Raises:** `FileNotFoundError`; `ValueError` for what is not URDF or not supported, for inertias that no body has,
+    for links with two parents, in a circle or without a way to the root: with the line of each.
+
+    Source: the URDF specification, `wiki.ros.org/urdf/XML`.
+    """
+    if base not in ("fixed", "free"):
+        raise ValueError(f'base= must be "fixed" or "free", and is {base!r}.')
+    path = file_of(source, "lj.read_urdf")
+    robot = _parsed(source.strip(), "the text") if path is None else _parsed(path.read_bytes(), path.name)
+    for x in robot.inside:
+        if x.tag not in {"link", "joint"} | BESIDE and ":" not in x.tag:
+            raise _unknown(x, robot)
+    not_taken = [NotTaken(f"<{x.tag}>", x.attributes.get("name", ""), f"line {x.line}")
+                 for x in robot.inside if x.tag not in ("link", "joint", "material")]  # fmt: skip
+    links = {x.text("name"): _link(x, not_taken) for x in _named_once(robot, "link")}
+    joints = [_joint(x, links, not_taken) for x in _named_once(robot, "joint")]
+    ordered = _from_the_root(links, joints, base)
+    tree = merged(links, ordered)
+    on_ground = {name for name, (head, _) in tree.frames.items() if head is None}
+    faults = [f"{link.line}: '{link.name}' {fault}" for link in links.values()
+              if link.name not in on_ground and (fault := fault_of_inertia(link))]  # fmt: skip
+    if faults:
+        raise ValueError(
+            "no body has the inertia of " + ("this link" if len(faults) == 1 else "these links") + ":\n  "
+            + "\n  ".join(faults) + "\nUsual cause: moments about the link's origin in place of its centre of mass, "
+            "products of inertia with the other sign, or numbers made up or rounded.\n"
+            "Fix: in the file, moments about the centre of mass, as the drawing program gives them."
+        )  # fmt: skip
+    shapes = [shape for x in robot.all("link") for shape in _shapes(x)]
+    return RobotModel.of(robot.attributes.get("name", "robot"), tree, shapes, (), gravity, not_taken)
+
+
+def _parsed(text: str | bytes, called: str) -> XMLElement:
+    parser = expat.ParserCreate()
+    top = XMLElement("", {}, 0)
+    open_ = [top]
+
+    def start(tag, attributes):
+        element = XMLElement(tag, attributes, parser.CurrentLineNumber)
+        open_[-1].inside.append(element)
+        open_.append(element)
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: open_.pop()
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise ValueError(f"{called} is not XML: {error}.") from error
+    robot = top.inside[0]
+    if robot.tag != "robot":
+        other = {"mujoco": "lj.read_mjcf(...) reads MJCF", "sdf": "SDF is not supported"}
+        raise ValueError(
+            f"line {robot.line} of {called}: URDF begins with <robot>, and this with <{robot.tag}>.\n"
+            f"Fix: {other.get(robot.tag, 'give the URDF file')}."
+        )
+    macros = [x for x in robot.inside if x.tag.startswith("xacro:")]
+    if macros:
+        raise ValueError(
+            f"line {macros[0].line} of {called}: <{macros[0].tag}> is a macro, which xacro must expand first.\n"
+            "Fix: xacro robot.urdf.xacro > robot.urdf, and lj.read_urdf('robot.urdf')."
+        )
+    return robot
+
+
+def _unknown(x: XMLElement, where: XMLElement) -> ValueError:
+    return ValueError(
+        f"line {x.line}: <{x.tag}> in {where.called} is not supported.\n"
+        "Usual cause: a misspelt name, or an extension of some program.\nFix: remove it, or write what URDF has for it."
+    )
+
+
+def _named_once(robot: XMLElement, tag: str) -> list[XMLElement]:
+    found: dict[str, XMLElement] = {}
+    for x in robot.all(tag):
+        before = found.setdefault(x.text("name"), x)
+        if before is not x:
+            raise ValueError(f"line {x.line}: {x.called} is there already, in line {before.line}.\nFix: rename one.")
+    return list(found.values())
+
+
+def _placement(x: XMLElement | None) -> Placement:
+    if x is None:
+        return unmoved()
+    x.only("xyz", "rpy", "quat_xyzw")
+    axes = Rotation.from_euler("xyz", x.numbers("rpy", 3, np.zeros(3)))
+    if "quat_xyzw" in x.attributes:
+        if "rpy" in x.attributes:
+            raise ValueError(f"line {x.line}: <origin> has rpy= and quat_xyzw=.\nFix: leave one of them.")
+        axes = Rotation.from_quat(x.numbers("quat_xyzw", 4))
+    return Placement(x.numbers("xyz", 3, np.zeros(3)), axes.as_matrix())
+
+
+def _link(x: XMLElement, not_taken: list[NotTaken]) -> RobotLink:
+    name, line = x.text("name"), f"line {x.line}"
+    for part in x.inside:
+        if part.tag not in {"inertial"} | BESIDE_LINK and ":" not in part.tag:
+            raise _unknown(part, x)
+        if part.tag not in ("inertial", "visual"):
+            what = "contacts of <collision>" if part.tag == "collision" else f"<{part.tag}>"
+            not_taken.append(NotTaken(what, name, f"line {part.line}"))
+    inertial = x.one("inertial")
+    if inertial is None:
+        return RobotLink(name, 0.0, np.zeros(3), np.zeros((3, 3)), line)
+    for part in inertial.inside:
+        if part.tag not in ("origin", "mass", "inertia"):
+            raise _unknown(part, inertial)
+    frame, mass, given = _placement(inertial.one("origin")), inertial.needed("mass"), inertial.needed("inertia")
+    given.only("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    xx, yy, zz = (given.number(key) for key in ("ixx", "iyy", "izz"))
+    xy, xz, yz = (given.number(key, 0.0) for key in ("ixy", "ixz", "iyz"))
+    inertia = frame.axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ frame.axes.T
+    return RobotLink(name, mass.number("value"), frame.origin, (inertia + inertia.T) / 2, f"line {inertial.line}")
+
+
+def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]) -> RobotJoint:
+    name, line, kind = x.text("name"), f"line {x.line}", x.text("type")
+    if kind not in TYPES:
+        raise ValueError(
+            f"line {x.line}: type='{kind}' of {x.called} is not supported.\nFix: one of {', '.join(sorted(TYPES))}."
+        )
+    for part in x.inside:
+        if part.tag == "mimic":
+            raise ValueError(
+                f"line {part.line}: <mimic> of {x.called} is not supported: without it the joint would move freely.\n"
+                "Fix: remove it, and give model.system(...) a constraint of your own between the two joints."
+            )
+        if part.tag in BESIDE_JOINT:
+            not_taken.append(NotTaken(BESIDE_JOINT[part.tag], name, f"line {part.line}"))
+        elif part.tag not in ("origin", "parent", "child", "axis", "dynamics") and ":" not in part.tag:
+            raise _unknown(part, x)
+    ends = [x.needed(tag).text("link") for tag in ("parent", "child")]
+    for tag, end in zip(("parent", "child"), ends):
+        if end not in links:
+            raise ValueError(f"line {x.needed(tag).line}: {x.called} names a link '{end}', which is not there.")
+    if ends[0] == ends[1]:
+        raise ValueError(f"line {x.line}: {x.called} joins '{ends[0]}' to itself.")
+    given = x.one("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if given is None else given.numbers("xyz", 3)
+    size = np.sqrt(axis @ axis)
+    if kind in ("revolute", "continuous", "prismatic", "planar"):
+        if not size > 0:
+            raise ValueError(f"line {given.line if given else x.line}: the axis of {x.called} is zero.")
+        if abs(size - 1) > 1e-3:
+            not_taken.append(NotTaken("length of the axis", name, f"line {given.line if given else x.line}"))
+    dynamics, damping = x.one("dynamics"), 0.0
+    if dynamics is not None:
+        damping = dynamics.number("damping", 0.0)
+        if dynamics.number("friction", 0.0) != 0:
+            not_taken.append(NotTaken("dry friction", name, f"line {dynamics.line}"))
+        if damping and kind not in ("revolute", "continuous", "prismatic"):
+            not_taken.append(NotTaken("damping", name, f"line {dynamics.line}"))
+            damping = 0.0
+    axis = axis / size if size > 0 else axis
+    return RobotJoint(name, TYPES[kind], ends[0], ends[1], _placement(x.one("origin")), axis, line, damping)
+
+
+def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: str) -> list[RobotJoint]:
+    """The joints, parents first, the first of which holds the root on the ground or lets it fly."""
+    above: dict[str, RobotJoint] = {}
+    for joint in joints:
+        before = above.setdefault(joint.child, joint)
+        if before is not joint:
+            raise ValueError(
+                f"{joint.line}: '{joint.child}' is the child of '{joint.name}' and of '{before.name}' ({before.line}), "
+                "and URDF has trees only.\nFix: one of the joints as lj.revolute(*...) in model.system(joints={...})."
+            )
+    roots = [name for name in links if name not in above]
+    if len(roots) != 1:
+        if not links:
+            raise ValueError("there is no <link>.")
+        if not roots:
+            listed = ", ".join(f"'{joint.name}' ({joint.line})" for joint in joints)
+            raise ValueError(f"the joints go in a circle, and no link is the root: {listed}.")
+        listed = ", ".join(f"'{name}' ({links[name].line})" for name in roots)
+        raise ValueError(
+            f"there must be one root, and no joint holds {listed}.\n"
+            "Usual cause: a joint that is missing.\nFix: a <joint> that has all but one of them as its <child>."
+        )
+    kind = "fixed" if base == "fixed" else "floating"
+    ordered = [RobotJoint(roots[0], kind, None, roots[0], unmoved(), np.zeros(3), links[roots[0]].line)]
+    held = {roots[0]}
+    while left := [joint for joint in joints if joint.parent in held and joint.child not in held]:
+        ordered += left
+        held |= {joint.child for joint in left}
+    if len(held) < len(links):
+        lost = [joint for joint in joints if joint.child not in held]
+        listed = ", ".join(f"'{joint.name}' ({joint.line})" for joint in lost)
+        raise ValueError(f"these joints go in a circle that nothing joins to the root: {listed}.")
+    return ordered
+
+
+def _shapes(x: XMLElement) -> Iterator[LinkShape]:
+    for role in ("visual", "collision"):
+        for part in x.all(role):
+            for geometry in part.needed("geometry").inside:
+                if geometry.tag == "mesh":
+                    size = geometry.numbers("scale", 3, np.ones(3))
+                elif geometry.tag in SIZES:
+                    sizes = SIZES[geometry.tag]
+                    size = np.concatenate([geometry.numbers(key, 3 if key == "size" else 1) for key in sizes])
+                else:
+                    raise _unknown(geometry, part)
+                frame, mesh = _placement(part.one("origin")), geometry.attributes.get("filename", "")
+                yield LinkShape("", x.text("name"), geometry.tag, tuple(size.tolist()), *frame, mesh, role)
