@@ -68,6 +68,11 @@ class ContactProblem(NamedTuple):
     partners: np.ndarray
 
     @property
+    def given(self) -> Bool[Array, " kT"]:
+        """Where the sliding is given."""
+        return lengths(self.slides, self.partners) > 0
+
+    @property
     def step(self) -> Float[Array, " k"]:
         """r of each force."""
         own, count = jnp.diag(self.matrix), self.may_push.size
@@ -82,8 +87,7 @@ class ContactProblem(NamedTuple):
         most = self.coefficient * jnp.maximum(self.normal_forces(jnp.concatenate([normal, forces[count:]])), 0.0)
         size = lengths(z[count:], self.partners)
         within = z[count:] * jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0)
-        given = lengths(self.slides, self.partners) > 0
-        return jnp.concatenate([normal, jnp.where(given, -self.slides * most, within)])
+        return jnp.concatenate([normal, jnp.where(self.given, -self.slides * most, within)])
 
     def normal_forces(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
         """N of each tangential force."""

@@ -68,7 +68,7 @@ class Compliant(eqx.Module):
         slope = jax.jacobian(lambda x: jnp.ravel(self.gap(t, x, params)))(q)
         by_row = jnp.concatenate([jnp.reshape(x, (depth.size, -1)) for x in jax.tree.leaves(slope)], axis=1)
         gaps, rates = sizes @ jnp.abs(by_row).T
-        slack = jnp.finfo(t.dtype).eps * (gaps + c / jnp.where(k > 0, k, jnp.inf) * rates)
+        slack = jnp.finfo(t.dtype).eps * (gaps + jnp.abs(depth) + c / jnp.where(k > 0, k, jnp.inf) * rates)
         m = self._pressed(t, q, v, params)
         now = given.modes[slice(*self.at)] == PRESSED
         unclear = jnp.abs(m) <= jnp.where(fired, AT_ZERO, ZERO_BELOW) * slack

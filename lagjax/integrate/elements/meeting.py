@@ -107,12 +107,53 @@ class Rows(NamedTuple):
         return jnp.stack([x, u])[:, None] / heavy[None]
 
 
-class Zeros(NamedTuple):
-    """What counts as zero: `gap` (k_N,), `velocity` (k,); `ends` (k_T,): the speed at which sliding in a plane ends."""
+class AsFound(NamedTuple):
+    """The contacts as a meeting finds them, and below which size what they are made of is zero.
 
-    gap: Float[Array, " kN"]
+    - `closed` (k_N,), `fired` (k,): which gaps are closed; which modes end.
+    - `scale` (k, 2): the sizes of gaps, or ways, and of velocities.
+    - `velocity` (k,): still is what is slower; `ends` (k_T,): the speed at which sliding in a plane ends.
+    """
+
+    closed: Bool[Array, " kN"]
+    fired: Bool[Array, " k"]
+    scale: Float[Array, "k 2"]
     velocity: Float[Array, " k"]
     ends: Float[Array, " kT"]
+
+    @property
+    def gap(self) -> Float[Array, " kN"]:
+        """Below which size a gap is zero."""
+        return _round_offs(CLOSED_BELOW, self.scale[: self.closed.size, 0])
+
+
+class ContactForces(NamedTuple):
+    """Forces that obey the laws, if `found`, with the accelerations `a`; below which size either is zero, for each."""
+
+    problem: ContactProblem
+    forces: Float[Array, " k"]
+    a: Float[Array, " k"]
+    no_force: Float[Array, " k"]
+    no_acceleration: Float[Array, " k"]
+    found: Bool[Array, ""]
+
+    def stays(self) -> Bool[Array, " kN"]:
+        """Which gaps that touch stay closed: those that are pushed, and those that do not open."""
+        # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
+        stays = (self.forces > self.problem.step * self.a) | (self.a <= self.no_acceleration)
+        return self.problem.may_push & stays[: self.problem.may_push.size]
+
+    def sides(self) -> Float[Array, " kT"]:
+        """The side, or direction, to which each sliding velocity slides on, or begins to slide; zero where it sticks.
+
+        It begins against its friction, or as nothing holds it.
+        """
+        problem, normals = self.problem, self.problem.may_push.size
+        most = problem.coefficient * jnp.maximum(problem.normal_forces(self.forces), 0.0)
+        # The force of friction is larger than its acceleration, and so says more about the direction.
+        begins = directions(jnp.where(most > 0, -self.forces[normals:], self.a[normals:]), problem.partners)
+        moves = lengths(self.a[normals:], problem.partners) > self.no_acceleration[normals:]
+        return jnp.where(problem.given, problem.slides, jnp.where(moves, begins, 0.0))
 
 
 class Meeting(eqx.Module):
@@ -146,13 +187,12 @@ class Meeting(eqx.Module):
         at = self._at(t, q, v, given)
         rows = self._rows(at)
         sizes = rows.sizes(sizes)
-        scale = jnp.abs(rows.jacobian) @ sizes.T
-        closed = stop_gradient(self._closed(at, fired, scale))
+        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian) @ sizes.T))
         if impacts and self.laws.normals:
-            at = at._replace(u=at.u + self._struck(at, rows, closed).impulses() @ rows.response)
+            at = at._replace(u=at.u + self._struck(at, rows, contacts.closed).impulses() @ rows.response)
         given, reach = self.laws.pressed(*at.state[:3], given, fired, sizes)
         at = at._replace(given=given)
-        decided = self._decided(*stop_gradient((at, rows, closed, scale)), fired)
+        decided = self._decided(*stop_gradient((at, rows, contacts)))
         u = at.u + self._onto(at, rows, decided.onto) @ rows.response
         after = self.laws.in_rows(given, decided.modes)
         # The rates of states are those of the new velocities.
@@ -199,12 +239,30 @@ class Meeting(eqx.Module):
         """The rates of gaps, and sliding velocities."""
         return constraints.velocity_residual(*at[:4])[self._places(at.model)[0]]
 
-    def _closed(self, at: AtMeeting, fired: Bool[Array, " k"], scale: Float[Array, "k 2"]) -> Bool[Array, " kN"]:
-        """Which gaps are closed."""
-        (normals, _), (t, q, _, params) = self.laws.count, at.state
-        gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in self.laws.normals)])
-        small = 4 * CLOSED_BELOW * jnp.finfo(gaps.dtype).eps * scale[:normals, 0]
-        return (at.given.modes == CLOSED)[:normals] | fired[:normals] | (jnp.abs(gaps) <= small)
+    def _as_found(self, at: AtMeeting, fired: Bool[Array, " k"], scale: Float[Array, "k 2"]) -> AsFound:
+        """The contacts before an impact; `scale`: the sizes that coordinates and velocities give."""
+        laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
+        modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, at.given.slack, fired))
+        gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
+        # A gap may be as large where all coordinates are zero.
+        scale = scale.at[:normals, 0].add(jnp.abs(gaps))
+        closed = (modes == CLOSED)[:normals] | fired[:normals]
+        closed = closed | (jnp.abs(gaps) <= _round_offs(4 * CLOSED_BELOW, scale[:normals, 0]))
+        # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
+        slid = (jnp.abs(modes) == 1).at[:normals].set(False)
+        before = jnp.where(slid, STILL_BELOW / CLOSED_BELOW * slack, 0.0)
+        # What slides is still where its guard ends that: as near to zero as the time of that is known.
+        reached = jnp.where(slid & fired & ~self._in_planes, 2 * jnp.abs(self._velocities(at)), 0.0)
+        velocity = jnp.maximum(jnp.maximum(_round_offs(STILL_BELOW, scale[:, 1]), before), reached)
+        ends = _above_round_off(ENDS_AT, t.dtype) * lengths(scale[normals:, 1], laws.partners)
+        # Also where nothing has moved yet.
+        return AsFound(closed, fired, scale, velocity, jnp.where(ends > 0, ends, ENDS_AT))
+
+    @property
+    def _in_planes(self) -> np.ndarray:
+        """Which rows slide in planes."""
+        normals, _ = self.laws.count
+        return np.concatenate([np.zeros(normals, bool), self.laws.in_planes])
 
     def _struck(self, at: AtMeeting, rows: Rows, closed: Bool[Array, " kN"]) -> Struck:
         """The contacts as an impact finds them."""
@@ -242,23 +300,21 @@ class Meeting(eqx.Module):
         zero = jnp.zeros(mine.size, t.dtype)
         return of(zero), jax.jacfwd(of)(zero)
 
-    def _zeros(self, at: AtMeeting, scale: Float[Array, "k 2"]) -> Zeros:
-        laws, (normals, _), eps = self.laws, self.laws.count, jnp.finfo(scale.dtype).eps
-        modes, slack = at.given.modes[: len(laws.rows)], at.given.slack[: len(laws.rows)]
-        # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
-        slid = jnp.where(jnp.abs(modes) == 1, slack, 0.0).at[:normals].set(0.0)
-        velocity = STILL_BELOW * jnp.maximum(eps * scale[:, 1], slid / CLOSED_BELOW)
-        ends = _ends_at(eps) * lengths(scale[normals:, 1], laws.partners)
-        # Also where nothing has moved yet.
-        return Zeros(CLOSED_BELOW * eps * scale[:normals, 0], velocity, jnp.where(ends > 0, ends, ENDS_AT))
-
-    def _sliding(self, at: AtMeeting, slips: Float[Array, " kT"], zeros: Zeros) -> Float[Array, " kT"]:
+    def _sliding(self, at: AtMeeting, contacts: AsFound) -> Float[Array, " kT"]:
         """The side, or direction, to which each sliding velocity slides; zero where it does not."""
         laws, (normals, _) = self.laws, self.laws.count
         modes, slack = (x[normals : len(laws.rows)] for x in (at.given.modes, at.given.slack))
-        in_plane = 1.5 * jnp.where(modes == 1, jnp.maximum(zeros.ends, slack), zeros.ends)
-        slow = jnp.where(laws.in_planes, in_plane, zeros.velocity[normals:])
+        in_plane = 1.5 * jnp.where(modes == 1, jnp.maximum(contacts.ends, slack), contacts.ends)
+        slow = jnp.where(laws.in_planes, in_plane, contacts.velocity[normals:])
+        slips = self._velocities(at)[normals:]
         return jnp.where(lengths(slips, laws.partners) > slow, directions(slips, laws.partners), 0.0)
+
+    def _touching(self, at: AtMeeting, contacts: AsFound) -> Bool[Array, " kN"]:
+        """Which gaps are closed and do not open."""
+        normals, _ = self.laws.count
+        slower = [jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in self.laws.normals]
+        slower = jnp.maximum(jnp.concatenate([contacts.gap[:0], *slower]), contacts.velocity[:normals])
+        return contacts.closed & (jnp.abs(self._velocities(at)[:normals]) <= slower)
 
     def _problem(self, at: AtMeeting, rows: Rows, touching: Bool[Array, " kN"], slides: Float[Array, " kT"]):
         """The complementarity problem of the forces at accelerations."""
@@ -274,53 +330,43 @@ class Meeting(eqx.Module):
         free = rows.jacobian @ a - every.gamma[mine]
         return ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
 
-    def _touching(self, at: AtMeeting, closed: Bool[Array, " kN"], zeros: Zeros) -> Bool[Array, " kN"]:
-        """Which gaps are closed and do not open."""
-        normals = closed.size
-        slower = [jnp.broadcast_to(law.slower_than, law.at[1] - law.at[0]) for law in self.laws.normals]
-        slower = jnp.maximum(jnp.concatenate([zeros.gap[:0], *slower]), zeros.velocity[:normals])
-        return closed & (jnp.abs(self._velocities(at)[:normals]) <= slower)
-
-    def _tangent_modes(self, at: AtMeeting, stays: Bool[Array, " kN"], side: Float[Array, " kT"]) -> Int[Array, " kT"]:
-        """The modes of sliding velocities that slide to this `side`, zero where they stick, or are free."""
-        owners = np.array(self.laws.owners, int)
-        rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], self.laws.rubs(at.given.modes))
-        slides = jnp.where(self.laws.in_planes, lengths(side, self.laws.partners) > 0, side).astype(int)
-        return jnp.where(rubs, jnp.where(slides != 0, slides, STICKS), FREE)
-
-    def _decided(
-        self, at: AtMeeting, rows: Rows, closed: Bool[Array, " kN"], scale: Float[Array, "k 2"], fired: Array
-    ) -> Decided:
-        """The modes after a meeting, by the forces at accelerations."""
-        laws, normals, partners, eps = self.laws, closed.size, self.laws.partners, jnp.finfo(at.u.dtype).eps
-        before, slack = at.given.modes[: len(laws.rows)], at.given.slack[: len(laws.rows)]
-        if not laws.rows:
-            none = at.u[:0]
-            return Decided(before, none, none, jnp.asarray(True))
-        zeros = self._zeros(at, scale)
-        touching, slides = self._touching(at, closed, zeros), self._sliding(at, self._velocities(at)[normals:], zeros)
-        problem = self._problem(at, rows, touching, slides)
+    def _contact_forces(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> ContactForces:
+        """The forces at accelerations."""
+        problem = self._problem(at, rows, self._touching(at, contacts), self._sliding(at, contacts))
         forces, found = solved(problem)
-        a, no_force = problem.matrix @ forces + problem.free, _no_force(problem, forces, scale)
+        no_force = _no_force(problem, forces, contacts.scale)
         # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
         # may open far more slowly than by its own response, since others stay closed.
-        let_go = fired[: before.size] & laws.holds(before)
-        no_acceleration = jnp.where(let_go, LET_GO * slack, no_force) / problem.step
-        # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
-        pushes = forces > problem.step * a
-        stays = touching & (pushes | (a <= no_acceleration))[:normals]
-        goes_on, moves = (lengths(x, partners) for x in (slides, a[normals:]))
-        starts = jnp.where(moves > no_acceleration[normals:], _against_friction(problem, forces, a), 0.0)
-        side = jnp.where(goes_on > 0, slides, starts)
-        tangents = self._tangent_modes(at, stays, side)
-        modes = jnp.concatenate([jnp.where(stays, CLOSED, OPEN), tangents]).astype(before.dtype)
-        begins = laws.in_planes & (tangents == 1) & (goes_on == 0)
-        ends = jnp.where(begins, zeros.ends * max(BEGINS_AT, ENDS_AT_ROUND_OFFS * eps) / _ends_at(eps), zeros.ends)
-        by_motion = jnp.where(laws.in_planes, ends, CLOSED_BELOW * eps * scale[normals:, 1])
-        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * side, jnp.nan)])
-        holds = laws.holds(modes)
-        slack = jnp.where(holds, no_force, jnp.concatenate([zeros.gap, by_motion]))
-        return Decided(modes, slack, jnp.where(holds, 0.0, onto), found)
+        let_go = contacts.fired & self.laws.holds(at.given.modes)
+        least = jnp.where(let_go, LET_GO * at.given.slack[: let_go.size], no_force)
+        a = problem.matrix @ forces + problem.free
+        return ContactForces(problem, forces, a, no_force, least / problem.step, found)
+
+    def _modes(self, at: AtMeeting, stays: Bool[Array, " kN"], sides: Float[Array, " kT"]) -> Int[Array, " kNT"]:
+        """The modes of gaps, and of sliding velocities that slide to these `sides`, zero where they stick or are
+        free."""
+        laws, owners = self.laws, np.array(self.laws.owners, int)
+        rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], laws.rubs(at.given.modes))
+        slides = jnp.where(laws.in_planes, lengths(sides, laws.partners) > 0, sides).astype(int)
+        tangents = jnp.where(rubs, jnp.where(slides != 0, slides, STICKS), FREE)
+        return jnp.concatenate([jnp.where(stays, CLOSED, OPEN), tangents]).astype(at.given.modes.dtype)
+
+    def _decided(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> Decided:
+        """The modes after a meeting, by the forces at accelerations."""
+        laws, (normals, _) = self.laws, self.laws.count
+        if not laws.rows:
+            return Decided(at.given.modes[:0], at.u[:0], at.u[:0], jnp.asarray(True))
+        solution = self._contact_forces(at, rows, contacts)
+        sides = solution.sides()
+        modes = self._modes(at, solution.stays(), sides)
+        holds, begins = laws.holds(modes), laws.in_planes & (modes[normals:] == 1) & ~solution.problem.given
+        # What begins to slide in a plane needs a direction: it gets twice the speed at which it would end.
+        begins_at, ends_at = (_above_round_off(part, at.u.dtype) for part in (BEGINS_AT, ENDS_AT))
+        ends = jnp.where(begins, begins_at / ends_at * contacts.ends, contacts.ends)
+        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, jnp.nan)])
+        slowest = jnp.where(laws.in_planes, ends, _round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]))
+        slack = jnp.where(holds, solution.no_force, jnp.concatenate([contacts.gap, slowest]))
+        return Decided(modes, slack, jnp.where(holds, 0.0, onto), solution.found)
 
     def _onto(self, at: AtMeeting, rows: Rows, wanted: Float[Array, " k"]) -> Float[Array, " k"]:
         """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""
@@ -332,19 +378,14 @@ class Meeting(eqx.Module):
         return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left
 
 
-def _ends_at(eps) -> float:
-    """At which part of the velocities in the motion sliding in a plane ends."""
-    return max(ENDS_AT, ENDS_AT_ROUND_OFFS * float(eps))
+def _round_offs(count: float, x: Array) -> Array:
+    """So many round-offs of x."""
+    return count * jnp.finfo(x.dtype).eps * x
 
 
-def _against_friction(
-    problem: ContactProblem, forces: Float[Array, " k"], a: Float[Array, " k"]
-) -> Float[Array, " kT"]:
-    """The direction in which each contact begins to slide, if it does: against its friction, or as nothing holds it."""
-    normals = problem.may_push.size
-    most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
-    # The force of friction is larger than its acceleration, and so says more about the direction.
-    return directions(jnp.where(most > 0, -forces[normals:], a[normals:]), problem.partners)
+def _above_round_off(part: float, dtype) -> float:
+    """A part of the velocities in the motion, or if that is larger, the round-offs at which sliding in a plane ends."""
+    return max(part, ENDS_AT_ROUND_OFFS * float(jnp.finfo(dtype).eps))
 
 
 def _no_force(problem: ContactProblem, forces: Float[Array, " k"], scale: Float[Array, "k 2"]) -> Float[Array, " k"]:

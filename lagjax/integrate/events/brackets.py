@@ -22,12 +22,10 @@ PIECES, INNER = len(SHARES) - 1, SHARES[1:-1]
 BENT = 0.5
 # A start on a guard is flat if the guard's rate there explains less than this part of its value at the next node.
 FLAT = 1e-3
-# Polynomials that multiply (q0, h v0, h² a0, h² a1, h v1, q1) and, in a cubic, (x0, h dx0, h dx1, x1).
-QUINTIC = np.array([
-    [1, 0, 0, -10, 15, -6], [0, 1, 0, -6, 8, -3], [0, 0, 0.5, -1.5, 1.5, -0.5],
-    [0, 0, 0, 0.5, -1, 0.5], [0, 0, 0, -4, 7, -3], [0, 0, 0, 10, -15, 6],
-])  # fmt: skip
+# Polynomials that multiply (x0, h dx0, h dx1, x1) in a cubic; and the one that goes from 0 to 1 with no rate, and no
+# curvature, at its ends.
 CUBIC = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, -1, 1], [0, 0, 3, -2]])
+RISE = np.array([0, 0, 0, 10, -15, 6])
 
 
 class GuardValue(NamedTuple):
@@ -200,27 +198,46 @@ def _bend(g, rate, h: Array):
 
 
 def between(left: Node, right: Node, h: Array):
-    """(state, acceleration) at the inner nodes, by the quintic, and by the cubics through (q, v) and (v, a)."""
-    (q0, v0), (q1, v1), a0, a1 = left.y, right.y, left.a, right.a
+    """(state, acceleration) at the inner nodes, by the quintic, and by the cubics through (q, v) and (v, a).
+
+    The quintic is the integral of the cubic through (v, a), and what that misses of the way from q0 to q1. What it
+    misses within round-off of q says nothing, and over a short step would make velocities of it.
+    """
     inverse = 1 / jnp.where(h > 0, h, 1.0)
 
-    def scaled(c, x):
-        return jtu.tree_map(lambda x: c * x, x)
+    def at(share: float, q0, v0, a0, q1, v1, a1):
+        def by(polynomials, derivatives, *ends):
+            powers = _derived(polynomials, derivatives)
+            weights = powers @ share ** np.arange(powers.shape[-1])
+            return sum(w * x for w, x in zip(np.ravel(weights).tolist(), ends) if w)
 
-    def by(coefficients, derivatives, share, *ends):
-        powers = np.polynomial.polynomial.polyder(coefficients, derivatives, axis=1)
-        weights = powers @ share ** np.arange(powers.shape[1])
-        return jtu.tree_map(lambda *x: sum(w * x for w, x in zip(weights.tolist(), x) if w), *ends)
+        of_v = v0, h * a0, h * a1, v1
+        missed = q1 - q0 - h * (0.5 * (v0 + v1) + h * (a0 - a1) / 12)
+        digit = ROUNDED * jnp.finfo(h.dtype).eps * (jnp.abs(q0) + jnp.abs(q1))
+        missed = jnp.where(jnp.abs(missed) > digit, missed, 0.0)
+        v, a = by(CUBIC, 0, *of_v), inverse * by(CUBIC, 1, *of_v)
+        fine = (
+            q0 + h * by(CUBIC, -1, *of_v) + by(RISE, 0, missed),
+            v + inverse * by(RISE, 1, missed),
+            a + inverse**2 * by(RISE, 2, missed),
+        )
+        return fine, (by(CUBIC, 0, q0, h * v0, h * v1, q1), v, a)
 
-    of_q = q0, scaled(h, v0), scaled(h * h, a0), scaled(h * h, a1), scaled(h, v1), q1
-    of_v = v0, scaled(h, a0), scaled(h, a1), v1
     fine, coarse = [], []
+    (q0, v0), (q1, v1), leaves = left.y, right.y, jtu.tree_leaves
+    structure = jtu.tree_structure(q0)
     for share in INNER:
-        v, a = scaled(inverse, by(QUINTIC, 1, share, *of_q)), scaled(inverse**2, by(QUINTIC, 2, share, *of_q))
-        fine.append(((by(QUINTIC, 0, share, *of_q), v), a))
-        q, v = by(CUBIC, 0, share, q0, of_q[1], of_q[4], q1), by(CUBIC, 0, share, *of_v)
-        coarse.append(((q, v), scaled(inverse, by(CUBIC, 1, share, *of_v))))
+        found = [at(share, *x) for x in zip(*map(leaves, (q0, v0, left.a, q1, v1, right.a)))]
+        for one, of_leaves in zip((fine, coarse), zip(*found)):
+            q, v, a = (jtu.tree_unflatten(structure, x) for x in zip(*of_leaves))
+            one.append(((q, v), a))
     return fine, coarse
+
+
+def _derived(polynomials: np.ndarray, derivatives: int) -> np.ndarray:
+    """Their derivative of this order; -1: the integral from zero."""
+    of = np.polynomial.polynomial
+    return of.polyint(polynomials, axis=-1) if derivatives < 0 else of.polyder(polynomials, derivatives, axis=-1)
 
 
 def first_root(kinds, times, of_guards, signs, crosses) -> GuardRoot:

@@ -204,3 +204,39 @@ def test_backlash_in_a_drive():
     np.testing.assert_allclose(found, end, atol=1e-8)
     assert {traj.switches.ways[i] for i in traj.switches.way[: len(traj.switches)]} == {"teeth[0]", "teeth[1]"}
     assert abs(tight[1] - end[1]) > 1e-3
+
+
+def pressed(sliding) -> lj.System:
+    """A block on a rough spring, in equilibrium at z = 0."""
+    rough = lj.CompliantContact(lambda t, q, mu: q[2] - G / K, K, friction=lambda mu: mu, sliding=sliding)
+    return lj.System(lambda t, q, v, mu: 0.5 * jnp.sum(v**2) - G * q[2], elements={"mat": rough})
+
+
+@pytest.mark.slow
+def test_a_block_that_stops_in_a_long_motion():
+    """It stops after v²/2 μ g and stays, in steps that do not depend on how long it is followed. Twin: with another
+    μ it is somewhere else."""
+    system, ends, speed = pressed(lambda t, q, v, mu: v[0]), [3.0, 100.0, 1e4], 0.3
+    found = [
+        moved(system, np.zeros(3), np.array([speed, 0, 0]), mu, ts=np.array([0.0, T / 2, T]), rtol=1e-11)
+        for T in ends
+        for mu in (0.3, 0.31)
+    ]
+    for traj, mu in zip(found, len(ends) * (0.3, 0.31)):
+        np.testing.assert_allclose(traj.q[1:, 0], speed**2 / (2 * mu * G), rtol=1e-10)
+        assert len(traj.switches) == 1 and int(traj.stats["num_steps"]) < 20
+    assert abs(found[0].q[-1, 0] - found[1].q[-1, 0]) > 1e-5
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("error")
+def test_a_block_that_stops_in_a_plane():
+    """The same with a sliding velocity of two components, without a warning. Twin: another μ, another place."""
+    system, places = pressed(lambda t, q, v, mu: v[:2]), {}
+    for mu in (0.3, 0.31):
+        for T in (3.0, 100.0):
+            traj = lj.integrate(system, np.zeros(3), np.array([1.2, 1.6, 0.0]), mu, ts=np.array([0.0, T]), rtol=1e-11)
+            assert int(traj.stats["num_steps"]) < 100
+            np.testing.assert_allclose(traj.q[-1], 4.0 / (2 * mu * G) * np.array([0.6, 0.8, 0.0]), atol=1e-11)
+            places[mu] = traj.q[-1]
+    assert np.linalg.norm(places[0.31] - places[0.3]) > 1e-3

@@ -45,6 +45,27 @@ def test_a_guard_that_is_left_without_speed(monkeypatch):
     assert steps(lambda t, q, v, p: 2.0 * q**3) > 40
 
 
+def test_velocities_over_a_short_step():
+    """Between the ends of a step of 1e-12 the interpolants have the velocity to the last digits, and over a long one
+    they are the polynomial through q, v and a. Twin: the distance of the positions, over the length, has none."""
+    way = np.polynomial.Polynomial([0.7, 1e-8, -0.3, 0.2, 0.1, -0.4])
+    one, two = way.deriv(), way.deriv(2)
+
+    def inside(h):
+        t = np.array([0.0, h])
+        nodes = [sampling.Node(x, ((way(x),), (one(x),)), (two(x),), ()) for x in jnp.asarray(t)]
+        (((q, v), a),), (((_, by_cubic), _),) = sampling.between(*nodes, jnp.asarray(h))
+        return np.array([q[0], v[0], a[0]]), by_cubic[0], (way(h) - way(0.0)) / h
+
+    at = sampling.INNER[0]
+    long, by_cubic, _ = inside(0.8)
+    np.testing.assert_allclose(long, [way(0.8 * at), one(0.8 * at), two(0.8 * at)], rtol=1e-13)
+    assert abs(by_cubic - long[1]) > 1e-3
+    short, _, by_distance = inside(1e-12)
+    np.testing.assert_allclose(short, [0.7, 1e-8, -0.6], rtol=1e-4)
+    assert abs(by_distance - 1e-8) > 1e-9
+
+
 def at_ends_of_steps(*between, pieces=sampling.pieces_of):
     """Return the pieces of a twin that looks only at the ends of steps."""
     found, no = pieces(*between), jnp.asarray(False)
