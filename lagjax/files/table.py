@@ -54,6 +54,8 @@ lineax
   AutoLinearSolver: well_posed
   Diagonal: well_posed rcond
   SVD: rcond
+lagjax.bodies.body
+  Pose: position quaternion
 lagjax.learned
   Network: mlp sizes angular
   SameMotion: differences ratio

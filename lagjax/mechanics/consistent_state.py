@@ -10,7 +10,8 @@ is not an equation for the others, and at the end it holds or it does not.
 
 Newton's method for a stationary point finds one nearby, which may be a farthest point instead of a nearest. So the
 first step is to find some state that satisfies the constraints, by steps that are shortest in M; it is its own nearest
-point, with μ = 0. From there the target is moved to x0 in stages, and the stationary point followed.
+point, with μ = 0. From there the target is moved to x0 in stages, and the stationary point followed. Where r is linear,
+as for velocities under holonomic constraints alone, one Newton step from the start is all of it.
 
 Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11.3 (continuation).
 """
@@ -69,8 +70,8 @@ def consistent_state(
     4.0 -3.0
 
     **Arguments:** `t` scalar, `q` and `v` alike, `params` as the system takes it; `hold`, the names of coordinates that
-    keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector, or a
-    dict of true and false by name; `hold_position`, `hold_velocity`: for the position alone, as of a crank
+    keep the values given for them and for their velocities: `"x"`, `["x", "r[0]"]`, `"r"` for all of a vector or a
+    body, or a dict of true and false by name; `hold_position`, `hold_velocity`: for the position alone, as of a crank
     whose speed a motor determines, or for the velocity alone.
 
     **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
@@ -105,8 +106,10 @@ def free_coordinates(q: PyTree, hold, argument: str = "hold") -> np.ndarray:
     if isinstance(hold, Mapping):
         hold = [name for name, held in hold.items() if held]
     hold = {hold} if isinstance(hold, str) else set(hold)
-    held = np.array([name in hold or name.split("[")[0] in hold for name in names])
-    unknown = hold - set(names) - {name.split("[")[0] for name in names}
+    # "crank.position[0]" is held by its own name, by "crank.position" and by "crank".
+    known = [{name, *(name[:i] for i, letter in enumerate(name) if letter in ".[")} for name in names]
+    held = np.array([bool(hold & whole) for whole in known])
+    unknown = hold.difference(*known)
     if unknown:
         raise ValueError(
             f"{argument} names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
@@ -147,14 +150,15 @@ def _consistent_state(model: Model, s: State, free: Array, free_velocity: Array)
     u = u0
     if model.m:
         u = _nearest(
-            lambda problem, u: constraints.velocity_residual(*problem, u), (*live, x), u, metric, free_velocity
-        )
+            lambda problem, u: constraints.velocity_residual(*problem, u), (*live, x), u, metric, free_velocity,
+            is_linear=bool(model.holonomic.all()),
+        )  # fmt: skip
     q, v, tolerance = model.tree(x), model.tree(resolved(model, t, x, u)), _round_off(t)
     return q, v, within(equations_of(model), t, q, v, tolerance, tolerance)
 
 
-def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free: Array):
-    """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0."""
+def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free: Array, is_linear: bool = False):
+    """Return the stationary point of `½ (y - y0)ᵀ M (y - y0) + μᵀ r(y)` near y0, for r that may be linear in y."""
     metric = jnp.where(free[:, None] & free[None, :], metric, jnp.diag(jnp.where(free, 0.0, 1.0)))
     n, fixed, fixed_metric, start = y0.size, stop_gradient(problem), *stop_gradient((metric, y0))
     residual = _two_or_more(residual)
@@ -180,42 +184,51 @@ def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free
         dependent_below = jnp.maximum(0.1 * 0.25**i, DEPENDENT_BELOW[np.dtype(y0.dtype)]).astype(y0.dtype)
         return to_displacement(y, dependent_below) @ r
 
-    slope = jnp.sum(jnp.abs(rows_at(fixed, start)), axis=1)
-    of_y = partial(residual, fixed)
-    slope = jnp.where(slope > 0, slope, 1.0)
-    reached = newton(of_y, shortest_step, start, TO_REACH, size=lambda r: largest(r / slope), fractions=FRACTIONS)
+    def some_state():
+        slope = jnp.sum(jnp.abs(rows_at(fixed, start)), axis=1)
+        slope = jnp.where(slope > 0, slope, 1.0)
+        of_y = partial(residual, fixed)
+        return newton(of_y, shortest_step, start, TO_REACH, size=lambda r: largest(r / slope), fractions=FRACTIONS)
+
+    def curvature(y: Array, multipliers: Array):
+        if is_linear:
+            return jnp.zeros_like(fixed_metric)
+        bent = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
+        return jnp.where(free[:, None] & free[None, :], bent, 0.0)
 
     def newton_matrix(y: Array, multipliers: Array):
-        curvature = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
-        curvature = jnp.where(free[:, None] & free[None, :], curvature, 0.0)
         rows = rows_at(fixed, y)
         independent = usable_rows(rows)
         # The full matrix, even for more equations than coordinates: all multipliers are unknowns.
         rows = jnp.where(independent[:, None], rows, 0.0)
-        return jnp.block([[fixed_metric + curvature, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
+        matrix = fixed_metric + curvature(y, multipliers)
+        return jnp.block([[matrix, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
 
     def equations(problem: PyTree, metric: Array, target: Array, y: Array, multipliers: Array):
         force = metric @ (y - target) + multipliers @ rows_at(problem, y)
         return jnp.concatenate([force, residual(problem, y)])
 
+    def step(state: Array, left: Array, i):
+        y, multipliers = state[:n], state[n:]
+        independent = usable_rows(rows_at(fixed, y))
+        left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
+        step = dense.solve(newton_matrix(y, multipliers), left)
+        return step.at[n:].set(jnp.where(independent, step[n:], multipliers))
+
+    def left_at(target: Array, state: Array) -> Array:
+        return equations(fixed, fixed_metric, target, state[:n], state[n:])
+
     def follow(state: Array, share: Array):
         target = reached + share * (start - reached)
+        return newton(partial(left_at, target), step, state, PER_STAGE), None
 
-        def step(state: Array, left: Array, i: Array):
-            y, multipliers = state[:n], state[n:]
-            independent = usable_rows(rows_at(fixed, y))
-            left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
-            step = dense.solve(newton_matrix(y, multipliers), left)
-            return step.at[n:].set(jnp.where(independent, step[n:], multipliers))
-
-        def left_at(state: Array) -> Array:
-            return equations(fixed, fixed_metric, target, state[:n], state[n:])
-
-        return newton(left_at, step, state, PER_STAGE), None
-
+    reached = start if is_linear else some_state()
     zero = jnp.zeros_like(residual(fixed, start))
-    shares = (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES
-    followed, _ = lax.scan(follow, jnp.concatenate([reached, zero]), shares)
+    begin = jnp.concatenate([reached, zero])
+    if is_linear:
+        followed = begin - step(begin, left_at(start, begin), 0)
+    else:
+        followed, _ = lax.scan(follow, begin, (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES)
     y, multipliers = followed[:n], followed[n:]
     finite = jnp.all(jnp.isfinite(y))
     y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.mechanics.consistent_state import free_coordinates
 from tests.tiers import exhaustive_but
 
 rng = np.random.default_rng(5)
@@ -198,3 +199,17 @@ def test_a_position_alone_and_a_velocity_alone():
         lj.consistent_state(driven, 0.0, guess, still, None, hold_velocity="a")
     with pytest.raises(ValueError, match="hold_velocity names 'c'"):
         lj.consistent_state(driven, 0.0, guess, still, None, hold_velocity="c")
+
+
+def test_names_to_hold():
+    """A coordinate is held by its own name, and by that of each part of q it lies in."""
+    q = {"crank": lj.Pose.at(), "x": jnp.zeros(2)}
+    for name, held in (
+        ("crank", range(7)),
+        ("crank.quaternion", range(3, 7)),
+        ("crank.position[1]", [1]),
+        ("x", (7, 8)),
+    ):
+        np.testing.assert_array_equal(np.flatnonzero(~free_coordinates(q, name)), held)
+    with pytest.raises(ValueError, match="hold names 'cran', but the coordinates are 'crank.position"):
+        free_coordinates(q, "cran")
