@@ -15,7 +15,7 @@ from lagjax.bodies.joints import (
 )
 from lagjax.bodies.loads import Load, applied, generalized_force, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
-from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail
+from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 
 __all__ = [
     "Body",
@@ -45,5 +45,6 @@ __all__ = [
     "torsion",
     "trail",
     "universal",
+    "usual_shapes",
     "weight",
 ]

@@ -19,6 +19,7 @@ from lagjax.bodies import (
     fixed,
     generalized_force,
     ground,
+    line,
     multibody,
     named,
     prismatic,
@@ -28,6 +29,7 @@ from lagjax.bodies import (
     universal,
     weight,
 )
+from lagjax.display import Drawing, Shape
 from lagjax.models.joint_positions import (
     BodyJoint,
     Chains,
@@ -38,6 +40,7 @@ from lagjax.models.joint_positions import (
     poses,
     rate_squared,
 )
+from lagjax.models.looks import looks_of
 from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -159,7 +162,9 @@ class RobotModel:
             return sum(energies) + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
 
         every = [weight(bodies, self.gravity), *self._loads(), *loads]
-        return multibody(bodies, own | dict(joints or {}), every, besides if rotors else lagrangian, **others)
+        system = multibody(bodies, own | dict(joints or {}), every, besides if rotors else lagrangian, **others)
+        setattr(system.lagrangian, "drawing", Drawing(self._looks))
+        return system
 
     def joint_system(self, loads: Iterable[Load] = (), closures: Mapping | None = None, **others) -> System:
         """Return the system in joint coordinates: q and v are positions and rates of joints by name.
@@ -199,6 +204,10 @@ class RobotModel:
             given = jax.vjp(self._poses, q)[1](of_loads)[0]
             return given if force is None else jax.tree.map(jnp.add, given, force(t, q, v, params))
 
+        def pose(name: str, q: PyTree, params: PyTree) -> Pose:
+            return self._poses(q)[name]
+
+        setattr(lagrangian, "drawing", Drawing(self._looks, pose))
         turning = [x for x in self.joints.values() if x.kind in ("spherical", "floating")]
         closing = named(self._loops() | dict(closures or {}))
         return System(
@@ -209,6 +218,16 @@ class RobotModel:
             dissipation=friction if dampers or losses else dissipation,
             **others,
         )
+
+    def _looks(self, params: PyTree) -> tuple[Shape, ...]:
+        """How it is drawn: bodies, and at each joint a dot with arms to the bodies' centres."""
+        found = list(looks_of(self.shapes, self.bodies.values()))
+        for joint in self.joints.values():
+            for head, frame in ((joint.parent, joint.placement), self.frames[joint.child]):
+                if head is None or head in self.bodies:
+                    marker = self._marker(head, frame, joint.axis)
+                    found += [line(marker)] if head is None else [line(marker), line(marker.body, marker)]
+        return tuple(found)
 
     def _energies(self, poses: Pose, rates: Pose) -> Array:
         """Kinetic energy minus that in the field of weight, of all bodies at once."""
