@@ -143,6 +143,7 @@ if TYPE_CHECKING:
         Load,
         Marker,
         Pose,
+        Tree,
         applied,
         box,
         cylinder,
@@ -209,8 +210,8 @@ LATER = {
     ),
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
-        "Body Load Marker Pose applied box cylinder cylindrical disk fixed ground line mesh motor multibody prismatic "
-        "revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
+        "Body Load Marker Pose Tree applied box cylinder cylindrical disk fixed ground line mesh motor multibody "
+        "prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.models": "RobotModel read_mjcf read_urdf",
@@ -253,6 +254,7 @@ __all__ = [
     "Pose",
     "ground",
     "Marker",
+    "Tree",
     "multibody",
     "spherical",
     "revolute",

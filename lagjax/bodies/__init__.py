@@ -16,6 +16,7 @@ from lagjax.bodies.joints import (
 from lagjax.bodies.loads import Load, applied, generalized_force, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
 from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
+from lagjax.bodies.tree import Tree
 
 __all__ = [
     "Body",
@@ -23,6 +24,7 @@ __all__ = [
     "Load",
     "Marker",
     "Pose",
+    "Tree",
     "applied",
     "box",
     "cylinder",

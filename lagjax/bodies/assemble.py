@@ -6,7 +6,7 @@ import jax
 
 from lagjax.bodies.body import Body, check_bodies
 from lagjax.bodies.joints import named
-from lagjax.bodies.loads import Load, generalized_force
+from lagjax.bodies.loads import Load, check_loads, generalized_force
 from lagjax.bodies.shapes import usual_shapes
 from lagjax.display import Drawing
 from lagjax.system import Holonomic, Nonholonomic, System
@@ -49,7 +49,7 @@ def multibody(
     **Raises:** `ValueError` for two bodies or constraints of one name; `TypeError` for a body, joint or load that is
     none, and for a keyword that is not among `others`.
     """
-    bodies, loads = check_bodies("lj.multibody", bodies), _check_loads(loads)
+    bodies, loads = check_bodies("lj.multibody", bodies), check_loads("lj.multibody", loads)
     _check_joints(joints)
     _check_keywords(others)
     units = {f"{body.name} is turned": body.unit for body in bodies}
@@ -84,20 +84,6 @@ def multibody(
         dissipation=friction if has_dissipation else dissipation,
         **others,
     )
-
-
-def _check_loads(loads: Iterable[Load]) -> tuple[Load, ...]:
-    if isinstance(loads, Load):
-        raise TypeError("the loads of lj.multibody are a list, and one load was given.\nFix: loads=[lj.weight([rod])].")
-    loads = tuple(loads)
-    for i, load in enumerate(loads):
-        if not isinstance(load, Load):
-            raise TypeError(
-                f"load {i} of lj.multibody is no lj.Load, but {type(load).__name__}.\n"
-                "Usual cause: a function of (t, q, v, params) by itself, or a joint among the loads.\n"
-                "Fix: lj.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
-            )
-    return loads
 
 
 def _check_joints(joints: Mapping | None):

@@ -14,12 +14,14 @@ The multiplier of a point's row is a force along an axis of space (`aside`: of a
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, check_markers, valued
 from lagjax.bodies.shapes import disk, line, looks, sphere
+from lagjax.display import Shape
 from lagjax.system import Holonomic, Nonholonomic
 
 
@@ -221,14 +223,33 @@ def turn(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
     return jnp.sum(jnp.cross(a.axes(q), b.axes(q)), axis=0) / 2
 
 
+@dataclass(frozen=True)
+class Joined:
+    """The rows of a joint between two markers, as a function of (t, q, params).
+
+    >>> import lagjax as lj
+    >>> bob = lj.Body("bob", 1.0, (1.0, 1.0, 1.0))
+    >>> Joined(lj.ground.at(), bob.at(), (apart,))(0.0, {"bob": lj.Pose.at((0.0, 0.5, 0.0))}, None).tolist()
+    [0.0, 0.5, 0.0]
+    """
+
+    a: Marker
+    b: Marker
+    rows: tuple[Callable, ...]
+
+    def __call__(self, t, q: PyTree, params: PyTree) -> Float[Array, " m"]:
+        return jnp.concatenate([row(self.a, self.b, q, params) for row in self.rows])
+
+    @property
+    def drawing(self) -> tuple[Shape, ...]:
+        """What it looks like: a dot where it is, and lines to the bodies' centres."""
+        ends = (x for x in (self.a, self.b) if not isinstance(x.body, Ground))
+        return line(self.a), *(line(x.body, x) for x in ends)
+
+
 def _joined(a: Marker, b: Marker, *rows: Callable) -> Holonomic:
     _check_two(a, b)
-
-    def joint(t, q, params):
-        return jnp.concatenate([row(a, b, q, params) for row in rows])
-
-    looks(joint, line(a), *(line(x.body, x) for x in (a, b) if not isinstance(x.body, Ground)))
-    return Holonomic(joint)
+    return Holonomic(Joined(a, b, rows))
 
 
 def _check_two(a: Marker, b: Marker):

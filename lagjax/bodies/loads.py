@@ -41,14 +41,23 @@ def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) 
 
     **Raises:** `TypeError` unless `bodies` is a list of them; L's check names what is wrong with `g`.
     """
-    bodies = check_bodies("lj.weight", bodies)
+    return Load(Weight(check_bodies("lj.weight", bodies), g))
 
-    def potential(t, q, v, params):
-        centres = [body.pose(q).position for body in bodies]
-        field = jnp.asarray(valued(g, params), centres[0].dtype)
-        return -sum(valued(body.mass, params) * jnp.dot(field, r) for body, r in zip(bodies, centres))
 
-    return Load(potential)
+class Weight(NamedTuple):
+    """The potential energy of bodies in a uniform field.
+
+    >>> Weight((), (0.0, 0.0, -9.81)).bodies
+    ()
+    """
+
+    bodies: tuple[Body, ...]
+    g: ArrayLike | Callable
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        centres = [body.pose(q).position for body in self.bodies]
+        field = jnp.asarray(valued(self.g, params), centres[0].dtype)
+        return -sum(valued(body.mass, params) * jnp.dot(field, r) for body, r in zip(self.bodies, centres))
 
 
 def spring(
@@ -169,6 +178,21 @@ def generalized_force(loads: Iterable[Load], t, q: PyTree, v: PyTree, params: Py
     """The generalized force of loads' powers."""
     powers = [load.power for load in loads if load.power is not None]
     return jax.grad(lambda w: sum(power(t, q, w, v, params) for power in powers))(v)
+
+
+def check_loads(whose: str, loads: Iterable[Load]) -> tuple[Load, ...]:
+    """The loads as a tuple; a `TypeError` in the name of `whose` unless they are a list of some."""
+    if isinstance(loads, Load):
+        raise TypeError(f"the loads of {whose} are a list, and one load was given.\nFix: loads=[lj.weight([rod])].")
+    loads = tuple(loads)
+    for i, load in enumerate(loads):
+        if not isinstance(load, Load):
+            raise TypeError(
+                f"load {i} of {whose} is no lj.Load, but {type(load).__name__}.\n"
+                "Usual cause: a function of (t, q, v, params) by itself, or a joint among the loads.\n"
+                "Fix: lj.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
+            )
+    return loads
 
 
 def _is_zero(x: ArrayLike | Callable) -> bool:

@@ -52,3 +52,19 @@ def about(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:
     axis = jnp.asarray(axis, float)
     half = jnp.asarray(angle, float) / 2
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis / jnp.sqrt(jnp.sum(axis**2))])
+
+
+def quaternion_of(turned: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """The unit quaternion of a rotation matrix, of the two the one whose largest part is positive."""
+    (a, b, c), (d, f, g), (h, i, j) = turned
+    # The rows of 4 e eᵀ, of which that with the largest diagonal entry is divided by the root of that.
+    rows = [
+        jnp.stack([1 + a + f + j, i - g, c - h, d - b]),
+        jnp.stack([i - g, 1 + a - f - j, b + d, c + h]),
+        jnp.stack([c - h, b + d, 1 - a + f - j, g + i]),
+        jnp.stack([d - b, c + h, g + i, 1 - a - f + j]),
+    ]
+    best, largest = rows[0], rows[0][0]
+    for k in (1, 2, 3):
+        best, largest = (jnp.where(rows[k][k] > largest, x, y) for x, y in ((rows[k], best), (rows[k][k], largest)))
+    return best / (2 * jnp.sqrt(largest))

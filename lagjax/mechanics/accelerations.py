@@ -13,8 +13,8 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.saddle_point import examined
-from lagjax.mechanics.sparse_saddle_point import Banded
+from lagjax.mechanics.forward_dynamics import ForwardDynamics
+from lagjax.mechanics.saddle_point import Dense, examined
 from lagjax.system import (
     Model,
     State,
@@ -71,10 +71,12 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(model)
-    if isinstance(equations.form, Banded):
+    if not isinstance(equations.form, Dense):
         found = equations.verdict(s.t, s.q, s.v)
         if found.finite and not found.singular and not found.contradictory:
             return found.a, found.multipliers
+    if isinstance(equations.form, ForwardDynamics):
+        raise ValueError(explain_failure(model, s) or f"the accelerations are not finite {where(s)}.")
     found = examined(model, s)
     solution = found.a, found.multipliers
     finite = all(np.all(np.isfinite(x)) for x in jax.tree.leaves((solution, found.lagrangian)))

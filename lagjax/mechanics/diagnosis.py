@@ -10,6 +10,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.first_order import balance_matrix, is_determined, of_states, with_first_order
+from lagjax.mechanics.forward_dynamics import missed
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined
 from lagjax.system import Model, State, constraints, coordinates
 
@@ -21,6 +22,8 @@ OFF_ABOVE = 1e-6
 
 def explain_failure(model: Model, s: coordinates.State) -> str | None:
     """Say in the user's names why the equations fail at a state; None where they do not."""
+    if model.solves_itself and (disagreement := explain_disagreement(model, s)):
+        return disagreement
     found = examined(model, s)
     linear, rows, lagrangian = found.linear, found.rows, found.lagrangian
     names = model.names
@@ -63,6 +66,23 @@ def explain_failure(model: Model, s: coordinates.State) -> str | None:
         explain_singular(np.asarray(found.matrix), model, s)
         or explain_contradiction(found, model, s)
         or _explain_paradox(found, s)
+    )
+
+
+def explain_disagreement(model: Model, s: State) -> str | None:
+    """Say in which coordinate forward dynamics miss the equations of L; None where they solve them."""
+    model = with_first_order(model)
+    state = s.t, *model.vectors(s.q, s.v)
+    by, wrong = (np.asarray(x) for x in missed(model, *state, np.eye(model.n, dtype=s.t.dtype)))
+    if not np.any(wrong) or not np.isfinite(model.lagrangian(*state)):
+        return None
+    i = int(np.argmax(np.where(wrong, by, 0.0)))
+    return (
+        f"forward_dynamics do not solve the equations of L: M a = F is missed by {by[i]:.3g} in '{model.names[i]}', "
+        f"{where(s)} or at other velocities there.\n"
+        "Usual cause: a term of L that they leave out, as a potential or a Coriolis force; the force that they "
+        "are given, which is all that acts beside L; or a sign.\n"
+        "Fix: compare them with lj.accelerations(lj.System(lagrangian, ...), ...) without forward_dynamics."
     )
 
 

@@ -1,9 +1,10 @@
 """The equations of a system: everything asked of them at a state, and the one place that knows how to solve them.
 
-There are three ways. The robust way works in arrays: one matrix (`saddle_point.py`), or a band where the system is
-large and its parts touch few others (`sparse_saddle_point.py`). It exchanges rows, leaves dependent constraints out and
-says what is wrong. The fast way is for small systems: their equations are also written out number by number
-(`scalar_equations.py`), which is many times as fast, and gives NaN where it fails.
+There are four ways. A system with forward dynamics of its own is solved by these (`forward_dynamics.py`). The robust
+way works in arrays: one matrix (`saddle_point.py`), or a band where the system is large and its parts touch few others
+(`sparse_saddle_point.py`). It exchanges rows, leaves dependent constraints out and says what is wrong. The fast way is
+for small systems: their equations are also written out number by number (`scalar_equations.py`), which is many times as
+fast, and gives NaN where it fails.
 
 A caller has an `Equations` and does not choose between them.
 """
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, once
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
+from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
@@ -37,7 +39,7 @@ class Equations(eqx.Module):
 
     model: Model
     prepared: tuple[tuple | None, tuple | None]
-    form: Dense | Banded = eqx.field(static=True)
+    form: Dense | Banded | ForwardDynamics = eqx.field(static=True)
     written: WrittenOut | None = eqx.field(static=True)
     fallback: bool = eqx.field(static=True)
     users: Form | None = eqx.field(static=True)
@@ -158,11 +160,18 @@ def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> 
         both = written.equations, written.project
         prepared = tuple(None if numbers is None else numbers.prepare(model) for numbers in both)
     fallback = fallback and written is not None and written.may_fail
+    if model.solves_itself:
+        return Equations(model, prepared, ForwardDynamics(_named(model)), None, False, None)
     sparse, unknowns = plan(model), model.n + model.m
     # Other small systems are written out, where zeros cost nothing.
     may_divide = has_networks(model) and not model.m and unknowns <= UP_TO
     form = Dense(unknowns, may_divide and is_diagonal(model)) if sparse is None else Banded(sparse)
     return Equations(model, prepared, form, written, fallback, users)
+
+
+def _named(model: Model) -> str:
+    solves = model.system.forward_dynamics
+    return getattr(solves, "__name__", type(solves).__name__).replace("_", " ")
 
 
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.

@@ -60,7 +60,7 @@ def _found(structure, leaves: tuple) -> FirstOrder:
     places = model.tree(np.arange(model.n))
     states = tuple((name, tuple(np.ravel(places[name]).tolist())) for name in model.system.states)
     known = [i for _, among in states for i in among]
-    return FirstOrder(states, () if model.reacts else _massless(structure, leaves, known))
+    return FirstOrder(states, () if model.reacts or model.solves_itself else _massless(structure, leaves, known))
 
 
 def _massless(structure, leaves: tuple, states: list[int]) -> tuple[int, ...]:

@@ -62,7 +62,7 @@ def has_networks(model: Model | PyTree) -> bool:
 
 def is_small(model: Model) -> bool:
     """Whether the equations of a system are to be written out."""
-    if is_plain() or has_networks(model):
+    if is_plain() or has_networks(model) or model.solves_itself:
         return False
     return model.n + model.m <= (CONSTRAINED_UP_TO if model.m else UP_TO)
 

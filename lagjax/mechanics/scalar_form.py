@@ -47,7 +47,7 @@ def in_numbers(model: Model) -> Model:
     form = model.form._replace(structure=structure, shapes=((),) * model.n)
 
     def change(function: Callable, role: str) -> InNumbers:
-        return InNumbers(function, model.form, returns_coordinates=role == "force")
+        return InNumbers(function, model.form, returns_coordinates=role in ("force", "forward_dynamics"))
 
     return unchecked(model.system.map(change), model.params, form)
 

@@ -19,7 +19,7 @@ from lagjax.jaxtools import is_linear, kinds, remembered
 from lagjax.system import coordinates
 from lagjax.system.argument_checks import check_system
 from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE, takes_of
+from lagjax.system.function_arguments import OF_STATE, WITH_FORCE, takes_of
 from lagjax.system.model import Model, model_of
 from lagjax.system.states import check_rate, check_starts, check_use, with_rates
 from lagjax.system.system import System, unchecked
@@ -71,6 +71,12 @@ def traced_system(system: System, s: State) -> System:
         call = Call("rate", f, OF_STATE, f" of state '{name}'")
         states[name] = traced_call(call, given, partial(check_rate, of=s.q[name]), OF_STATES)
     found = unchecked(lagrangian, constraints, None, dissipation, states)
+    solved = None
+    if system.forward_dynamics is not None:
+        call = Call("forward_dynamics", system.forward_dynamics, WITH_FORCE)
+        check = partial(_check_force, q=s.q, what="acceleration")
+        solved = traced_call(call, given | {"force": s.q}, check)
+        found = unchecked(lagrangian, constraints, None, dissipation, states, None, solved)
     if system.force is None:
         check_use(found)
         return found
@@ -78,7 +84,7 @@ def traced_system(system: System, s: State) -> System:
     given["multipliers"] = model_of(found, *s).zero_multipliers()
     call = Call("force", system.force, takes_of(system.force))
     force = traced_call(call, given, partial(_check_force, q=s.q))
-    found = unchecked(lagrangian, constraints, force, dissipation, states)
+    found = unchecked(lagrangian, constraints, force, dissipation, states, None, solved)
     check_use(found)
     model = model_of(found, *s)
     if model.reacts:
@@ -123,20 +129,20 @@ def _is_complex(dtype: DTypeLike):
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 
-def _check_force(call: Call, force: PyTree, q: PyTree):
+def _check_force(call: Call, force: PyTree, q: PyTree, what: str = "force"):
     expected = jax.tree.map(jnp.shape, q)
     if force is None:
         raise ValueError(
-            f"{call} must return one force per coordinate, like q, and returned None.\n"
+            f"{call} must return one {what} per coordinate, like q, and returned None.\n"
             "Usual cause: a function without return.\n"
-            "Fix: return the structure of q, with 0.0 where no force acts."
+            f"Fix: return the structure of q, with 0.0 where there is no {what}."
         )
     if jax.tree.map(jnp.shape, force) != expected:
         raise ValueError(
-            f"{call} must return one force per coordinate, like q.\n"
-            f"  q has shapes {expected}\n  the force has {jax.tree.map(jnp.shape, force)}\n"
-            "Usual cause: a force for only one of the coordinates.\n"
-            "Fix: return the structure of q, with 0.0 where no force acts."
+            f"{call} must return one {what} per coordinate, like q.\n"
+            f"  q has shapes {expected}\n  the {what} has {jax.tree.map(jnp.shape, force)}\n"
+            f"Usual cause: a {what} for only one of the coordinates.\n"
+            f"Fix: return the structure of q, with 0.0 where there is no {what}."
         )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 OF_STATE, OF_POSITION = ("t", "q", "v", "params"), ("t", "q", "params")
 WITH_MULTIPLIERS = ("t", "q", "v", "multipliers", "params")
+WITH_FORCE = ("t", "q", "v", "force", "params")
 
 
 def takes_of(function: Callable) -> tuple[str, ...]:

@@ -200,6 +200,16 @@ class Model(eqx.Module):
         stacked = jnp.zeros(self.m, self.form.dtype) if multipliers is None else multipliers
         return force(t, q, v, self.split(stacked), self.params)
 
+    def forward_dynamics(self, t: Array, x: Array, u: Array, force: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The accelerations of L under a force, by the function that the user gave for that."""
+        a = self.system.forward_dynamics(t, self.tree(x), self.tree(u), self.tree(force), self.params)
+        return self.vector(a).astype(x.dtype)
+
+    @property
+    def solves_itself(self) -> bool:
+        """Whether the user's own forward dynamics solve the equations; not where the force depends on multipliers."""
+        return getattr(self.system, "forward_dynamics", None) is not None and not self.reacts
+
     @property
     def is_returned(self) -> bool:
         """Whether a step is followed by a return of the state, to constraints or to velocities that are determined."""

@@ -21,6 +21,7 @@ from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
 from lagjax.system.constraints import Holonomic, Nonholonomic
 from lagjax.system.elements import Element, Elements, Held, SampledControl
+from lagjax.system.function_arguments import OF_STATE, WITH_FORCE
 from lagjax.system.traced_functions import Traced
 
 # Packages that pickle any function, whatever its name: they write down what it does.
@@ -68,7 +69,7 @@ def _any_function_is_taken():
     return False
 
 
-FIELDS = "lagrangian", "constraints", "force", "dissipation", "states", "elements"
+FIELDS = "lagrangian", "constraints", "force", "dissipation", "states", "elements", "forward_dynamics"
 
 
 class System(eqx.Module):
@@ -99,6 +100,9 @@ class System(eqx.Module):
 
     - `elements`: by name, contacts, friction and sampled control (`lj.Contact`, `lj.CompliantContact`, `lj.Stop`,
       `lj.Friction`, `lj.SampledControl`); or `lj.Elements` of them.
+    - `forward_dynamics`: `f(t, q, v, force, params)` -> like `q`, the accelerations that solve the equations of this L
+      under a generalized force, if you have a faster way than its mass matrix. Where a motion starts and at each call
+      from Python, M a = F is checked with L; from then on accelerations, and multipliers by M⁻¹ = ∂f/∂force, are f's.
 
     Systems with the same functions are equal, and can be static arguments of `jax.jit`. They can be pickled if their
     functions can, that is if these are defined with `def` in a module.
@@ -114,6 +118,7 @@ class System(eqx.Module):
     dissipation: Callable | None
     states: dict[str, Callable]
     elements: Elements | None
+    forward_dynamics: Callable | None
 
     def __init__(
         self,
@@ -123,13 +128,18 @@ class System(eqx.Module):
         dissipation: Callable | None = None,
         states: Mapping[str, Callable] | None = None,
         elements: Elements | Mapping[str, Element] | None = None,
+        forward_dynamics: Callable | None = None,
     ):
         if isinstance(lagrangian, System):
             raise TypeError("this is a lj.System already.\nFix: system, in place of lj.System(system).")
-        for role, function in (("lagrangian", lagrangian), ("force", force), ("dissipation", dissipation)):
+        functions = {
+            "lagrangian": lagrangian, "force": force, "dissipation": dissipation, "forward_dynamics": forward_dynamics,
+        }  # fmt: skip
+        for role, function in functions.items():
+            takes = ", ".join(WITH_FORCE if role == "forward_dynamics" else OF_STATE)
             if function is not None and not callable(function):
                 raise TypeError(
-                    f"{role} must be a function of (t, q, v, params), not {type(function).__name__}.\n"
+                    f"{role} must be a function of ({takes}), not {type(function).__name__}.\n"
                     f"Fix: pass the function itself, {role}=f, not its value f(...)."
                 )
         if constraints is not None and not isinstance(constraints, Mapping):
@@ -171,12 +181,14 @@ class System(eqx.Module):
         self.dissipation = dissipation
         # None where there are none, so that nothing else has to ask.
         self.elements = (elements if isinstance(elements, Elements) else Elements(elements)) if elements else None
+        self.forward_dynamics = forward_dynamics
         self.states = dict(sorted({**states, **_held(self.elements or {}, states)}.items()))
 
     def map(self, change: Callable[[Callable, str], Callable]) -> "System":
         """The system with `change(function, role)` in place of each of its functions, unchecked.
 
-        Roles: "lagrangian", "force", "dissipation", `rate_of` a state, and those of constraints, "g" and "phi".
+        Roles: "lagrangian", "force", "dissipation", "forward_dynamics", `rate_of` a state, and those of constraints,
+        "g" and "phi".
         """
 
         def change_if(function: Callable | None, role: str) -> Any:
@@ -189,6 +201,7 @@ class System(eqx.Module):
             change_if(self.dissipation, "dissipation"),
             {name: change(f, rate_of(name)) for name, f in self.states.items()},
             self.elements,
+            change_if(self.forward_dynamics, "forward_dynamics"),
         )
 
     in_phases: ClassVar[bool] = False
@@ -201,7 +214,9 @@ class System(eqx.Module):
     @property
     def first_phase(self) -> "System":
         """The system itself, without its elements."""
-        return self if self.elements is None else unchecked(*(getattr(self, name) for name in FIELDS[:-1]))
+        if self.elements is None:
+            return self
+        return unchecked(*(None if name == "elements" else getattr(self, name) for name in FIELDS))
 
     def starting(self, start, argument: str = "start") -> "System":
         """The system itself; raise if `start` names a phase."""
@@ -231,7 +246,9 @@ class System(eqx.Module):
     def functions(self) -> dict[str, Callable | None]:
         """The user's functions by role."""
         of_constraints = {f"{c.role} of constraint '{name}'": c.function for name, c in self.constraints.items()}
-        others = {"the force": self.force, "the dissipation": self.dissipation}
+        others = {
+            "the force": self.force, "the dissipation": self.dissipation, "the forward dynamics": self.forward_dynamics,
+        }  # fmt: skip
         of_states = {f"the {rate_of(name)}": f for name, f in self.states.items()}
         return {"the Lagrangian": self.lagrangian, **of_constraints, **others, **of_states}
 
@@ -296,9 +313,11 @@ def unchecked(
     dissipation,
     states: dict,
     elements: Elements | None = None,
+    forward_dynamics: Callable | None = None,
 ) -> System:
     """A system of these functions, which have been checked: to make a module the usual way takes long."""
-    return without_init(System, dict(zip(FIELDS, (lagrangian, constraints, force, dissipation, states, elements))))
+    given = lagrangian, constraints, force, dissipation, states, elements, forward_dynamics
+    return without_init(System, dict(zip(FIELDS, given)))
 
 
 def _name(function: Callable):

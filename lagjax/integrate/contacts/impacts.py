@@ -103,7 +103,8 @@ class _Rebound(eqx.Module):
         but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
         before = self.before
         system = System(
-            before.lagrangian, before.constraints | contact, before.force, before.dissipation, before.states
+            before.lagrangian, before.constraints | contact, before.force, before.dissipation, before.states,
+            forward_dynamics=before.forward_dynamics,
         )  # fmt: skip
         model = model_of(system, t, q, v, params)
         change = model.belongs_to(list(contact)[-1]).astype(model.form.dtype)

@@ -1,0 +1,96 @@
+"""What is known of a tree's links independently of their motion, as arrays over links, for given params.
+
+Masses, inertias and places that are functions of params are called once for each function, however many links have it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.bodies.tree.links import Entry, Link, Slots, slots_of
+
+
+class Given(NamedTuple):
+    """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links."""
+
+    mass: Float[Array, " n"]
+    inertia: Float[Array, "n 3 3"]
+    a: Float[Array, "n 3"]
+    b: Float[Array, "n 3"]
+
+
+class Geometry:
+    """The links of a tree as arrays.
+
+    `frame_a`, `frame_b` (n, 3, 3): the axes of joints as rows, along those of parents and of links. `turns` (n, k):
+    which freedoms turn, `slides` which slide; k is the largest number of freedoms of a joint between two bodies.
+    """
+
+    def __init__(self, links: Sequence[Link], entries: Sequence[Entry]):
+        self.links, self.entries = links, entries
+        kinds = np.array([link.kind for link in links])
+        self.n, self.k = len(links), 3 if "ball" in kinds else 1
+        self.frame_a = np.array([link.a.frame for link in links])
+        self.frame_b = np.array([link.b.frame for link in links])
+        first = np.arange(self.k) == 0
+        self.turns = (((kinds == "turn")[:, None] & first) | (kinds == "ball")[:, None]).astype(float)
+        self.slides = ((kinds == "slide")[:, None] & first).astype(float)
+        self.free, self.ball = kinds == "free", kinds == "ball"
+        self.root = np.array([link.parent < 0 for link in links], float)
+        self.slots: Slots = slots_of([link.parent for link in links])
+        self.body_at = {link.body.name: i for i, link in enumerate(links) if link.body is not None}
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """The place of each link's number among all numbers, (n,); that behind the last one if it has none."""
+        has = [link.kind in ("turn", "slide") for link in self.links]
+        return np.array([link.place if x else sum(has) for link, x in zip(self.links, has)])
+
+    @cached_property
+    def quaternions(self) -> np.ndarray:
+        """The place of each link's quaternion among all of them, (n,); 0 if it has none."""
+        return np.array([link.place if link.kind in ("ball", "free") else 0 for link in self.links])
+
+    @cached_property
+    def links_of_numbers(self) -> np.ndarray:
+        """The link of each number."""
+        has = np.flatnonzero([link.kind in ("turn", "slide") for link in self.links])
+        return has[np.argsort(self.numbers[has])]
+
+    @cached_property
+    def links_of_quaternions(self) -> np.ndarray:
+        """The link of each quaternion."""
+        has = np.flatnonzero(self.ball | self.free)
+        return has[np.argsort(self.quaternions[has])]
+
+    def at(self, params: PyTree, dtype: DTypeLike) -> Given:
+        """The numbers of links for these params."""
+        bodies = [link.body for link in self.links]
+
+        def inertia(x: Any) -> Any:
+            of = np if isinstance(x, np.ndarray) else jnp
+            return of.diag(x) if np.ndim(x) == 1 else x
+
+        def values(given: Sequence, form: Callable = lambda x: x) -> Array:
+            constants = [None if callable(x) else form(np.array(x)) for x in given]
+            like = next((x for x in constants if x is not None), None)
+            functions = {x for x in given if callable(x)}
+            found = {f: form(jnp.asarray(f(params), dtype)) for f in functions}
+            shape = np.shape(like if like is not None else next(iter(found.values())))
+            total = jnp.asarray(np.array([np.zeros(shape) if x is None else x for x in constants]), dtype)
+            for f, value in found.items():
+                of_f = np.array([x is f for x in given], dtype).reshape(-1, *[1] * len(shape))
+                total = total + of_f * value[None]
+            return total
+
+        return Given(
+            values([0.0 if body is None else body.mass for body in bodies]),
+            values([(0.0, 0.0, 0.0) if body is None else body.inertia for body in bodies], inertia),
+            values([link.a.place for link in self.links]),
+            values([link.b.place for link in self.links]),
+        )

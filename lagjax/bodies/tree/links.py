@@ -1,0 +1,192 @@
+"""The links of a tree: its bodies in an order in which each comes after its parent, and what joins it to that.
+
+A joint of several freedoms that turn about or slide along axes is a row of links, of which all but the last have no
+body. A body on which no joint ends is free.
+
+Both passes over the links, outward and inward, need only what belongs to few links at a time: those that still have
+children to come. Each of these has a slot, which its last child takes over; a chain has one, and a tree of n links that
+always fork at most log2(n), as the largest branch comes last.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax.bodies.body import Body, Ground, Marker, ground
+from lagjax.bodies.joints import Joined, apart, aside, tilt, turn
+from lagjax.system import Holonomic
+
+# The freedoms that a joint leaves, from the rows that it has as a constraint.
+FREEDOMS = {
+    (apart, tilt): ("turn",),
+    (aside, turn): ("slide",),
+    (aside, tilt): ("slide", "turn"),
+    (apart,): ("ball",),
+    (apart, turn): ("held",),
+}
+# What a joint of each kind has in q: numbers, or a quaternion.
+SIZES = {("turn",): (), ("slide",): (), ("slide", "turn"): (2,), ("ball",): (4,), ("held",): None}
+# Both ends of a link without a body.
+BETWEEN = Marker(Ground("between"), (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class Link:
+    """A body, or None where it has no mass, and how it moves from its parent (-1: the ground).
+
+    `kind`: "turn" and "slide" about or along the axis of a, "ball", "free" or "held"; `a` is a place on the parent and
+    `b` on the body. `place`: of its coordinate among all numbers, or among all quaternions.
+    """
+
+    body: Body | None
+    parent: int
+    kind: str
+    a: Marker
+    b: Marker
+    place: int
+
+
+class Entry(NamedTuple):
+    """An entry of q: its name, its kinds of freedoms, and how many joints it lists (None for a single one)."""
+
+    name: str
+    kinds: tuple[str, ...]
+    count: int | None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Its shape in q; of a free body, that of its quaternion."""
+        one = (4,) if self.kinds == ("free",) else SIZES[self.kinds]
+        assert one is not None
+        return one if self.count is None else (self.count, *one)
+
+
+def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence]) -> tuple[list[Link], list[Entry]]:
+    """The links in order, and the entries of q; raises where joints and bodies do not make a tree."""
+    entries, held_by, every = [], {}, set(bodies)
+    numbers = quaternions = 0
+    for name, given in joints.items():
+        listed = isinstance(given, list | tuple)
+        row = [_joint(name, joint, every) for joint in (given if listed else [given])]
+        kinds = {kinds for _, kinds in row}
+        if len(kinds) != 1:
+            raise ValueError(
+                f"the list of joints '{name}' has joints of several kinds, or none.\n"
+                "Fix: a name for each kind; a list is one array in q."
+            )
+        of_all = kinds.pop()
+        for joined, kinds in row:
+            child = joined.b.body
+            if child.name in held_by:
+                raise ValueError(
+                    f"body '{child.name}' hangs on two joints, '{held_by[child.name][0]}' and '{name}'.\n"
+                    "Usual cause: a closed loop; or the places of one of them in the wrong order, which is the "
+                    "parent's first.\n"
+                    f"Fix: lj.revolute(parent.at(...), child.at(...)); a joint that closes a loop goes into "
+                    f"tree.system(closures={{'{name}': ...}})."
+                )
+            at = quaternions if kinds == ("ball",) else numbers
+            held_by[child.name] = name, joined, kinds, at
+            quaternions += kinds == ("ball",)
+            numbers += 0 if kinds in (("ball",), ("held",)) else len(kinds)
+        if of_all != ("held",):
+            entries.append(Entry(name, of_all, len(row) if listed else None))
+    for body in bodies:
+        if body.name not in held_by:
+            held_by[body.name] = body.name, Joined(ground.at(), body.at(), ()), ("free",), quaternions
+            entries.append(Entry(body.name, ("free",), None))
+            quaternions += 1
+    names = [entry.name for entry in entries]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"a joint and a free body are called '{twice[0]}'.\nFix: a name for each.")
+    return _in_order(bodies, held_by), entries
+
+
+def _joint(name: str, joint: Holonomic, bodies: Set[Body]) -> tuple[Joined, tuple[str, ...]]:
+    joined = joint.g if isinstance(joint, Holonomic) else None
+    kinds = FREEDOMS.get(joined.rows) if isinstance(joined, Joined) else None
+    if kinds is None or not isinstance(joined, Joined):
+        raise TypeError(
+            f"joint '{name}' is none that a tree has coordinates for: lj.revolute, lj.prismatic, lj.cylindrical, "
+            "lj.spherical, lj.fixed, or a list of some of one kind.\n"
+            "Fix: a constraint of another kind goes into tree.system(closures={...})."
+        )
+    for marker in (joined.a, joined.b):
+        if marker.body not in bodies and not isinstance(marker.body, Ground):
+            raise ValueError(
+                f"joint '{name}' holds on to '{marker.body.name}', which is not among the bodies of the tree.\n"
+                "Fix: lj.Tree([..., body], joints)."
+            )
+    if isinstance(joined.b.body, Ground):
+        raise ValueError(
+            f"the second place of joint '{name}' is on the ground, and must be on the body that hangs there.\n"
+            "Fix: lj.revolute(lj.ground.at(...), body.at(...)), the parent's first."
+        )
+    return joined, kinds
+
+
+def _in_order(bodies: Sequence[Body], held_by: Mapping) -> list[Link]:
+    """The links, each branch in one piece after its parent, the largest last."""
+    children: dict[Body | Ground, list[Body]] = {}
+    for body in bodies:
+        children.setdefault(held_by[body.name][1].a.body, []).append(body)
+    # Outward from the ground; what is not met hangs on itself.
+    met, ahead = [], list(children.get(ground, ()))
+    while ahead:
+        met.append(ahead.pop())
+        ahead += children.get(met[-1], ())
+    if lost := [body.name for body in bodies if body not in set(met)]:
+        raise ValueError(
+            f"bodies {', '.join(map(repr, lost[:4]))} hang on each other in a ring, and on nothing else.\n"
+            "Usual cause: a closed loop, or the places of a joint in the wrong order, which is the parent's first.\n"
+            "Fix: leave a joint out and give it to tree.system(closures={...})."
+        )
+    size: dict[Body | Ground, int] = {}
+    for body in reversed(met):
+        size[body] = 1 + sum(size[child] for child in children.get(body, ()))
+    links, last, ahead = [], {ground: -1}, _smallest_first(children.get(ground, ()), size)
+    while ahead:
+        body = ahead.pop()
+        _, joined, kinds, at = held_by[body.name]
+        parent, a = last[joined.a.body], joined.a
+        for i, kind in enumerate(kinds):
+            ends = i == len(kinds) - 1
+            links.append(Link(body if ends else None, parent, kind, a, joined.b if ends else BETWEEN, at + i))
+            parent, a = len(links) - 1, BETWEEN
+        last[body] = parent
+        ahead += _smallest_first(children.get(body, ()), size)
+    return links
+
+
+def _smallest_first(children: Iterable[Body], size: Mapping) -> list[Body]:
+    """Such that the smallest branch is the first to be taken from the end."""
+    return sorted(children, key=lambda body: -size[body])
+
+
+class Slots(NamedTuple):
+    """Where each link finds its parent's numbers, and where it leaves its own for its children, (n, slots)."""
+
+    read: np.ndarray
+    write: np.ndarray
+
+
+def slots_of(parents: Sequence[int]) -> Slots:
+    """Slots for links whose parents come before them, each branch in one piece."""
+    last_child = {parent: i for i, parent in enumerate(parents)}
+    slot_of, free, used = {}, [], 0
+    pairs = []
+    for i, parent in enumerate(parents):
+        read = slot_of.get(parent)
+        if read is not None and last_child[parent] == i:
+            free.append(read)
+        write = None
+        if i in last_child:
+            if not free:
+                free.append(used)
+                used += 1
+            write = slot_of[i] = free.pop()
+        pairs.append((read, write))
+    numbers = np.arange(max(used, 1))
+    return Slots(*(np.array([numbers == (-1 if x is None else x) for x in row], float) for row in zip(*pairs)))

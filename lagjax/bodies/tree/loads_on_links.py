@@ -1,0 +1,91 @@
+"""What acts on the bodies of a tree, as functions of joint coordinates, and as moments and forces on their centres.
+
+A load reads `q[body.name]` as the body's pose; here it reads the pose that the joint coordinates give, and any other
+name as the joint coordinate of that name. The derivatives of a potential by a body's pose are a force and, by
+
+    N = ½ vec(∂V/∂e e*) = ∂V/∂Ω,      since ė = ½ Ω e,
+
+a moment: so a potential costs its own derivative, not that of the way to the links.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.bodies.body import Pose, valued
+from lagjax.bodies.loads import Load, Weight
+from lagjax.bodies.rotation import conjugate, product, quaternion_of
+from lagjax.bodies.tree.geometry import Geometry, Given
+from lagjax.bodies.tree.motion import Motion
+
+
+class Placed:
+    """What loads and closures read as q or v: bodies by name as poses, all else as it is in the tree's own q or v."""
+
+    def __init__(self, geometry: Geometry, poses: Pose, others: PyTree):
+        self.geometry, self.poses, self.others = geometry, poses, others
+
+    def __getitem__(self, name: str) -> Any:
+        place = self.geometry.body_at.get(name)
+        return self.others[name] if place is None else Pose(self.poses.position[place], self.poses.quaternion[place])
+
+
+def poses_of(motion: Motion) -> Pose:
+    """The poses of all links, stacked."""
+    return Pose(motion.centre, jax.vmap(quaternion_of)(motion.turn))
+
+
+def rates_of(motion: Motion, poses: Pose) -> Pose:
+    """Their rates."""
+    spin = jnp.concatenate([jnp.zeros_like(motion.spin[:, :1]), motion.spin], axis=1)
+    return Pose(motion.velocity, jax.vmap(product)(spin, poses.quaternion) / 2)
+
+
+def potential(geometry: Geometry, given: Given, loads: Iterable[Load], motion: Motion, state: tuple) -> Array:
+    """V of all loads."""
+    weights, others = _sorted(loads)
+    total = -jnp.sum(_weights(geometry, given, weights, state[-1]) * motion.centre)
+    return total + _of_poses(geometry, others, poses_of(motion), state) if others else total
+
+
+def wrenches(
+    geometry: Geometry, given: Given, loads: Iterable[Load], motion: Motion, state: tuple
+) -> Float[Array, "n 6"]:
+    """Moments and forces of the loads' potentials on the centres of links."""
+    weights, others = _sorted(loads)
+    force = _weights(geometry, given, weights, state[-1])
+    moment = jnp.zeros_like(force)
+    if others:
+        poses = poses_of(motion)
+        slope = jax.grad(lambda poses: _of_poses(geometry, others, poses, state))(poses)
+        force, moment = force - slope.position, moment - moments(poses.quaternion, slope.quaternion)
+    return jnp.concatenate([moment, force], axis=1)
+
+
+def _sorted(loads: Iterable[Load]) -> tuple[list[Weight], list[Callable]]:
+    """Weights, whose forces are known without a derivative, and the other potentials."""
+    given = [load.potential for load in loads if load.potential is not None]
+    return [x for x in given if isinstance(x, Weight)], [x for x in given if not isinstance(x, Weight)]
+
+
+def _of_poses(geometry: Geometry, potentials: Sequence[Callable], poses: Pose, state: tuple) -> Array:
+    t, q, v, params = state
+    return jnp.asarray(sum(x(t, Placed(geometry, poses, q), v, params) for x in potentials))
+
+
+def moments(e: Float[Array, "m 4"], slope: Float[Array, "m 4"]) -> Float[Array, "m 3"]:
+    """½ vec(slope e*): the derivative by Ω of what has this derivative by ė."""
+    return jax.vmap(product)(slope, jax.vmap(conjugate)(e))[:, 1:] / 2
+
+
+def _weights(geometry: Geometry, given: Given, weights: Sequence[Weight], params: PyTree) -> Float[Array, "n 3"]:
+    total = jnp.zeros((geometry.n, 3), given.mass.dtype)
+    for weight in weights:
+        field, bodies = jnp.asarray(valued(weight.g, params), total.dtype), set(weight.bodies)
+        pulled = np.array([link.body in bodies for link in geometry.links], total.dtype)
+        total = total + (pulled * given.mass)[:, None] * field[None]
+    return total

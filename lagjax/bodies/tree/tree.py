@@ -1,0 +1,281 @@
+"""A tree of bodies in joint coordinates: its Lagrangian, and its accelerations without a mass matrix."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from lagjax.bodies.body import Body, Pose, check_bodies
+from lagjax.bodies.joints import named
+from lagjax.bodies.loads import Load, check_loads, generalized_force
+from lagjax.bodies.rotation import product
+from lagjax.bodies.shapes import usual_shapes
+from lagjax.bodies.tree.geometry import Geometry, Given
+from lagjax.bodies.tree.links import links_of
+from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, rates_of, wrenches
+from lagjax.bodies.tree.motion import (
+    Coordinates,
+    Motion,
+    applied,
+    flat,
+    growth,
+    moving,
+    numbers_of_links,
+    of_links,
+    spins,
+    unflat,
+)
+from lagjax.bodies.tree.recursion import accelerated
+from lagjax.display import Drawing
+from lagjax.system import Holonomic, Nonholonomic, System
+
+
+class Tree:
+    """Bodies and the joints from which they hang, each on one: chains, arms, walking machines, in joint coordinates.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> rod = lj.Body("rod", mass=1.0, inertia=(1 / 12, 1 / 12, 0.0))
+    >>> hinge = lj.revolute(lj.ground.at(axis=(0.0, 1.0, 0.0)), rod.at((0.0, 0.0, 0.5), axis=(0.0, 1.0, 0.0)))
+    >>> pendulum = Tree([rod], {"hinge": hinge})
+    >>> print(pendulum.poses({"hinge": jnp.pi / 2})["rod"].position.round(6))
+    [-0.5 -0.   0. ]
+    >>> system = pendulum.system([lj.weight([rod])])
+    >>> a, _ = lj.accelerations(system, 0.0, {"hinge": jnp.pi / 2}, {"hinge": 0.0}, None)
+    >>> print(a["hinge"].round(6))
+    -14.715
+
+    **Arguments:**
+
+    - `bodies`: `lj.Body`s of different names.
+    - `joints`: by name, `lj.revolute`, `lj.prismatic`, `lj.cylindrical`, `lj.spherical` or `lj.fixed`, from a place on
+      the parent (or `lj.ground`) to one on the body that hangs there; or a list of joints of one kind.
+
+    Coordinates: `q[name]` of a joint is an angle, a length, both in an array (2,) of a cylindrical joint, or a
+    quaternion (4,) of a spherical one, and an array of these for a list; zero where the two frames (`lj.Marker`) are
+    alike, a quaternion then (1, 0, 0, 0). A fixed joint has none. A body on which no joint ends is free, and
+    `q[body.name]` its `lj.Pose`. Quaternions may have any length: they are read as e / |e|, and no constraint holds
+    them.
+
+    **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,
+    or two things of one name.
+
+    Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 4 (trees), ch. 7 (the recursion).
+    """
+
+    def __init__(self, bodies: Iterable[Body], joints: Mapping[str, Holonomic | Sequence[Holonomic]] | None = None):
+        bodies = check_bodies("lj.Tree", bodies)
+        names = [body.name for body in bodies]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"two bodies are called '{twice}'.\nFix: a name for each.")
+        if not isinstance(joints or {}, Mapping):
+            raise TypeError(
+                f"the joints of lj.Tree are a dict by name, and {type(joints).__name__} was given.\n"
+                "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}, or {'links': [...]} for a list."
+            )
+        self.bodies = bodies
+        listed = (x if isinstance(x, list | tuple) else [x] for x in (joints or {}).values())
+        self._joints = [joint for row in listed for joint in row]
+        self._geometry = Geometry(*links_of(bodies, joints or {}))
+
+    def __repr__(self):
+        entries = ", ".join(entry.name for entry in self._geometry.entries)
+        return f"Tree({len(self.bodies)} bodies; {entries})"
+
+    def reference(self) -> dict[str, PyTree[Array]]:
+        """q where all joints are at zero, and free bodies at the origin, unturned."""
+        geometry = self._geometry
+        count = len(geometry.links_of_quaternions)
+        e = jnp.zeros((count, 4)).at[:, 0].set(1.0)
+        return unflat(geometry, Coordinates(jnp.zeros(len(geometry.links_of_numbers)), e, jnp.zeros((count, 3))))
+
+    def poses(self, q: PyTree, params: PyTree = None) -> dict[str, Pose]:
+        """The poses of all bodies by name; `params` where places of joints are functions of them."""
+        q = jax.tree.map(jnp.asarray, q)
+        _, motion = _moving(self._geometry, q, jax.tree.map(jnp.zeros_like, q), params)
+        poses = poses_of(motion)
+        return {body.name: Placed(self._geometry, poses, q)[body.name] for body in self.bodies}
+
+    def rates(self, q: PyTree, v: PyTree, params: PyTree = None) -> dict[str, Pose]:
+        """The rates of their poses by name, for `body.velocity(q, v)` and the like."""
+        q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
+        _, motion = _moving(self._geometry, q, v, params)
+        rates = rates_of(motion, poses_of(motion))
+        return {body.name: Placed(self._geometry, rates, v)[body.name] for body in self.bodies}
+
+    def system(
+        self,
+        loads: Iterable[Load] = (),
+        closures: Mapping[str, Holonomic | Nonholonomic | Mapping] | None = None,
+        potential: Callable | None = None,
+        **others,
+    ) -> System:
+        """Return the system of these bodies in joint coordinates, whose accelerations come by the recursion.
+
+        >>> import lagjax as lj
+        >>> cart, rail = lj.Body("cart", 2.0, (1.0, 1.0, 1.0)), lj.ground.at(axis=(1.0, 0.0, 0.0))
+        >>> tree = Tree([cart], {"slide": lj.prismatic(rail, cart.at(axis=(1.0, 0.0, 0.0)))})
+        >>> system = tree.system(potential=lambda t, q, params: 4.0 * q["slide"] ** 2)
+        >>> print(lj.accelerations(system, 0.0, {"slide": 1.0}, {"slide": 0.0}, None)[0]["slide"])
+        -4.0
+
+        **Arguments:**
+
+        - `loads`: `lj.weight`, `lj.spring`, `lj.motor`, `lj.applied`, as for `lj.multibody`.
+        - `closures`: joints, or constraints written by hand, that close loops; they read `q[body.name]` as a pose.
+        - `potential`: what V has besides, a function V(t, q, params) of the joint coordinates.
+        - `others`: `force`, `dissipation`, `states` and `elements` of `lj.System`, in joint coordinates.
+
+        **Raises:** `TypeError` for a load that is none, or an argument that `lj.System` has not.
+        """
+        loads = check_loads("tree.system", loads)
+        force, dissipation = others.pop("force", None), others.pop("dissipation", None)
+        dynamics = Dynamics(self._geometry, loads, potential, force, dissipation)
+
+        def total(t, q, v, params):
+            return dynamics.lagrangian(t, q, v, params)
+
+        looks_like = [*(joint.function for joint in self._joints), *(load.potential for load in loads)]
+
+        def pose(name: str, q: PyTree, params: PyTree) -> Pose:
+            return self.poses(q, params)[name]
+
+        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), pose))
+        return System(
+            total,
+            {name: _closure(self._geometry, c) for name, c in named(closures or {}).items()},
+            force=dynamics.driven if any(load.power is not None for load in loads) else force,
+            dissipation=dynamics.friction if any(load.dissipation is not None for load in loads) else dissipation,
+            forward_dynamics=dynamics.articulated_body_recursion,
+            **others,
+        )
+
+
+class Dynamics(NamedTuple):
+    """The functions of a system of links: L, the accelerations that follow from it, and what else acts."""
+
+    geometry: Geometry
+    loads: tuple[Load, ...]
+    potential: Callable | None
+    force: Callable | None
+    dissipation: Callable | None
+
+    def lagrangian(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
+        """T - V. The growth of quaternions has an inertia, for a regular mass matrix, and no part in the rest."""
+        geometry = self.geometry
+        given, motion = _moving(geometry, q, v, params)
+        kinetic = _kinetic(geometry, given, motion, flat(geometry, q), flat(geometry, v))
+        total = kinetic
+        if self.loads:
+            total = total - potential(geometry, given, self.loads, motion, (t, q, v, params))
+        return total if self.potential is None else total - self.potential(t, q, params)
+
+    def articulated_body_recursion(self, t: Array, q: PyTree, v: PyTree, force: PyTree, params: PyTree) -> PyTree:
+        """The accelerations of this L under a generalized force, by the recursion."""
+        geometry = self.geometry
+        if self.potential is not None:
+            slope = jax.grad(self.potential, argnums=1)(t, q, params)
+            force = jax.tree.map(lambda x, y: x - y, force, slope)
+        given, motion = _moving(geometry, q, v, params)
+        wrench = jnp.zeros_like(motion.turn[:, :2].reshape(-1, 6))
+        if any(load.potential is not None for load in self.loads):
+            wrench = wrenches(geometry, given, self.loads, motion, (t, q, v, params))
+        a = _accelerations(geometry, given, motion, wrench, *(flat(geometry, x) for x in (q, v, force)))
+        return {name: jax.tree.map(jnp.zeros_like, y) for name, y in q.items()} | unflat(geometry, a)
+
+    def friction(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
+        """Rayleigh's function of loads and of the user."""
+        placed, moving = self._placed(q, v, params)
+        lost = sum(x.dissipation(t, placed, moving, params) for x in self.loads if x.dissipation is not None)
+        return lost + (0.0 if self.dissipation is None else self.dissipation(t, q, v, params))
+
+    def driven(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> PyTree:
+        """The generalized force of loads and of the user."""
+        placed, moving = self._placed(q, v, params)
+
+        def of_rates(load: Load) -> Callable:
+            def power(t, q, w, v, params):
+                return load.power(t, placed, self._placed(q, w, params)[1], moving, params)  # pyright: ignore
+
+            return power
+
+        powers = [Load(power=of_rates(load)) for load in self.loads if load.power is not None]
+        given = generalized_force(powers, t, q, v, params)
+        return given if self.force is None else jax.tree.map(lambda x, y: x + y, given, self.force(t, q, v, params))
+
+    def _placed(self, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Placed]:
+        _, motion = _moving(self.geometry, q, v, params)
+        poses = poses_of(motion)
+        return Placed(self.geometry, poses, q), Placed(self.geometry, rates_of(motion, poses), v)
+
+
+def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[Given, Motion]:
+    x, u = flat(geometry, q), flat(geometry, v)
+    given = geometry.at(params, x.numbers.dtype)
+    return given, moving(geometry, given, x, u)
+
+
+# Jitted, as all that calls no function of the user's, so that it is traced once.
+@partial(jax.jit, static_argnums=0)
+def _kinetic(geometry: Geometry, given: Given, motion: Motion, q: Coordinates, v: Coordinates) -> Array:
+    in_body = applied(jnp.swapaxes(motion.turn, 1, 2), motion.spin)
+    twice = jnp.sum(in_body * applied(given.inertia, in_body)) + jnp.sum(given.mass[:, None] * motion.velocity**2)
+    if len(geometry.links_of_quaternions):
+        twice = twice + jnp.sum(_of_growth(geometry, given) * growth(q.quaternions, v.quaternions) ** 2)
+    return twice / 2
+
+
+@partial(jax.jit, static_argnums=0)
+def _accelerations(
+    geometry: Geometry, given: Given, motion: Motion, wrench: Array, q: Coordinates, v: Coordinates, force: Coordinates
+) -> Coordinates:
+    """The accelerations of coordinates under moments and forces on links, and a generalized force."""
+    torque = numbers_of_links(geometry, force.numbers)
+    if len(geometry.links_of_quaternions):
+        moment = of_links(moments(q.quaternions, force.quaternions), geometry.quaternions)
+        if geometry.k == 3:
+            torque = jnp.where(geometry.ball[:, None], moment, torque)
+        on_free = jnp.concatenate([moment, of_links(force.positions, geometry.quaternions)], axis=1)
+        wrench = wrench + jnp.where(geometry.free[:, None], on_free, 0.0)
+    found = accelerated(geometry, given, motion, torque, wrench)
+    numbers = of_links(found.joints[:, 0], geometry.links_of_numbers)
+    if not len(geometry.links_of_quaternions):
+        return Coordinates(numbers, q.quaternions, q.positions)
+    links = geometry.links_of_quaternions
+    turning = found.links[links, :3]
+    if geometry.k == 3:
+        turning = jnp.where(geometry.free[links, None], turning, found.joints[links])
+    e, rate = q.quaternions, v.quaternions
+    grows = jnp.sum(e * force.quaternions, axis=1) / 2 / _of_growth(geometry, given)
+    both = jnp.concatenate([growth(e, rate)[:, None], spins(e, rate)], axis=1)
+    faster = jnp.concatenate([grows[:, None], turning], axis=1)
+    bent = (jax.vmap(product)(faster, e) + jax.vmap(product)(both, rate)) / 2
+    return Coordinates(numbers, bent, found.links[links, 3:])
+
+
+def _of_growth(geometry: Geometry, given: Given) -> Array:
+    """The inertia of the growth of each quaternion."""
+    return jnp.trace(given.inertia, axis1=1, axis2=2)[geometry.links_of_quaternions] / 3
+
+
+def _closure(geometry: Geometry, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
+    """A constraint of poses as one of joint coordinates."""
+    if isinstance(constraint, Holonomic):
+
+        def closes(t, q, params):
+            _, motion = _moving(geometry, q, jax.tree.map(jnp.zeros_like, q), params)
+            return constraint.g(t, Placed(geometry, poses_of(motion), q), params)
+
+        return Holonomic(closes)
+
+    def moves(t, q, v, params):
+        _, motion = _moving(geometry, q, v, params)
+        poses = poses_of(motion)
+        placed = Placed(geometry, poses, q), Placed(geometry, rates_of(motion, poses), v)
+        return constraint.phi(t, *placed, params)
+
+    return Nonholonomic(moves)

@@ -1,0 +1,231 @@
+"""Trees in joint coordinates: the recursion against the equations of L, Pinocchio and closed forms; refused trees."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.bodies.tree.links import slots_of
+
+Y = (0.0, 1.0, 0.0)
+
+
+def a_body(rng, name, mass=None):
+    """A body with a mass and an inertia as any body might have."""
+    moments = rng.uniform(0.1, 1.0, 3)
+    axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    inertia = axes @ np.diag(moments.sum() - moments) @ axes.T
+    return lj.Body(name, rng.uniform(0.5, 2.0) if mass is None else mass, (inertia + inertia.T) / 2)
+
+
+def a_place(rng, body):
+    """A place on a body, with an axis."""
+    return body.at(rng.normal(size=3), rng.normal(size=3))
+
+
+def like(rng, q):
+    """Random numbers in the structure of q."""
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=np.shape(x))), q)
+
+
+def every_joint():
+    """A tree with all kinds of joints, forks, a free body, functions of params, and all kinds of loads."""
+    rng = np.random.default_rng(1)
+    b = [a_body(rng, f"b{i}", mass=(lambda params: params["m"]) if i in (2, 5) else None) for i in range(8)]
+    pairs = [(lj.ground, b[0]), (b[0], b[1]), (b[0], b[2]), (b[1], b[3]), (b[1], b[4]), (b[4], b[5]), (b[2], b[6])]
+    places = [(a_place(rng, x), a_place(rng, y)) for x, y in pairs]
+    joints = {
+        "hinge": lj.revolute(*places[0]),
+        "slide": lj.prismatic(*places[1]),
+        "pair": [lj.revolute(*places[2]), lj.revolute(*places[3])],
+        "ball": lj.spherical(*places[4]),
+        "ring": lj.cylindrical(*places[5]),
+        "weld": lj.fixed(*places[6]),
+    }
+    tree = lj.Tree(b, joints)
+    loads = [
+        lj.weight(b[:5], g=lambda params: jnp.array([0.0, 1.0, -params["g"]])),
+        lj.spring(a_place(rng, b[3]), a_place(rng, b[5]), 2.0, 0.5, damping=0.7),
+        lj.motor(a_place(rng, b[0]), a_place(rng, b[2]), lambda t, q, v, params: 1.3 - v["hinge"]),
+        lj.applied(a_place(rng, b[7]), (1.0, 2.0, 3.0)),
+    ]
+    system = tree.system(loads, potential=lambda t, q, params: 2.0 * q["slide"] ** 2 + q["pair"][0] * q["ring"][1])
+    return rng, tree, system, {"m": jnp.asarray(1.3), "g": jnp.asarray(9.81)}
+
+
+def test_shapes_of_coordinates():
+    """A joint is a number or a quaternion under its name, a list an array, a cylindrical one two numbers."""
+    _, tree, _, _ = every_joint()
+    shapes = {name: jax.tree.map(jnp.shape, x) for name, x in tree.reference().items()}
+    assert shapes == {
+        "hinge": (), "slide": (), "pair": (2,), "ball": (4,), "ring": (2,), "b7": lj.Pose((3,), (4,)),
+    }  # fmt: skip
+    assert repr(tree) == "Tree(8 bodies; hinge, slide, pair, ball, ring, b7)"
+
+
+@pytest.mark.exhaustive
+def test_poses_and_rates():
+    """Poses satisfy the joints as constraints, their rates are derivatives; an angle to the wrong side does not."""
+    rng, tree, _, params = every_joint()
+    q = like(rng, tree.reference())
+    v = like(rng, q)
+    poses, moved = jax.jvp(lambda q: tree.poses(q, params), (q,), (v,))
+    rates = tree.rates(q, v, params)
+    for body in tree.bodies:
+        for x, y in zip(rates[body.name], moved[body.name]):
+            np.testing.assert_allclose(x, y, atol=1e-13)
+    a, b = tree.bodies[0].at((0.1, 0.2, 0.3), Y), tree.bodies[1].at((0.0, 0.0, 1.0), Y)
+    two = lj.Tree(tree.bodies[:2], {"a": lj.prismatic(lj.ground.at(axis=Y), a), "b": lj.revolute(a, b)})
+    poses = two.poses({"a": 0.4, "b": 0.7})
+    np.testing.assert_allclose(poses["b0"].position, [-0.1, 0.4 - 0.2, -0.3], atol=1e-15)
+    np.testing.assert_allclose(lj.revolute(a, b).g(0.0, poses, None), 0.0, atol=1e-15)
+    turned = lj.torsion(a, b, stiffness=2.0, angle=0.7).potential(0.0, poses, None, None)
+    assert turned < 1e-30 < lj.torsion(a, b, stiffness=2.0, angle=-0.7).potential(0.0, poses, None, None)
+
+
+@pytest.mark.slow
+def test_the_recursion_solves_lagranges_equations():
+    """d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v with all joints and loads, at random states; without Coriolis terms it is not."""
+    rng, tree, system, params = every_joint()
+
+    @jax.jit
+    @jax.vmap
+    def missed(q, v, moving):
+        def momentum_and_slope(q, v):
+            slope, momentum = jax.grad(system.lagrangian, argnums=(1, 2))(0.0, q, v, params)
+            return momentum, slope
+
+        lost = jax.grad(system.dissipation, argnums=2)(0.0, q, v, params)
+        beside = jax.tree.map(lambda x, y: x - y, system.force(0.0, q, v, params), lost)
+        a = system.forward_dynamics(0.0, q, moving, beside, params)
+        _, change, slope = jax.jvp(momentum_and_slope, (q, v), (v, a), has_aux=True)
+        return jax.tree.map(lambda x, y, z: x - y - z, change, slope, beside)
+
+    q, v = (jax.tree.map(lambda *x: jnp.stack(x), *(like(rng, tree.reference()) for _ in range(6))) for _ in range(2))
+    # In the second half of the lanes as if nothing moved.
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), (q, v))
+    found = missed(*twice, jax.tree.map(lambda x: jnp.concatenate([x, 0 * x]), v))
+    size = np.max([jnp.max(jnp.abs(x[:6])) for x in jax.tree.leaves(found)])
+    assert size < 1e-12
+    assert np.max([jnp.max(jnp.abs(x[6:])) for x in jax.tree.leaves(found)]) > 0.1
+
+
+def test_a_tree_beside_pinocchio():
+    """Accelerations of a forked tree of hinges and slides, within 1e-10 of Pinocchio's."""
+    pin = pytest.importorskip("pinocchio")
+    rng = np.random.default_rng(4)
+    parents = [-1, 0, 1, 1, 3, 0, 5]
+    bodies = [a_body(rng, f"b{i}") for i in range(len(parents))]
+    model, joints, centres = pin.Model(), {}, rng.normal(size=(len(parents), 3))
+    for i, parent in enumerate(parents):
+        place, axis = rng.normal(size=3), rng.normal(size=3)
+        axis, slides, centre = axis / np.linalg.norm(axis), i in (2, 5), centres[i]
+        kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
+        at = model.addJoint(parent + 1, kind(axis), pin.SE3(np.eye(3), place), f"j{i}")
+        inertia = pin.Inertia(bodies[i].mass, centre, np.array(bodies[i].inertia))
+        model.appendBodyToJoint(at, inertia, pin.SE3.Identity())
+        # Pinocchio's places are given from the joint of the parent, ours from its centre of mass.
+        on = lj.ground.at(place, axis) if parent < 0 else bodies[parent].at(place - centres[parent], axis)
+        joints[f"j{i}"] = (lj.prismatic if slides else lj.revolute)(on, bodies[i].at(-centre, axis))
+    tree = lj.Tree(bodies, joints)
+    q, v, tau = rng.normal(size=(3, len(parents)))
+    expected = pin.aba(model, model.createData(), q, v, tau)
+    system = tree.system([lj.weight(bodies)])
+    named = (dict(zip(joints, map(jnp.asarray, x))) for x in (q, v, tau))
+    found = jax.jit(lambda *x: system.forward_dynamics(0.0, *x, None))(*named)
+    np.testing.assert_allclose([found[name] for name in joints], expected, rtol=1e-10, atol=1e-10)
+    other = pin.aba(model, model.createData(), q, 0 * v, tau)
+    assert np.abs(other - expected).max() > 0.1
+
+
+@pytest.mark.exhaustive
+def test_derivatives_by_a_mass():
+    """Both modes agree to round-off, and with central differences; the derivative is not that of the weight alone."""
+    bodies = [lj.Body(f"b{i}", lambda params: params["m"], (0.1, 0.1, 0.1)) for i in range(3)]
+    bodies[2] = lj.Body("b2", 1.0, (0.1, 0.2, 0.2))
+    first = lj.revolute(lj.ground.at(axis=Y), bodies[0].at((0.0, 0.0, 0.5), Y))
+    others = [lj.revolute(x.at((0.0, 0.0, -0.5), Y), y.at((0.0, 0.0, 0.5), Y)) for x, y in zip(bodies, bodies[1:])]
+    system = lj.Tree(bodies, {"q": [first, *others]}).system([lj.weight(bodies)])
+
+    def of(x):
+        zero = {"q": jnp.zeros(3)}
+        found = system.forward_dynamics(0.0, {"q": x[1:4]}, {"q": x[4:]}, zero, {"m": x[0]})
+        return found["q"]
+
+    x = jnp.array([1.2, 0.3, -0.4, 1.0, 0.5, 2.0, -1.0])
+    forward, backward, f = jax.jit(jax.jacfwd(of))(x), jax.jit(jax.jacrev(of))(x), jax.jit(of)
+    np.testing.assert_allclose(forward, backward, atol=1e-13)
+    steps = 1e-6 * np.eye(7)
+    differences = np.stack([(f(x + h) - f(x - h)) / 2e-6 for h in steps], axis=1)
+    np.testing.assert_allclose(forward, differences, atol=1e-7)
+    assert np.abs(forward[:, 0]).max() > 0.1
+
+
+def test_slots():
+    """A chain needs one slot and a binary tree as many as its depth; reading finds what the parent wrote."""
+    assert slots_of(range(-1, 40)).read.shape[1] == 1
+    # Each branch in one piece: 0 (1 (2, 3), 4 (5, 6)).
+    parents = [-1, 0, 1, 1, 0, 4, 4]
+    read, write = slots_of(parents)
+    slots = np.zeros(read.shape[1])
+    for i, parent in enumerate(parents):
+        assert read[i] @ slots == parent + 1
+        slots = (1 - write[i]) * slots + write[i] * (i + 1)
+    assert read.shape[1] == 2
+
+
+def test_what_is_no_tree_is_refused():
+    """Loops, rings, joints without coordinates, names given twice, by name and with the fix."""
+    a, b = (lj.Body(name, 1.0, (1.0, 1.0, 1.0)) for name in "ab")
+    hinge, back = lj.revolute(lj.ground.at(), a.at()), lj.revolute(b.at(), a.at((1.0, 0.0, 0.0)))
+    on = lj.revolute(a.at(), b.at())
+    for bodies, joints, said in (
+        ([a, b], {"x": hinge, "y": back}, "hangs on two joints, 'x' and 'y'"),
+        ([a, b], {"x": on, "y": back}, "'a', 'b' hang on each other in a ring"),
+        ([a], {"x": on}, "which is not among the bodies"),
+        ([a], {"x": lj.revolute(a.at(), lj.ground.at())}, "the parent's first"),
+        ([a, b], {"x": [hinge, lj.prismatic(a.at(), b.at())]}, "several kinds"),
+        ([a, b], {"b": hinge}, "called 'b'"),
+        ([a, a], {}, "two bodies are called 'a'"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            lj.Tree(bodies, joints)
+    with pytest.raises(TypeError, match="none that a tree has coordinates for"):
+        lj.Tree([a], {"x": lj.universal(lj.ground.at(), a.at())})
+    with pytest.raises(TypeError, match="no lj.Load"):
+        lj.Tree([a], {"x": hinge}).system([hinge])
+
+
+@pytest.mark.exhaustive
+def test_a_closed_loop():
+    """A four-bar closed by a joint moves as with angles solved by hand: a parallelogram's coupler does not turn."""
+    rods = [lj.Body(name, 1.0, (0.1, 0.1, 0.1)) for name in ("crank", "coupler", "rocker")]
+    crank, coupler, rocker = rods
+    joints = {
+        "crank": lj.revolute(lj.ground.at(axis=Y), crank.at((-0.5, 0.0, 0.0), Y)),
+        "coupler": lj.revolute(crank.at((0.5, 0.0, 0.0), Y), coupler.at((-1.0, 0.0, 0.0), Y)),
+        "rocker": lj.revolute(lj.ground.at((2.0, 0.0, 0.0), Y), rocker.at((-0.5, 0.0, 0.0), Y)),
+    }
+    closure = lj.spherical(coupler.at((1.0, 0.0, 0.0)), rocker.at((0.5, 0.0, 0.0)))
+    system = lj.Tree(rods, joints).system([lj.weight(rods)], closures={"pin": closure})
+    angle, rate = 0.7, 1.1
+    q = {"crank": angle, "coupler": -angle, "rocker": angle}
+    v = {"crank": rate, "coupler": -rate, "rocker": rate}
+    a, _ = lj.accelerations(system, 0.0, q, v, None)
+    # Both cranks about their ends, and the coupler's mass on a circle of radius 1.
+    inertia = 2 * (0.1 + 0.25) + 1.0
+    expected = 9.81 * (2 * 0.5 + 1.0) * np.cos(angle) / inertia
+    np.testing.assert_allclose([a["crank"], a["coupler"], a["rocker"]], expected * np.array([1, -1, 1]), rtol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_tree_is_drawn_by_itself():
+    """A film of a tree has its bodies where their poses are."""
+    rod = lj.Body("rod", 1.0, (1 / 12, 1 / 12, 0.0))
+    tree = lj.Tree([rod], {"hinge": lj.revolute(lj.ground.at(axis=Y), rod.at((0.0, 0.0, 0.5), Y))})
+    motion = lj.integrate(tree.system([lj.weight([rod])]), {"hinge": 0.3}, {"hinge": 0.0}, ts=jnp.linspace(0.0, 2.0, 5))
+    # A physical pendulum of length 2/3 from its energy: v² = 2 g/l (cos q - cos 0.3).
+    np.testing.assert_allclose(motion.v["hinge"] ** 2, 3 * 9.81 * (np.cos(motion.q["hinge"]) - np.cos(0.3)), atol=1e-8)
+    # Drawn by itself: the rod's box and the dot and line of its hinge.
+    assert "rod" in str(vars(motion.animate().points))

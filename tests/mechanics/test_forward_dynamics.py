@@ -1,0 +1,67 @@
+"""Systems that solve their own equations: checked against L, with constraints, in the user's words where wrong."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+
+def lagrangian(t, q, v, params):
+    """A particle in the plane in polar coordinates, under its weight along x."""
+    r, angle = q
+    return params["m"] * ((v[0] ** 2 + (r * v[1]) ** 2) / 2 + 10.0 * r * jnp.cos(angle))
+
+
+def polar(t, q, v, force, params):
+    """Its accelerations, by hand."""
+    r, angle = q
+    radial = r * v[1] ** 2 + 10.0 * jnp.cos(angle) + force[0] / params["m"]
+    return jnp.array([radial, (-2 * v[0] * v[1] - 10.0 * jnp.sin(angle) + force[1] / (params["m"] * r)) / r])
+
+
+def without_coriolis(t, q, v, force, params):
+    """The same without the term of r' and angle'."""
+    return polar(t, q, jnp.array([0.0, 1.0]) * v, force, params)
+
+
+Q, V, PARAMS = jnp.array([2.0, 0.3]), jnp.array([0.5, -1.0]), {"m": 3.0}
+ROD = {"rod": lj.Holonomic(lambda t, q, params: q[0] ** 2 - 4.0)}
+
+
+@pytest.mark.slow
+def test_a_system_that_solves_itself():
+    """Accelerations, multipliers, motion and explanation are those of L's own equations, under forces, with a rod."""
+    beside = dict(force=lambda t, q, v, params: jnp.array([0.0, 2.0]), dissipation=lambda t, q, v, params: v[1] ** 2)
+    systems = [lj.System(lagrangian, ROD, forward_dynamics=f, **beside) for f in (polar, None)]
+    v = V.at[0].set(0.0)
+    (a, found), (b, expected) = (lj.accelerations(system, 0.0, Q, v, PARAMS) for system in systems)
+    np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(found["rod"], expected["rod"], rtol=1e-13)
+    motions = [lj.integrate(system, Q, v, PARAMS, ts=jnp.linspace(0.0, 2.0, 3), rtol=1e-10) for system in systems]
+    np.testing.assert_allclose(motions[0].q, motions[1].q, atol=1e-8)
+    assert "polar" in str(lj.explain(systems[0], 0.0, Q, v, PARAMS))
+
+
+@pytest.mark.slow
+def test_forward_dynamics_that_are_wrong():
+    """A term left out is named, by the coordinate, also where the given velocity hides it, and in a motion."""
+    system = lj.System(lagrangian, forward_dynamics=without_coriolis)
+    for v in (V, 0 * V):
+        with pytest.raises(ValueError, match="do not solve the equations of L: M a = F is missed by .* in 'q\\[1\\]'"):
+            lj.accelerations(system, 0.0, Q, v, PARAMS)
+    with pytest.raises(ValueError, match="do not solve the equations of L"):
+        lj.integrate(system, Q, 0 * V, PARAMS, ts=jnp.linspace(0.0, 1.0, 3))
+
+
+def test_forward_dynamics_of_the_wrong_kind():
+    """What is no function, takes other arguments, or returns something unlike q is refused in the user's words."""
+    with pytest.raises(TypeError, match="forward_dynamics must be a function of \\(t, q, v, force, params\\)"):
+        lj.System(lagrangian, forward_dynamics=3.0)
+    for f, said in ((lambda t, q, v, params: q, "forward_dynamics"), (lambda *x: jnp.zeros(3), "one acceleration per")):
+        system = lj.System(lagrangian, forward_dynamics=f)
+        with pytest.raises((TypeError, ValueError), match=said):
+            lj.accelerations(system, 0.0, Q, V, PARAMS)
+    assert "forward dynamics" in lj.System(lagrangian, forward_dynamics=polar).functions().__repr__()
+    assert jax.tree.structure(Q) == jax.tree.structure(V)
