@@ -49,6 +49,14 @@ def of_states(model: Model) -> np.ndarray:
     return np.zeros(model.n, bool) if first is None else first._replace(massless=()).mask(model.n)
 
 
+def without_mass(model: Model) -> Bool[np.ndarray, " n"]:
+    """Which rows of M are zero at every state: coordinates whose momenta contain no velocity, not of first order."""
+    first = model.form.first_order
+    leaves, structure = jtu.tree_flatten(model)
+    shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
+    return ~_heavy(structure, shapes) & ~(np.zeros(model.n, bool) if first is None else first.mask(model.n))
+
+
 def _with(model: Model, found: FirstOrder) -> Model:
     return unchecked(model.system, model.params, model.form._replace(first_order=found))
 
@@ -63,6 +71,21 @@ def _found(structure, leaves: tuple) -> FirstOrder:
     return FirstOrder(states, () if model.reacts or model.solves_itself else _massless(structure, leaves, known))
 
 
+@once
+def _heavy(structure, leaves: tuple) -> Bool[np.ndarray, " n"]:
+    """The coordinates whose momenta contain velocities."""
+    model = jtu.tree_unflatten(structure, leaves)
+    t, y = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
+
+    def momentum(u: Array, x: Array, given: tuple) -> Array:
+        arrays, t = given
+        model = jtu.tree_unflatten(structure, [leaf if x is None else x for x, leaf in zip(arrays, leaves)])
+        return jax.grad(model.lagrangian, argnums=2)(t, x, u)
+
+    given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t
+    return pattern(momentum, y, y, given).any(axis=1)
+
+
 def _massless(structure, leaves: tuple, states: list[int]) -> tuple[int, ...]:
     """The coordinates whose momenta contain no velocity, and whose equations contain velocities of such coordinates."""
     model = jtu.tree_unflatten(structure, leaves)
@@ -74,16 +97,12 @@ def _massless(structure, leaves: tuple, states: list[int]) -> tuple[int, ...]:
         model = jtu.tree_unflatten(structure, [leaf if x is None else x for x, leaf in zip(arrays, leaves)])
         return model if first is None else _with(model, first), t
 
-    def momentum(u: Array, x: Array, given: tuple) -> Array:
-        model, t = at(given)
-        return jax.grad(model.lagrangian, argnums=2)(t, x, u)
-
     def residual(y: Array, given: tuple) -> Array:
         model, t = at(given)
         x, u = jnp.split(y, 2)
         return constraints.velocity_residual(model, t, x, u)
 
-    heavy = pattern(momentum, y, y, given).any(axis=1)
+    heavy = _heavy(structure, leaves)
     if heavy.all():
         return ()
     held = np.zeros(2 * model.n, bool)

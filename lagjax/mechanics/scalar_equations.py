@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools import TooLong, decided, is_array, is_plain
-from lagjax.mechanics.first_order import completed, resolved
+from lagjax.mechanics.first_order import completed, resolved, without_mass
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
 from lagjax.mechanics.scalar_form import WRITTEN, Numbers
@@ -37,8 +37,9 @@ UP_TO, CONSTRAINED_UP_TO = 8, 16
 # Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
 # thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
 MATRIX = 64
-# A program of more operations takes too long to compile.
-LONG = 2000
+# A program of more operations compiles faster in arrays. A rattleback's 2,465 take 20 s of processor time written out,
+# 50 s in arrays; a vehicle's 7,106 take 34 s in arrays and, at the same rate, 60 s written out (not measured).
+LONG = 3000
 # Two iterations are enough where the second one moves the state by less than this share of its size.
 SMALL_CORRECTION = 1e-7
 
@@ -64,7 +65,10 @@ def is_small(model: Model) -> bool:
     """Whether the equations of a system are to be written out."""
     if is_plain() or has_networks(model) or model.solves_itself:
         return False
-    return model.n + model.m <= (CONSTRAINED_UP_TO if model.m else UP_TO)
+    if model.n + model.m > (CONSTRAINED_UP_TO if model.m else UP_TO):
+        return False
+    # A pivot that is zero at every state: the robust way would be compiled as well, and be used.
+    return not without_mass(model).any()
 
 
 def write_out(model: Model) -> WrittenOut | None:
