@@ -12,7 +12,7 @@ from lagjax.display.in_space import (
     Drawing,
     InSpace,
     Shape,
-    pose_in_q,
+    poses_in_q,
     rotations,
     stills_in_space,
     surface,

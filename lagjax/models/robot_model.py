@@ -204,10 +204,10 @@ class RobotModel:
             given = jax.vjp(self._poses, q)[1](of_loads)[0]
             return given if force is None else jax.tree.map(jnp.add, given, force(t, q, v, params))
 
-        def pose(name: str, q: PyTree, params: PyTree) -> Pose:
-            return self._poses(q)[name]
+        def poses(q: PyTree, params: PyTree) -> dict[str, Pose]:
+            return self._poses(q)
 
-        setattr(lagrangian, "drawing", Drawing(self._looks, pose))
+        setattr(lagrangian, "drawing", Drawing(self._looks, poses))
         turning = [x for x in self.joints.values() if x.kind in ("spherical", "floating")]
         closing = named(self._loops() | dict(closures or {}))
         return System(

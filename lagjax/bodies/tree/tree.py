@@ -141,10 +141,7 @@ class Tree:
 
         looks_like = [*(joint.function for joint in self._joints), *(load.potential for load in loads)]
 
-        def pose(name: str, q: PyTree, params: PyTree) -> Pose:
-            return self.poses(q, params)[name]
-
-        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), pose))
+        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), self.poses))
         return System(
             total,
             {name: _closure(self._geometry, c) for name, c in named(closures or {}).items()},

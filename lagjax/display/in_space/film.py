@@ -16,6 +16,8 @@ from lagjax.display.web_page.page import encoded
 
 # From where a film is seen first, in degrees: from the right of -y, x to the right.
 AZIMUTH, ELEVATION = -60.0, 22.0
+# Names of more bodies than this are not listed: their colours repeat.
+MOST_NAMES = 12
 LOOK = {
     "light": painting.LIGHT.tolist(), "darkest": painting.DARKEST, "lighter": painting.LIGHTER,
     "trail": painting.TRAIL, "piece": painting.PIECE, "pieces": painting.MOST_PIECES, "line": painting.LINE,
@@ -58,7 +60,7 @@ def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tu
         f'<span><span style="color:{COLOURS[i % (len(COLOURS) - (i < len(bodies)))]}" aria-hidden="true">&#9679;</span>'
         f" {html.escape(str(name))}</span>"
         for i, name in enumerate([*motion.poses, *motion.points])
-        if len(bodies) + len(motion.points) > 1
+        if 1 < len(bodies) + len(motion.points) <= MOST_NAMES
     ]
     start = f"t = {float(t[0]):.{digits}f}"
     body = (

@@ -67,9 +67,9 @@ class Shape:
         return next((anchor.body for anchor in self.anchors if anchor.body is not None), None)
 
 
-def pose_in_q(name: str, q: PyTree, params: PyTree) -> Any:
-    """Where a body is whose entry in q is its pose."""
-    return q[name]
+def poses_in_q(q: PyTree, params: PyTree) -> Any:
+    """Where bodies are whose entries in q are their poses."""
+    return q
 
 
 class Drawing(NamedTuple):
@@ -77,22 +77,22 @@ class Drawing(NamedTuple):
 
     - `shapes`: `lj.box(...)` and the like, or a function of params that gives them. Functions
       `positions(t, q, params)` may be among them.
-    - `pose`: `pose(name, q, params)` -> the centre of mass (3,) and the unit quaternion (w, x, y, z) of the body of
-      that name, where they are not `q[name]`.
+    - `poses`: `poses(q, params)` -> by the names of bodies, the centre of mass (3,) and the unit quaternion
+      (w, x, y, z); by default they are the entries of q.
 
     A system is drawn by itself if its Lagrangian has one as the attribute `drawing`.
 
     >>> import lagjax as lj
     >>> import jax.numpy as jnp
     >>> arm = lj.Body("arm", 1.0, (0.1, 0.1, 0.01))
-    >>> def pose(name, q, params):
-    ...     return lj.Pose.at((0.0, 0.0, -0.5)).turned((1.0, 0.0, 0.0), q)
-    >>> Drawing([lj.box(arm, (0.1, 0.1, 1.0))], pose).shapes
+    >>> def poses(q, params):
+    ...     return {"arm": lj.Pose.at((0.0, 0.0, -0.5)).turned((1.0, 0.0, 0.0), q)}
+    >>> Drawing([lj.box(arm, (0.1, 0.1, 1.0))], poses).shapes
     [Shape(a solid on 'arm')]
     """
 
     shapes: Sequence[Shape | Callable] | Callable[[PyTree], Sequence[Shape | Callable]]
-    pose: Callable[[str, PyTree, PyTree], Any] = pose_in_q
+    poses: Callable[[PyTree, PyTree], Any] = poses_in_q
 
 
 def _three(x: Any, params: PyTree, what: str) -> np.ndarray:

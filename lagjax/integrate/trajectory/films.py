@@ -16,15 +16,13 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from lagjax.display import Animation, InSpace, plots, pose_in_q, stills_in_space
+from lagjax.display import Animation, InSpace, plots, poses_in_q, stills_in_space
 from lagjax.integrate.trajectory.subject import Subject, check_positions, subject_of
 
 # Without every other output the picture may be wrong by this share of its size: with all of them by a hundredth.
 MAY_MISS = 0.16
 # The shortest and the longest film, in seconds, if the user does not give its length.
 SHORTEST, LONGEST = 2.0, 20.0
-
-
 # Instants that a trail is drawn through in a figure.
 OF_A_PATH = 301
 
@@ -89,7 +87,7 @@ def film_of_lanes(
             found.append(None)
             continue
         t, q, v = lane
-        subject = Subject((positions,), (), pose_in_q, traj.params)
+        subject = Subject((positions,), (), poses_in_q, traj.params)
         here = np.clip(at, min(t[0], t[-1]), max(t[0], t[-1]))
         found.append(subject.frames(here, hermite(t, q, v, here)))
         _check_dense(subject, t, q, v, found[-1])

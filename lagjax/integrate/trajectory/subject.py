@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display import Drawing, InSpace, Shape, pose_in_q
+from lagjax.display import Drawing, InSpace, Shape, poses_in_q
 from lagjax.system import Call, Traced, UnknownSystem, check_arguments
 
 # States whose poses are computed together.
@@ -15,11 +15,11 @@ BLOCK = 256
 
 
 class Subject(NamedTuple):
-    """What is drawn: `functions` of (t, q, params) that give points, and `shapes`, with `pose` for their bodies."""
+    """What is drawn: `functions` of (t, q, params) that give points, and `shapes`, with `poses` of their bodies."""
 
     functions: tuple[Callable, ...]
     shapes: tuple[Shape, ...]
-    pose: Callable
+    poses: Callable
     params: PyTree
 
     def frames(self, t: np.ndarray, q: PyTree) -> dict[str, np.ndarray] | InSpace:
@@ -38,38 +38,40 @@ class Subject(NamedTuple):
 
     def _poses(self, names: tuple[str, ...], t: np.ndarray, q: PyTree) -> dict[str, np.ndarray]:
         def at(q: PyTree):
-            return [tuple(self._pose(name, q)) for name in names]
+            found = self.poses(q, self.params)
+            return [_pose_of(name, found) for name in names]
 
         # In whole blocks, so that all calls for one film are compiled once.
         count = BLOCK * -(-len(t) // BLOCK)
         padded = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], count - len(t), axis=0)]), q)
-        found = {}
-        for name, pose in zip(names, (at if self.pose is pose_in_q else jax.jit(jax.vmap(at)))(padded)):
+        poses = {}
+        for name, pose in zip(names, (at if self.poses is poses_in_q else jax.jit(jax.vmap(at)))(padded)):
             position, quaternion = (np.asarray(x, float)[: len(t)] for x in pose)
             if position.shape[1:] != (3,) or quaternion.shape[1:] != (4,):
                 raise ValueError(
                     f"the pose of '{name}' must be a point of space (3,) and a quaternion (4,), and has the shapes "
                     f"{position.shape[1:]} and {quaternion.shape[1:]}."
                 )
-            found[name] = np.concatenate([position, quaternion], axis=1)
-            if not np.all(np.isfinite(found[name])):
-                first = t[~np.isfinite(found[name]).all(axis=1)][0]
+            poses[name] = np.concatenate([position, quaternion], axis=1)
+            if not np.all(np.isfinite(poses[name])):
+                first = t[~np.isfinite(poses[name]).all(axis=1)][0]
                 raise ValueError(
                     f"the pose of '{name}' is NaN or infinite at t = {first:.6g}.\n"
                     "Fix: evaluate it there, term by term."
                 )
-        return found
+        return poses
 
-    def _pose(self, name: str, q: PyTree):
-        try:
-            position, quaternion = self.pose(name, q, self.params)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"it is not known where the body '{name}' is.\n"
-                "Usual cause: a body of another system, or coordinates that are not poses.\n"
-                "Fix: lj.Drawing(shapes, pose=lambda name, q, params: (position, quaternion)) in place of the shapes."
-            ) from error
-        return position, quaternion
+
+def _pose_of(name: str, poses: Any) -> tuple[Any, Any]:
+    try:
+        position, quaternion = poses[name]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"it is not known where the body '{name}' is.\n"
+            "Usual cause: a body of another system, or coordinates that are not poses.\n"
+            "Fix: lj.Drawing(shapes, poses), with poses(q, params) -> {name: (position, quaternion)}."
+        ) from error
+    return position, quaternion
 
 
 def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
@@ -83,11 +85,9 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
                 "traj.animate([lj.box(body, (1.0, 0.2, 0.2))])."
             )
     # Where its bodies are is known of a system whatever is drawn of it.
-    drawing = what if isinstance(what, Drawing) else (known_drawing(system) or Drawing(()))._replace(shapes=what)
-    if not isinstance(what, Drawing) and callable(what):
-        parts = [what]
-    else:
-        parts = drawing.shapes(params) if callable(drawing.shapes) else drawing.shapes
+    poses = (what if isinstance(what, Drawing) else known_drawing(system) or Drawing(())).poses
+    parts = what.shapes if isinstance(what, Drawing) else [what] if callable(what) else what
+    parts = parts(params) if callable(parts) else parts
     parts = [parts] if isinstance(parts, Shape) else parts
     if not isinstance(parts, Sequence) or not all(isinstance(x, Shape) or callable(x) for x in parts) or not parts:
         raise TypeError(
@@ -104,7 +104,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
             "nothing of what is drawn moves: all shapes are fixed in space.\n"
             "Fix: give the bodies, too, traj.animate([lj.sphere(body, 0.1), lj.line(lj.ground, body)])."
         )
-    return Subject(functions, shapes, drawing.pose, params)
+    return Subject(functions, shapes, poses, params)
 
 
 def known_drawing(system: Any) -> Drawing | None:
