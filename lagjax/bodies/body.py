@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -42,12 +43,18 @@ class Pose(NamedTuple):
 
     def turned(self, axis: ArrayLike, angle: ArrayLike) -> "Pose":
         """The pose after a further turn about an axis of space through the centre of mass."""
-        return Pose(self.position, product(about(axis, angle), self.quaternion))
+        return Pose(self.position, product(about(axis, angle).astype(floats(self)), self.quaternion))
 
     def moving(self, velocity: ArrayLike = (0.0, 0.0, 0.0), spin: ArrayLike = (0.0, 0.0, 0.0)) -> "Pose":
         """The rates, for `v`, of a body here, by its centre's velocity and its angular velocity in space."""
-        spin = jnp.concatenate([jnp.zeros(1), jnp.asarray(spin, float)])
-        return Pose(jnp.asarray(velocity, float), product(spin, self.quaternion) / 2)
+        dtype = floats(self)
+        spin = jnp.concatenate([jnp.zeros(1, dtype), jnp.asarray(spin, dtype)])
+        return Pose(jnp.asarray(velocity, dtype), product(spin, self.quaternion) / 2)
+
+
+def floats(q: PyTree) -> Any:
+    """The dtype of the numbers in q; JAX's usual one for whole numbers and where there are none."""
+    return jnp.result_type(1.0, *jax.tree.leaves(q))
 
 
 def valued(x: ArrayLike | Callable, params: PyTree) -> Any:
@@ -161,27 +168,27 @@ class Ground:
 
     def pose(self, q: PyTree) -> Pose:
         """The origin."""
-        return Pose(jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]))
+        return Pose(jnp.zeros(3, floats(q)), jnp.array([1.0, 0.0, 0.0, 0.0], floats(q)))
 
     def rates(self, v: PyTree) -> Pose:
         """Zero."""
-        return Pose(jnp.zeros(3), jnp.zeros(4))
+        return Pose(jnp.zeros(3, floats(v)), jnp.zeros(4, floats(v)))
 
     def point(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """The point itself."""
-        return jnp.asarray(r, float)
+        return jnp.asarray(r, floats(q))
 
     def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """The vector itself."""
-        return jnp.asarray(r, float)
+        return jnp.asarray(r, floats(q))
 
     def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
         """Zero."""
-        return jnp.zeros(3)
+        return jnp.zeros(3, floats(q))
 
     def spin(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
         """Zero."""
-        return jnp.zeros(3)
+        return jnp.zeros(3, floats(q))
 
     def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
         """A place in space: see `lj.Marker`."""

@@ -155,6 +155,21 @@ def test_a_cardan_joint_and_a_weld():
     np.testing.assert_allclose(force.position, [4.0, 0.0, 0.0], atol=1e-12)
 
 
+def test_single_precision():
+    """In float32 all that bodies, joints and loads give is float32, though markers hold Python's numbers."""
+    rod = lj.Body("rod", 1, (1, 1, 2))
+    pose = lj.Pose(jnp.array([0.0, 0.0, 1.0], jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32))
+    pose = pose.turned((1.0, 0.0, 0.0), 0.5)
+    q, v = {"rod": pose}, {"rod": pose.moving((1.0, 0.0, 0.0), (0.0, 2.0, 0.0))}
+    a, b = lj.ground.at((0.1, 0.0, 0.0), (1.0, 1.0, 0.0)), rod.at(lambda params: (0.0, params, 0.0))
+    half = jnp.float32(0.5)
+    given = [rod.kinetic(q, v), lj.fixed(a, b).g(0.0, q, half), lj.prismatic(a, b).g(0.0, q, half)]
+    given += [load.potential(0.0, q, v, half) for load in (lj.weight([rod]), lj.spring(a, b, 2), lj.torsion(a, b, 2))]
+    given += [lj.spring(a, b, 2, damping=1).dissipation(0.0, q, v, half), lj.motor(a, b, 2).power(0.0, q, v, v, half)]
+    given += jax.tree.leaves((q, v)) + [rod.angular_momentum(q, v)]
+    assert {jnp.asarray(x).dtype for x in given} == {np.dtype("float32")}
+
+
 def test_bad_bodies_and_joints():
     """What no body has, and joints that join nothing, are refused by name."""
     with pytest.raises(ValueError, match="no body has the moments of inertia of 'rod', 1, 1, 3: each is at most"):
