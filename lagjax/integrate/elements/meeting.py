@@ -16,7 +16,7 @@ Source: Glocker, *Set-Valued Force Laws*, §5, §6; Pfeiffer & Glocker, *Multibo
 ch. 6-8.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,10 +41,10 @@ LIGHT = 1e-6
 NO_FORCE = 500
 # What has let go, by its slack, opens at least by this part of its own response to that.
 LET_GO = 0.01
-# Sliding in a plane ends at this part of the velocities in the motion, or at so many round-offs of them. Below some ten
-# times rtol steps may jump over it: at 1e-9, 400 of them are rejected in place of 40, and at 1e-12 thousands.
-ENDS_AT, ENDS_AT_ROUND_OFFS = 3e-8, 1000
-# That of sliding which begins at rest, with twice this speed.
+# Sliding in a plane ends at so many tolerances of the velocities in the motion, or at so many round-offs of them: below
+# one tolerance steps jump over it, and the motion goes to and fro.
+ENDS_AT, ENDS_AT_ROUND_OFFS = 3.0, 1000
+# That of sliding which begins at rest, with twice this part of them, is no more than this.
 BEGINS_AT = 1e-9
 
 
@@ -157,10 +157,15 @@ class ContactForces(NamedTuple):
 
 
 class Meeting(eqx.Module):
-    """Solves the contacts of a system in modes (`laws.py`) at one state."""
+    """Solves the contacts of a system in modes (`laws.py`) at one state; `rtol`: the tolerance of the motion."""
 
     system: System
     laws: Laws
+    rtol: Any = 1e-9
+
+    def with_tolerance(self, rtol: Float[Array, ""]) -> "Meeting":
+        """The same in a motion of this tolerance."""
+        return Meeting(self.system, self.laws, stop_gradient(rtol))
 
     def __call__(
         self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"], instant: Bool[Array, ""]
@@ -254,9 +259,14 @@ class Meeting(eqx.Module):
         # What slides is still where its guard ends that: as near to zero as the time of that is known.
         reached = jnp.where(slid & fired & ~self._in_planes, 2 * jnp.abs(self._velocities(at)), 0.0)
         velocity = jnp.maximum(jnp.maximum(_round_offs(STILL_BELOW, scale[:, 1]), before), reached)
-        ends = _above_round_off(ENDS_AT, t.dtype) * lengths(scale[normals:, 1], laws.partners)
+        part = self._ends_at(t.dtype)
+        ends = part * lengths(scale[normals:, 1], laws.partners)
         # Also where nothing has moved yet.
-        return AsFound(closed, fired, scale, velocity, jnp.where(ends > 0, ends, ENDS_AT))
+        return AsFound(closed, fired, scale, velocity, jnp.where(ends > 0, ends, part))
+
+    def _ends_at(self, dtype) -> Float[Array, ""]:
+        """At which part of the velocities in the motion sliding in a plane ends."""
+        return jnp.maximum(jnp.asarray(ENDS_AT * self.rtol, dtype), ENDS_AT_ROUND_OFFS * jnp.finfo(dtype).eps)
 
     @property
     def _in_planes(self) -> np.ndarray:
@@ -361,8 +371,9 @@ class Meeting(eqx.Module):
         modes = self._modes(at, solution.stays(), sides)
         holds, begins = laws.holds(modes), laws.in_planes & (modes[normals:] == 1) & ~solution.problem.given
         # What begins to slide in a plane needs a direction: it gets twice the speed at which it would end.
-        begins_at, ends_at = (_above_round_off(part, at.u.dtype) for part in (BEGINS_AT, ENDS_AT))
-        ends = jnp.where(begins, begins_at / ends_at * contacts.ends, contacts.ends)
+        ends_at, least = self._ends_at(at.u.dtype), ENDS_AT_ROUND_OFFS * jnp.finfo(at.u.dtype).eps
+        slower = jnp.maximum(BEGINS_AT, least) / jnp.maximum(ends_at, BEGINS_AT)
+        ends = jnp.where(begins, slower * contacts.ends, contacts.ends)
         onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, jnp.nan)])
         slowest = jnp.where(laws.in_planes, ends, _round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]))
         slack = jnp.where(holds, solution.no_force, jnp.concatenate([contacts.gap, slowest]))
@@ -381,11 +392,6 @@ class Meeting(eqx.Module):
 def _round_offs(count: float, x: Array) -> Array:
     """So many round-offs of x."""
     return count * jnp.finfo(x.dtype).eps * x
-
-
-def _above_round_off(part: float, dtype) -> float:
-    """A part of the velocities in the motion, or if that is larger, the round-offs at which sliding in a plane ends."""
-    return max(part, ENDS_AT_ROUND_OFFS * float(jnp.finfo(dtype).eps))
 
 
 def _no_force(problem: ContactProblem, forces: Float[Array, " k"], scale: Float[Array, "k 2"]) -> Float[Array, " k"]:

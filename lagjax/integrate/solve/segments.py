@@ -99,6 +99,10 @@ class Phase(NamedTuple):
         """Whether legs end at instants of sampled controls, too."""
         return self.meeting is not None and bool(self.meeting.laws.sampled)
 
+    def with_tolerance(self, rtol: Float[Array, ""]) -> "Phase":
+        """The same in a motion of this tolerance."""
+        return self if self.meeting is None else self._replace(meeting=self.meeting.with_tolerance(rtol))
+
     def until(self, modes: "Modes | None", ts: Array, params: PyTree) -> Float[Array, ""]:
         """The next instant."""
         if modes is None:
@@ -156,6 +160,7 @@ def solved_in_legs(
     hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases, settings: Settings, adjoint: Any
 ):
     """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
+    phases = [phase.with_tolerance(settings.rtol[0]) for phase in phases]
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
     def next_legs(way: PhaseWay) -> PhaseWay:
