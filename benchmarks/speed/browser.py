@@ -76,12 +76,14 @@ class Browser:
         number = self.count
         until = time.monotonic() + self.patience
         while time.monotonic() < until:
-            for message in self._read():
+            found = self._read()
+            # Events that came in one piece with the answer, some of them after it, are kept.
+            self.events += [message for message in found if "id" not in message]
+            for message in found:
                 if message.get("id") == number:
                     if "error" in message:
                         raise RuntimeError(f"{method}: {message['error']}")
                     return message["result"]
-                self.events.append(message)
         raise RuntimeError(f"{method}: no answer in {self.patience:g} s")
 
     def _read(self):

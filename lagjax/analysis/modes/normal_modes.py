@@ -340,7 +340,7 @@ class Mode(eqx.Module):
         return drawn_mode(self)
 
     def animate(self, positions, *, amplitude=0.2, seconds: float = 6.0, rate: float = 25.0, trail: float = 0.0):
-        """Play the mode: points in the plane, as `Trajectory.animate` draws them.
+        """Play the mode: points in the plane or in space, as `Trajectory.animate` draws them.
 
         **Arguments:** `positions(t, q, params)` -> points, see `lj.Trajectory.animate`; `amplitude`: the
         amplitude of the coordinate that moves most, `[q]`; `seconds`, `rate`, `trail`: of the film.
@@ -348,7 +348,7 @@ class Mode(eqx.Module):
         **Returns:** an `Animation` of a few periods on top of the steady motion; for a mode that grows or decays, of a
         few times the time in which it does so by a factor e.
 
-        **Raises:** `ValueError` for positions that are not points of the plane.
+        **Raises:** `ValueError` for positions that are not points.
         """
         return animated(self, positions, amplitude, seconds, rate, trail)
 

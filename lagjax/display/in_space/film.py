@@ -42,12 +42,11 @@ def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tu
     about = "Motion in space" + (f" of {', '.join(names)}" if names else "")
     surfaces = list({id(shape.surface): shape.surface for shape in motion.shapes if shape.surface is not None}.values())
     colours = {name: _rgb(COLOURS[i % len(COLOURS)]) for i, name in enumerate(motion.points, start=len(bodies))}
-    poses = np.stack(list(motion.poses.values()), axis=2) if bodies else np.zeros(0)
     spec = {
         "rate": rate, "trail": trail, "start": float(t[0]), "step": step, "digits": digits, "frames": len(t),
         "about": about, "view": _plain(view), "look": LOOK, "bodies": len(bodies),
         "grid": {"floor": grid.floor, "x": lines(grid.x), "y": lines(grid.y), "z": lines(grid.z)},
-        "poses": encoded(poses, "f4"),
+        "poses": encoded(_poses(motion), "f4"),
         "surfaces": [
             {"vertices": encoded(s.vertices, "f4"), "light": encoded(s.light, "f4"), "closed": s.closed,
              "faces": encoded(s.faces, "i2" if len(s.vertices) < 2**15 else "i4")} for s in surfaces
@@ -71,6 +70,15 @@ def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tu
         "</div></div>"
     )
     return body, spec
+
+
+def _poses(motion: InSpace) -> np.ndarray:
+    """All poses (N, F, bodies, 7), with unit quaternions: those between outputs are a little shorter."""
+    if not motion.poses:
+        return np.zeros(0)
+    poses = np.stack(list(motion.poses.values()), axis=2)
+    places, e = poses[..., :3], poses[..., 3:]
+    return np.concatenate([places, e / np.linalg.norm(e, axis=-1, keepdims=True)], axis=-1)
 
 
 def _plain(view: View) -> dict[str, Any]:
