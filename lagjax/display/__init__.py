@@ -13,7 +13,6 @@ from lagjax.display.in_space import (
     InSpace,
     Shape,
     poses_in_q,
-    rotations,
     stills_in_space,
     surface,
 )

@@ -59,7 +59,10 @@ class Shape:
     def with_params(self, params: PyTree) -> "Shape":
         """The same with numbers in the place of functions of params."""
         anchors = tuple(Anchor(a.body, _three(a.point, params, "a point"), a.axes) for a in self.anchors)
-        return Shape(self.kind, anchors, self.surface, _three(self.size, params, "the size"), self.color)
+        size = _three(self.size, params, "the size")
+        if not np.all(size >= 0):
+            raise ValueError(f"the size of a shape is negative: {size.tolist()}.\nFix: lengths from zero on.")
+        return Shape(self.kind, anchors, self.surface, size, self.color)
 
     @property
     def owner(self) -> str | None:

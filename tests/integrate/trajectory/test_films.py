@@ -162,6 +162,8 @@ def test_sizes_by_params(traj):
     np.testing.assert_allclose(drawn.shapes[0].anchors[0].point, [0.0, 0.0, -PARAMS["l"]])
     with pytest.raises(ValueError, match="the size of a shape must be three finite numbers, and is 0.3"):
         traj.animate(lj.Drawing([lj.box(ROD, 0.3)], swung))
+    with pytest.raises(ValueError, match="is negative"):
+        traj.animate(lj.Drawing([lj.sphere(ROD, -0.3)], swung))
 
 
 def test_shapes_that_cannot_be_drawn(traj):
