@@ -106,11 +106,11 @@ class Body:
 
     def pose(self, q: PyTree) -> Pose:
         """Where it is."""
-        return q[self.name]
+        return self._entry(q)
 
     def rates(self, v: PyTree) -> Pose:
         """The rates of its pose."""
-        return v[self.name]
+        return self._entry(v)
 
     def point(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """Where a point of the body is in space, given from the centre of mass along the body's axes."""
@@ -150,6 +150,18 @@ class Body:
     def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
         """A place on the body for joints and springs: see `lj.Marker`."""
         return Marker.on(self, point, axis)
+
+    def _entry(self, q: PyTree) -> Pose:
+        entry = q[self.name]
+        if not hasattr(entry, "quaternion"):
+            is_array = isinstance(entry, jax.Array | np.ndarray)
+            given = f"an array of shape {entry.shape}" if is_array else type(entry).__name__
+            raise TypeError(
+                f"the entry '{self.name}' of q and v must be a lj.Pose, and is {given}.\n"
+                f"Fix: q0 = {{'{self.name}': pose}}, v0 = {{'{self.name}': pose.moving(velocity, spin)}}, with "
+                "pose = lj.Pose.at(position, axis, angle)."
+            )
+        return entry
 
     def _inertia(self, params: PyTree, dtype) -> Float[Array, "3 3"]:
         inertia = jnp.asarray(valued(self.inertia, params), dtype)
