@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, once
+from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, length, once
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
@@ -53,6 +53,12 @@ class Equations(eqx.Module):
     def are_taken_for_regular(self) -> bool:
         """Whether the equations are assumed regular: the result is NaN, unexplained, where the fast way fails."""
         return self.written is not None and self.written.may_fail and not self.fallback
+
+    def operations(self, t: Array, q: PyTree, v: PyTree) -> int:
+        """How many operations the accelerations have; written out, with those of the return to the constraints."""
+        if self.written is not None:
+            return sum(numbers.length for numbers in (self.written.equations, self.written.project) if numbers)
+        return length(jax.make_jaxpr(self.accelerations)(t, q, v).jaxpr)
 
     def inside(self, y: Array):
         """Convert the user's position or velocity to the form that these equations take."""
