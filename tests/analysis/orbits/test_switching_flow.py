@@ -127,6 +127,24 @@ def test_derivatives_and_lanes():
     np.testing.assert_allclose(jax.jit(jax.grad(start))(0.07), slope[1], rtol=1e-9)
 
 
+@pytest.mark.exhaustive
+def test_derivatives_of_multipliers():
+    """The derivative by A of the trace of M, in both modes, against the closed form. Twin: a table of another A."""
+    t, q, v, _ = bounce(0.07)
+
+    def trace(A):
+        orbit = lj.periodic_orbit(bouncing, (q, v), PERIOD, {"A": A, "omega": OMEGA, "e": E}, t=t)
+        return jnp.sum(lj.floquet(orbit).multipliers.real)
+
+    def exact(A):
+        curved = G - A * OMEGA**2 * jnp.sin(jnp.arccos(PUSHES / (A * OMEGA)))
+        return -2 * E + (1 + E) ** 2 * curved / G
+
+    slope = jax.grad(exact)(0.07)
+    np.testing.assert_allclose([jax.jacfwd(trace)(0.07), jax.grad(trace)(0.07)], [slope, slope], rtol=1e-10)
+    assert abs(slope - jax.grad(exact)(0.0707)) > 0.1
+
+
 # A mass on a belt: the spring pulls it off where it reaches the force of sticking.
 
 
@@ -164,6 +182,16 @@ def test_stick_slip():
         assert found.trivial.tolist() == [True, False] and bool(found.attracts)
         assert "belt sticks" in repr(orbit) and "0 within the errors of M, as after sticking" in repr(found)
         assert isinstance(orbit.trajectory, lj.HybridTrajectory)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_a_period():
+    """The derivative by μ of the period of sticking and slipping, in both modes. Twin: that of the wait alone."""
+    period = lambda mu: lj.periodic_orbit(block, (0.1, 0.25), 6.5, BELT | {"mu": mu}).period
+    h = 1e-6
+    slope = (stick_slip(BELT | {"mu": 0.5 + h}) - stick_slip(BELT | {"mu": 0.5 - h})) / (2 * h)
+    np.testing.assert_allclose([jax.jacfwd(period)(0.5), jax.grad(period)(0.5)], [slope, slope], rtol=1e-8)
+    assert abs(slope + 2 / BELT["k"] / BELT["V"]) > 0.1
 
 
 def stribeck(speed, p):
