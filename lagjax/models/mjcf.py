@@ -157,7 +157,8 @@ class _Reading:
         if kind not in ("connect", "weld"):
             raise ValueError(
                 f"{line}: the equality '{name}' couples by '{kind}', which is not supported: without it the parts "
-                "would move freely.\nFix: remove it, and give model.system(...) a constraint of your own."
+                "would move freely.\nFix: remove it, and tie the joints in joint coordinates: model.joint_system("
+                "closures={'gear': lj.Holonomic(lambda t, q, params: q['a'] - 2 * q['b'])})."
             )
         ends, data = (m.eq_obj1id[i], m.eq_obj2id[i]), m.eq_data[i]
         if m.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:

@@ -134,6 +134,8 @@ def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> Merg
         here = frame.then(joint.placement)
         if joint.kind == "fixed":
             frames[joint.child] = head, here
+        elif joint.name in moving:
+            raise ValueError(f"{joint.line}: a joint and a free body are both called '{joint.name}'.\nFix: rename one.")
         else:
             moving[joint.name] = joint._replace(parent=head, placement=here)
             head = joint.child

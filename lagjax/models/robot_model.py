@@ -91,6 +91,11 @@ class RobotModel:
         if field.shape != (3,):
             raise ValueError(f"gravity must be three numbers, and is {gravity}.\nFix: gravity=(0.0, 0.0, -9.81).")
         placed = tuple(_on_body(shape, merged) for shape in shapes)
+        if not merged.joints:
+            raise ValueError(
+                f"nothing in '{name}' moves: it has no joints but fixed ones.\n"
+                'Usual cause: a body that flies.\nFix: lj.read_urdf(..., base="free"), or <freejoint/> in MJCF.'
+            )
         empty = [link for link in merged.links.values() if link.mass == 0 and link.inertia.any()]
         if empty:
             raise ValueError(
@@ -170,8 +175,8 @@ class RobotModel:
         """Return the system in joint coordinates: q and v are positions and rates of joints by name.
 
         A tree has no constraints there (but that quaternions are unit ones), links without mass may move, and springs
-        of joints count whole turns. `loads` are those of `lj.multibody`, `closures` constraints by name that read
-        `q[body]` as a pose; loops of the file are in it. `others` are `force`, `dissipation`, `states` and `elements`
+        of joints count whole turns. `loads` are those of `lj.multibody`, `closures` constraints by name; both read
+        `q[body]` as a pose, and the position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`, `states` and `elements`
         of `lj.System`, in joint coordinates.
         """
         for name in self.links:
@@ -189,13 +194,13 @@ class RobotModel:
             poses, rates = jax.jvp(self._stacked, (q,), (v,))
             of_rotors = sum(x.armature * _squared(x, q, v) / 2 for x in rotors)
             of_springs = sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
-            by_name = self._named(poses), self._named(rates)
+            by_name = q | self._named(poses), v | self._named(rates)
             of_loads = sum(potential(t, *by_name, params) for potential in potentials)
             return self._energies(poses, rates) + of_rotors - of_springs - of_loads
 
         def friction(t, q, v, params):
             own = sum(x.damping * _squared(x, q, v) / 2 for x in dampers)
-            by_name = self._moving(q, v) if losses else ()
+            by_name = self._with_poses(q, v) if losses else ()
             of_loads = sum(loss(t, *by_name, params) for loss in losses)
             return own + of_loads + (0.0 if dissipation is None else dissipation(t, q, v, params))
 
@@ -245,8 +250,8 @@ class RobotModel:
     def _through_joints(self, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
         """A constraint of poses as one of joint coordinates."""
         if isinstance(constraint, Holonomic):
-            return Holonomic(lambda t, q, params: constraint.g(t, self._poses(q), params))
-        return Nonholonomic(lambda t, q, v, params: constraint.phi(t, *self._moving(q, v), params))
+            return Holonomic(lambda t, q, params: constraint.g(t, q | self._poses(q), params))
+        return Nonholonomic(lambda t, q, v, params: constraint.phi(t, *self._with_poses(q, v), params))
 
     def _loops(self) -> dict[str, Holonomic]:
         ends = [[self._marker(head, frame, (0.0, 0.0, 1.0)) for head, frame in loop.places] for loop in self.loops]
@@ -287,6 +292,11 @@ class RobotModel:
 
     def _moving(self, s: Mapping, w: Mapping) -> tuple[dict[str, Pose], dict[str, Pose]]:
         return jax.jvp(self._poses, (s,), (w,))
+
+    def _with_poses(self, s: Mapping, w: Mapping) -> tuple[dict, dict]:
+        """Positions of joints and poses of bodies by name, and their rates."""
+        poses, rates = self._moving(s, w)
+        return s | poses, w | rates
 
     @cached_property
     def _of_joints(self) -> Callable:

@@ -145,7 +145,7 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
     if base not in ("fixed", "free"):
         raise ValueError(f'base= must be "fixed" or "free", and is {base!r}.')
     path = file_of(source, "lj.read_urdf")
-    robot = _parsed(source.strip(), "the text") if path is None else _parsed(path.read_bytes(), path.name)
+    robot = _parsed(source, "the text") if path is None else _parsed(path.read_bytes(), path.name)
     for x in robot.inside:
         if x.tag not in {"link", "joint"} | BESIDE and ":" not in x.tag:
             raise _unknown(x, robot)
@@ -173,16 +173,19 @@ def _parsed(text: str | bytes, called: str) -> XMLElement:
     parser = expat.ParserCreate()
     top = XMLElement("", {}, 0)
     open_ = [top]
+    # A declaration must stand at the very beginning.
+    begun = text.lstrip()
+    above = len(text[: len(text) - len(begun)].splitlines())
 
     def start(tag, attributes):
-        element = XMLElement(tag, attributes, parser.CurrentLineNumber)
+        element = XMLElement(tag, attributes, parser.CurrentLineNumber + above)
         open_[-1].inside.append(element)
         open_.append(element)
 
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda tag: open_.pop()
     try:
-        parser.Parse(text, True)
+        parser.Parse(begun, True)
     except expat.ExpatError as error:
         raise ValueError(f"{called} is not XML: {error}.") from error
     robot = top.inside[0]
@@ -261,7 +264,8 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
         if part.tag == "mimic":
             raise ValueError(
                 f"line {part.line}: <mimic> of {x.called} is not supported: without it the joint would move freely.\n"
-                "Fix: remove it, and give model.system(...) a constraint of your own between the two joints."
+                "Fix: remove it, and tie the joints in joint coordinates: model.joint_system(closures={'mimic': "
+                f"lj.Holonomic(lambda t, q, params: q['{name}'] - q['{part.attributes.get('joint', 'other')}'])}})."
             )
         if part.tag in BESIDE_JOINT:
             not_taken.append(NotTaken(BESIDE_JOINT[part.tag], name, f"line {part.line}"))

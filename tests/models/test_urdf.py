@@ -236,6 +236,8 @@ def also(parent, child, name="x"):
             "in a circle that nothing joins to the root: 'x' .line 6., 'y'",
         ),
         ("<robot name='r'/>", "there is no <link>"),
+        ("\n\n<robot name='r'><link name='a'/></robot>", "nothing in 'r' moves.*\n.*\nFix: .*base=\"free\""),
+        ("\n <?xml version='1.0'?>\n<robot name='r'>\n<links/></robot>", "line 4: <links> in <robot> 'r'"),
         ("<mujoco/>", "URDF begins with <robot>, and this with <mujoco>.\nFix: lj.read_mjcf"),
         ("<robot><link name='a'></robot>", "the text is not XML: mismatched tag: line 1"),
         (
