@@ -125,8 +125,7 @@ class _Reading:
         return self.m.joint(k).name or f"joint {k}"
 
     def _joint(self, k: int, parent: str | None, child: str, placement: Placement) -> RobotJoint:
-        m, kind, line = self.m, self._kind(k), self.lines.get(("joint", k), "")
-        name = child if kind == "floating" else self._joint_name(k)
+        m, kind, name, line = self.m, self._kind(k), self._joint_name(k), self.lines.get(("joint", k), "")
         first, at = m.jnt_dofadr[k], m.jnt_qposadr[k]
         stiffness, damping = float(m.jnt_stiffness[k]), float(m.dof_damping[first])
         armature, rest = float(m.dof_armature[first]), 0.0

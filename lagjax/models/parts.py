@@ -134,10 +134,12 @@ def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> Merg
         here = frame.then(joint.placement)
         if joint.kind == "fixed":
             frames[joint.child] = head, here
-        elif joint.name in moving:
-            raise ValueError(f"{joint.line}: a joint and a free body are both called '{joint.name}'.\nFix: rename one.")
         else:
-            moving[joint.name] = joint._replace(parent=head, placement=here)
+            # A floating joint holds nothing: its position is the pose of its body, and goes by the body's name.
+            name = joint.child if joint.kind == "floating" else joint.name
+            if name in moving:
+                raise ValueError(f"{joint.line}: a joint and a free body are both called '{name}'.\nFix: rename one.")
+            moving[name] = joint._replace(name=name, parent=head, placement=here)
             head = joint.child
             frames[head] = head, unmoved()
         parts.setdefault(head, []).append(joint.child)

@@ -15,6 +15,7 @@ from lagjax.bodies import (
     Load,
     Marker,
     Pose,
+    Tree,
     cylindrical,
     fixed,
     generalized_force,
@@ -71,7 +72,7 @@ class RobotModel:
 
     Positions of joints, by name, count from the file's drawing, `[length]` or radians: a number for revolute and
     prismatic joints, (3,) for planar ones (two lengths, an angle), a unit quaternion for spherical ones; for floating
-    ones the `lj.Pose` of the body in space.
+    ones, which go by the name of their body, its `lj.Pose` in space.
     """
 
     name: str
@@ -174,55 +175,89 @@ class RobotModel:
     def joint_system(self, loads: Iterable[Load] = (), closures: Mapping | None = None, **others) -> System:
         """Return the system in joint coordinates: q and v are positions and rates of joints by name.
 
-        A tree has no constraints there (but that quaternions are unit ones), links without mass may move, and springs
-        of joints count whole turns. `loads` are those of `lj.multibody`, `closures` constraints by name; both read
-        `q[body]` as a pose, and the position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`, `states` and `elements`
-        of `lj.System`, in joint coordinates.
+        Where all joints turn, slide, are spherical or floating, it is that of a `lj.Tree`, solved at O(n). With rotors,
+        planar joints or moving links without mass, L is composed of the poses, its mass matrix is a dense one, and its
+        quaternions have constraints. Springs of joints count whole turns.
+
+        `loads` are those of `lj.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and the
+        position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
+        `states` and `elements` of `lj.System`, in joint coordinates.
         """
         for name in self.links:
             if not self._mass_from(name):
                 raise self._massless([joint for joint in self.joints.values() if joint.child == name])
-        loads = tuple(loads)
+        loads, closing = tuple(loads), self._loops() | dict(closures or {})
         rotors = [joint for joint in self.joints.values() if joint.armature]
         springs = [joint for joint in self.joints.values() if joint.stiffness]
         dampers = [joint for joint in self.joints.values() if joint.damping]
         force, dissipation = others.pop("force", None), others.pop("dissipation", None)
+
+        def of_springs(t, q, params):
+            return sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
+
+        def of_dampers(t, q, v, params):
+            own = sum(x.damping * _squared(x, q, v) / 2 for x in dampers)
+            return own if dissipation is None else own + dissipation(t, q, v, params)
+
+        dissipation_in_joints = of_dampers if dampers else dissipation
+        if not rotors and self._is_a_tree:
+            system = self.tree().system(
+                [weight(self.bodies.values(), self.gravity), *loads],
+                closing,
+                of_springs if springs else None,
+                force=force,
+                dissipation=dissipation_in_joints,
+                **others,
+            )
+            setattr(system.lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
+            return system
         losses = [load.dissipation for load in loads if load.dissipation is not None]
         potentials = [load.potential for load in loads if load.potential is not None]
 
         def lagrangian(t, q, v, params):
             poses, rates = jax.jvp(self._stacked, (q,), (v,))
             of_rotors = sum(x.armature * _squared(x, q, v) / 2 for x in rotors)
-            of_springs = sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
             by_name = q | self._named(poses), v | self._named(rates)
             of_loads = sum(potential(t, *by_name, params) for potential in potentials)
-            return self._energies(poses, rates) + of_rotors - of_springs - of_loads
+            return self._energies(poses, rates) + of_rotors - of_springs(t, q, params) - of_loads
 
         def friction(t, q, v, params):
-            own = sum(x.damping * _squared(x, q, v) / 2 for x in dampers)
-            by_name = self._with_poses(q, v) if losses else ()
-            of_loads = sum(loss(t, *by_name, params) for loss in losses)
-            return own + of_loads + (0.0 if dissipation is None else dissipation(t, q, v, params))
+            of_loads = sum(loss(t, *self._with_poses(q, v), params) for loss in losses)
+            return of_loads if dissipation_in_joints is None else of_loads + dissipation_in_joints(t, q, v, params)
 
         def driven(t, q, v, params):
             of_loads = generalized_force(loads, t, *self._moving(q, v), params)
             given = jax.vjp(self._poses, q)[1](of_loads)[0]
             return given if force is None else jax.tree.map(jnp.add, given, force(t, q, v, params))
 
-        def poses(q: PyTree, params: PyTree) -> dict[str, Pose]:
-            return self._poses(q)
-
-        setattr(lagrangian, "drawing", Drawing(self._looks, poses))
+        setattr(lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
         turning = [x for x in self.joints.values() if x.kind in ("spherical", "floating")]
-        closing = named(self._loops() | dict(closures or {}))
         return System(
             lagrangian,
             {f"{x.name} is turned": _unit(x) for x in turning}
-            | {name: self._through_joints(x) for name, x in closing.items()},
+            | {name: self._through_joints(x) for name, x in named(closing).items()},
             force=driven if any(load.power is not None for load in loads) else force,
-            dissipation=friction if dampers or losses else dissipation,
+            dissipation=friction if losses else dissipation_in_joints,
             **others,
         )
+
+    def tree(self) -> Tree:
+        """Return the `lj.Tree` of its bodies: its poses, and systems at O(n); without what acts, and without loops.
+
+        **Raises:** `TypeError` for planar joints; `ValueError` for a link without mass that moves, by its line.
+        """
+        equations = {x.joints[0].name: EQUATIONS[x.kind](x.a, x.b)
+                     for x in self._between.values() if x.kind != "floating"}  # fmt: skip
+        return Tree(list(self.bodies.values()), equations)
+
+    @property
+    def _is_a_tree(self) -> bool:
+        """Whether `lj.Tree` has coordinates for it."""
+        kinds = {joint.kind for joint in self.joints.values()}
+        return len(self.bodies) == len(self.links) and "planar" not in kinds
+
+    def _drawn_poses(self, q: PyTree, params: PyTree) -> dict[str, Pose]:
+        return self._poses(q)
 
     def _looks(self, params: PyTree) -> tuple[Shape, ...]:
         """How it is drawn: bodies, and at each joint a dot with arms to the bodies' centres."""

@@ -175,7 +175,8 @@ def _parsed(text: str | bytes, called: str) -> XMLElement:
     open_ = [top]
     # A declaration must stand at the very beginning.
     begun = text.lstrip()
-    above = len(text[: len(text) - len(begun)].splitlines())
+    left_out = text[: len(text) - len(begun)]
+    above = left_out.count("\n") if isinstance(left_out, str) else left_out.count(b"\n")
 
     def start(tag, attributes):
         element = XMLElement(tag, attributes, parser.CurrentLineNumber + above)
