@@ -78,9 +78,9 @@ class Tree:
                 "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}, or {'links': [...]} for a list."
             )
         self.bodies = bodies
-        listed = (x if isinstance(x, list | tuple) else [x] for x in (joints or {}).values())
-        self._joints = [joint for row in listed for joint in row]
         self._geometry = Geometry(*links_of(bodies, joints or {}))
+        rows = ([x] if isinstance(x, Holonomic) else x for x in (joints or {}).values())
+        self._joints = [joint for row in rows for joint in row]
 
     def __repr__(self):
         entries = ", ".join(entry.name for entry in self._geometry.entries)
@@ -188,7 +188,7 @@ class Dynamics(NamedTuple):
         """Rayleigh's function of loads and of the user."""
         placed, moving = self._placed(q, v, params)
         lost = sum(x.dissipation(t, placed, moving, params) for x in self.loads if x.dissipation is not None)
-        return lost + (0.0 if self.dissipation is None else self.dissipation(t, q, v, params))
+        return jnp.asarray(lost + (0.0 if self.dissipation is None else self.dissipation(t, q, v, params)))
 
     def driven(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> PyTree:
         """The generalized force of loads and of the user."""
