@@ -115,7 +115,7 @@ def test_a_heavy_top():
                  for end in (period, part)]  # fmt: skip
         return whole * up_to[0] + up_to[1]
 
-    ts = np.linspace(0.0, 20 * period, 41)
+    ts = np.linspace(0.0, 20.3 * period, 41)
     q, v = state(tilt, own, 0.0)
     motion = lj.integrate(system, q, v, None, ts=ts, rtol=1e-12, estimate_error=False)
     axis = along(motion, top)
@@ -133,7 +133,7 @@ def test_a_heavy_top():
         q, v = state(tilt, spin - turn * np.cos(tilt), turn)
         axis = along(lj.integrate(system, q, v, None, ts=ts, rtol=1e-12, estimate_error=False), top)
         even = np.stack([np.sin(tilt) * np.sin(turn * ts), -np.sin(tilt) * np.cos(turn * ts)], axis=1)
-        assert (np.abs(axis[:, :2] - even).max() > 1e-2) is nods
+        assert bool(np.abs(axis[:, :2] - even).max() > 1e-2) == nods
         if not nods:
             np.testing.assert_allclose(axis[:, :2], even, atol=2e-8)
             np.testing.assert_allclose(axis[:, 2], np.cos(tilt), atol=2e-8)
@@ -175,7 +175,7 @@ def test_a_rolling_disk():
         angle = turn * np.asarray(circle.t)
         radius = -R * w3 / turn
         expected = np.stack([radius * np.cos(angle), radius * np.sin(angle), R * np.sin(tilt) + 0 * angle], axis=1)
-        assert (np.abs(centre - expected).max() < 1e-10) is is_steady
+        assert bool(np.abs(centre - expected).max() < 1e-10) == is_steady
 
     wobble = motion(state(0.9, 4.0, 1.5, 0.7), 10.0)
     axis, spin = along(wobble, disk), np.asarray(jax.vmap(disk.spin)(wobble.q, wobble.v))
