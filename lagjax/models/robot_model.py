@@ -331,7 +331,7 @@ class RobotModel:
     def _with_poses(self, s: Mapping, w: Mapping) -> tuple[dict, dict]:
         """Positions of joints and poses of bodies by name, and their rates."""
         poses, rates = self._moving(s, w)
-        return s | poses, w | rates
+        return dict(s) | poses, dict(w) | rates
 
     @cached_property
     def _of_joints(self) -> Callable:
