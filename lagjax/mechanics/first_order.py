@@ -83,7 +83,7 @@ def _heavy(structure, leaves: tuple) -> Bool[np.ndarray, " n"]:
         return jax.grad(model.lagrangian, argnums=2)(t, x, u)
 
     given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t
-    return pattern(momentum, y, y, given).any(axis=1)
+    return np.asarray(pattern(momentum, y, y, given).any(axis=1))
 
 
 def _massless(structure, leaves: tuple, states: list[int]) -> tuple[int, ...]:
