@@ -164,8 +164,11 @@ def test_single_precision():
     a, b = lj.ground.at((0.1, 0.0, 0.0), (1.0, 1.0, 0.0)), rod.at(lambda params: (0.0, params, 0.0))
     half = jnp.float32(0.5)
     given = [rod.kinetic(q, v), lj.fixed(a, b).g(0.0, q, half), lj.prismatic(a, b).g(0.0, q, half)]
-    given += [load.potential(0.0, q, v, half) for load in (lj.weight([rod]), lj.spring(a, b, 2), lj.torsion(a, b, 2))]
-    given += [lj.spring(a, b, 2, damping=1).dissipation(0.0, q, v, half), lj.motor(a, b, 2).power(0.0, q, v, v, half)]
+    loads = lj.weight([rod]), lj.spring(a, b, 2), lj.torsion(a, b, 2)
+    given += [load.potential(0.0, q, v, half) for load in loads if load.potential is not None]
+    damper, drive = lj.spring(a, b, 2, damping=1).dissipation, lj.motor(a, b, 2).power
+    assert damper is not None and drive is not None
+    given += [damper(0.0, q, v, half), drive(0.0, q, v, v, half)]
     given += jax.tree.leaves((q, v)) + [rod.angular_momentum(q, v)]
     assert {jnp.asarray(x).dtype for x in given} == {np.dtype("float32")}
 
