@@ -6,7 +6,7 @@ r is the centre of mass, e the quaternion (`rotation.py`), I the inertia about t
 The last term vanishes with the constraint |e|² = 1. It is there so that the mass matrix is regular for all rates of e.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -152,10 +152,13 @@ class Body:
         return Marker.on(self, point, axis)
 
     def _entry(self, q: PyTree) -> Pose:
-        entry = q[self.name]
-        if not hasattr(entry, "quaternion"):
+        if isinstance(q, Mapping) and self.name not in q:
+            given, entry = f"missing beside {', '.join(map(repr, q)) or 'nothing'}", None
+        else:
+            entry = q[self.name]
             is_array = isinstance(entry, jax.Array | np.ndarray)
             given = f"an array of shape {entry.shape}" if is_array else type(entry).__name__
+        if not hasattr(entry, "quaternion"):
             raise TypeError(
                 f"the entry '{self.name}' of q and v must be a lj.Pose, and is {given}.\n"
                 f"Fix: q0 = {{'{self.name}': pose}}, v0 = {{'{self.name}': pose.moving(velocity, spin)}}, with "

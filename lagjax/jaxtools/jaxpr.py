@@ -69,7 +69,7 @@ T = TypeVar("T")
 
 # Chains of at least so many calls are worth a loop.
 LONG_CHAIN = 16
-# Of 5, 20, 40 and 80 operations, 20 and 40 compile in the least time, and 20 runs in the least; see `shared`.
+# With fewer, more results cost more than copies do; with 80, there are copies again. See `shared`.
 SHARED_FROM = 20
 # What XLA takes for expensive.
 EXPENSIVE = {"cos", "div", "exp", "log", "pow", "rsqrt", "sin", "sqrt", "tan", "tanh"}

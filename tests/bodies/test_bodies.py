@@ -194,6 +194,8 @@ def test_bad_bodies_and_joints():
         TypeError, match="entry 'rod' of q and v must be a lj.Pose, and is tuple.\nFix: q0 = {'rod': pose}"
     ):
         rod.spin({"rod": lj.Pose.at()}, {"rod": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))})
+    with pytest.raises(TypeError, match="entry 'rod' of q and v must be a lj.Pose, and is missing beside 'rods'"):
+        rod.point({"rods": lj.Pose.at()}, (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="two bodies or constraints are called 'rod'"):
         lj.multibody([rod, lj.Body("rod", 2.0, (1.0, 1.0, 1.0))])
 

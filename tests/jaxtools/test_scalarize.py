@@ -107,8 +107,8 @@ def kept_in(chain):
 
 @pytest.mark.optimised
 def test_what_results_share_is_compiled_once():
-    """Forty operations before seven results: one is kept, and they are in the program once; twins: fewer are not kept,
-    and without the kept one XLA has copies of them."""
+    """Twenty products and sums before seven results: one number is kept, and they are in the program once; twins: of
+    five none is kept, and without the kept one XLA has copies of them."""
     count, (once, copies) = kept_in(20)
     assert count == 1 and kept_in(5)[0] == 0
     assert once.count(" multiply(") < 40 and copies.count(" multiply(") > 100
