@@ -69,10 +69,6 @@ T = TypeVar("T")
 
 # Chains of at least so many calls are worth a loop.
 LONG_CHAIN = 16
-# With fewer, more results cost more than copies do; with 80, there are copies again. See `shared`.
-SHARED_FROM = 20
-# What XLA takes for expensive.
-EXPENSIVE = {"cos", "div", "exp", "log", "pow", "rsqrt", "sin", "sqrt", "tan", "tanh"}
 
 
 def bodies(equation: JaxprEqn) -> list[Jaxpr]:
@@ -312,8 +308,7 @@ def run(closed: ClosedJaxpr, operands: Sequence) -> list:
 def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     """Split a program into two functions: of the inputs `first`, and of the first one's results and the inputs `then`.
 
-    A division of floating-point numbers by a value of the first function becomes a multiplication by its inverse. The
-    second function returns the program's results, and `shared` numbers among its values.
+    A division of floating-point numbers by a value of the first function becomes a multiplication by its inverse.
     """
     jaxpr = program.jaxpr
     late = reached(jaxpr, (jaxpr.invars[i] for i in then))
@@ -327,7 +322,6 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
     crossing.update(dict.fromkeys(x for x in jaxpr.outvars if is_known(x)))
     divisors = dict.fromkeys(e.invars[1] for e in after if _divides_numbers(e) and is_known(e.invars[1]))
     constants = dict(zip(jaxpr.constvars, program.consts))
-    kept = shared(after, jaxpr.outvars)
 
     def at_first(*given):
         values = constants | {jaxpr.invars[i]: x for i, x in zip(first, given)}
@@ -345,35 +339,9 @@ def staged(program: ClosedJaxpr, first: Sequence[int], then: Sequence[int]):
             else:
                 results = evaluate(jaxpr, equation, values)
             values.update(zip(equation.outvars, results))
-        results = [jnp.asarray(written(x)) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
-        return results, [values[x] for x in kept]
+        return [jnp.asarray(written(x)) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
 
     return at_first, afterwards
-
-
-def shared(equations: Sequence[JaxprEqn], results: Sequence) -> list[Var]:
-    """The numbers that are used several times and take long to compute: `SHARED_FROM` operations from those before.
-
-    On a CPU, XLA merges operations into the kernels of the results, and copies into each what leads to it, other than
-    what it takes for expensive. It does not copy what is a result itself. So these numbers become results too, which
-    nobody reads: a projection of four links has 1,290 operations, 6,300 in XLA's program without this and 3,500 with.
-    """
-    uses = Counter(x for e in equations for x in e.invars if not isinstance(x, Literal))
-    uses.update(x for x in results if not isinstance(x, Literal))
-    leading: dict[Var, frozenset] = {}
-    found = []
-    for equation in equations:
-        before = frozenset().union(*(leading.get(x, frozenset()) for x in variables(equation)))
-        for x in equation.outvars:
-            leading[x] = before | {x}
-            if uses[x] < 2:
-                continue
-            if equation.primitive.name in EXPENSIVE:
-                leading[x] = frozenset()
-            elif len(leading[x]) >= SHARED_FROM and not cast(Any, x.aval).shape:
-                found.append(x)
-                leading[x] = frozenset()
-    return found
 
 
 def _divides_numbers(equation):

@@ -93,8 +93,7 @@ class Numbers:
 
     def at(self, prepared, t: Array, q: PyTree, v: PyTree):
         """The function's result at a state."""
-        results, _ = self._late(prepared or (), *jtu.tree_leaves((t, q, v)))
-        return jtu.tree_unflatten(self.shapes[0], results)
+        return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
 
     def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""
