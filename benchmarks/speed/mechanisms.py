@@ -268,7 +268,7 @@ CASES = {
     "four-bar with ledger": Case(FOUR_BAR, 12.0, LEDGER),
     "Bricard": Case(MECHANISM.format(name="bricard", end=0.5, varied="g"), 15.0),
     "Fekete": Case(MECHANISM.format(name="fekete", end=10.0, varied="alpha"), 20.0),
-    "Andrews": Case(MECHANISM.format(name="andrews", end=0.003, varied="m1"), 10.0),
+    "Andrews": Case(MECHANISM.format(name="andrews", end=0.003, varied="mom"), 10.0),
     "vehicle": Case(VEHICLE, 12.0),
     "chain of 32": Case(CHAIN.format(count=32), 12.0),
     "chain of 256": Case(CHAIN.format(count=256), 20.0),

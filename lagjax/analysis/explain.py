@@ -135,7 +135,7 @@ class Explanation:
     - `degrees_of_freedom`: velocities left free: coordinates minus independent constraint equations.
     - `position_freedoms`: positions left free; more than the former if some constraints restrict only velocities.
     - `dependent`: each dependent equation, followed by those of which it is a combination.
-    - `structure`: what holds at every state, a `Structure`; None for large systems and long programs.
+    - `structure`: what holds at every state, a `Structure`; None for large systems, long programs and forward dynamics.
     - `mass_matrix`: its definiteness in words; `problem`: why the equations fail there, or None.
     - `modes`: of a system with elements, by name the mode that fits the state: "open", "closed", "free", "slides" or
       "sticks". The other fields are those with all gaps open and no friction.

@@ -75,8 +75,8 @@ class Structure(NamedTuple):
 
 
 def structure(model: Model) -> Structure | None:
-    """The structure of a system. None if it or its program is large."""
-    if model.n + model.m > UP_TO:
+    """The structure of a system. None if it or its program is large, or L is not what its motion is computed from."""
+    if model.n + model.m > UP_TO or model.solves_itself:
         return None
     try:
         return _structure(in_numbers(model), model.names)
