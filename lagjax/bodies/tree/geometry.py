@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.bodies.tree.links import Entry, Link, Slots, slots_of
 
 
-class Given(NamedTuple):
+class LinkNumbers(NamedTuple):
     """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links."""
 
     mass: Float[Array, " n"]
@@ -68,7 +68,7 @@ class Geometry:
         has = np.flatnonzero(self.ball | self.free)
         return has[np.argsort(self.quaternions[has])]
 
-    def at(self, params: PyTree, dtype: DTypeLike) -> Given:
+    def at(self, params: PyTree, dtype: DTypeLike) -> LinkNumbers:
         """The numbers of links for these params."""
         bodies = [link.body for link in self.links]
 
@@ -88,7 +88,7 @@ class Geometry:
                 total = total + of_f * value[None]
             return total
 
-        return Given(
+        return LinkNumbers(
             values([0.0 if body is None else body.mass for body in bodies]),
             values([(0.0, 0.0, 0.0) if body is None else body.inertia for body in bodies], inertia),
             values([link.a.place for link in self.links]),

@@ -19,8 +19,8 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.bodies.body import Pose, valued
 from lagjax.bodies.loads import Load, Weight
 from lagjax.bodies.rotation import conjugate, product, quaternion_of
-from lagjax.bodies.tree.geometry import Geometry, Given
-from lagjax.bodies.tree.motion import Motion
+from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
+from lagjax.bodies.tree.motion import LinkMotion
 
 
 class Placed:
@@ -34,18 +34,18 @@ class Placed:
         return self.others[name] if place is None else Pose(self.poses.position[place], self.poses.quaternion[place])
 
 
-def poses_of(motion: Motion) -> Pose:
+def poses_of(motion: LinkMotion) -> Pose:
     """The poses of all links, stacked."""
     return Pose(motion.centre, jax.vmap(quaternion_of)(motion.turn))
 
 
-def rates_of(motion: Motion, poses: Pose) -> Pose:
+def rates_of(motion: LinkMotion, poses: Pose) -> Pose:
     """Their rates."""
     spin = jnp.concatenate([jnp.zeros_like(motion.spin[:, :1]), motion.spin], axis=1)
     return Pose(motion.velocity, jax.vmap(product)(spin, poses.quaternion) / 2)
 
 
-def potential(geometry: Geometry, given: Given, loads: Iterable[Load], motion: Motion, state: tuple) -> Array:
+def potential(geometry: Geometry, given: LinkNumbers, loads: Iterable[Load], motion: LinkMotion, state: tuple) -> Array:
     """V of all loads."""
     weights, others = _sorted(loads)
     total = -jnp.sum(_weights(geometry, given, weights, state[-1]) * motion.centre)
@@ -53,7 +53,7 @@ def potential(geometry: Geometry, given: Given, loads: Iterable[Load], motion: M
 
 
 def wrenches(
-    geometry: Geometry, given: Given, loads: Iterable[Load], motion: Motion, state: tuple
+    geometry: Geometry, given: LinkNumbers, loads: Iterable[Load], motion: LinkMotion, state: tuple
 ) -> Float[Array, "n 6"]:
     """Moments and forces of the loads' potentials on the centres of links."""
     weights, others = _sorted(loads)
@@ -82,7 +82,7 @@ def moments(e: Float[Array, "m 4"], slope: Float[Array, "m 4"]) -> Float[Array, 
     return jax.vmap(product)(slope, jax.vmap(conjugate)(e))[:, 1:] / 2
 
 
-def _weights(geometry: Geometry, given: Given, weights: Sequence[Weight], params: PyTree) -> Float[Array, "n 3"]:
+def _weights(geometry: Geometry, given: LinkNumbers, weights: Sequence[Weight], params: PyTree) -> Float[Array, "n 3"]:
     total = jnp.zeros((geometry.n, 3), given.mass.dtype)
     for weight in weights:
         field, bodies = jnp.asarray(valued(weight.g, params), total.dtype), set(weight.bodies)

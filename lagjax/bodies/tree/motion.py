@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Pose
 from lagjax.bodies.rotation import conjugate, product, rotation_matrix
-from lagjax.bodies.tree.geometry import Geometry, Given
+from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
 
 
 class Coordinates(NamedTuple):
@@ -51,7 +51,7 @@ class Joints(NamedTuple):
     slide: Float[Array, "n 3"]
 
 
-class Motion(NamedTuple):
+class LinkMotion(NamedTuple):
     """The links in space, along its axes: R, r and their rates, what `Joints` has, and the parent's spin, `before`."""
 
     turn: Float[Array, "n 3 3"]
@@ -150,7 +150,7 @@ def _dot(a: Array, b: Array) -> Array:
     return applied(a[..., None, :], b)[..., 0]
 
 
-def seen_from_parents(geometry: Geometry, given: Given, q: Coordinates, v: Coordinates) -> Joints:
+def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates) -> Joints:
     """The links as seen from their parents."""
     dtype = q.numbers.dtype
     s, rates = numbers_of_links(geometry, q.numbers)[:, 0], numbers_of_links(geometry, v.numbers)
@@ -183,7 +183,7 @@ def seen_from_parents(geometry: Geometry, given: Given, q: Coordinates, v: Coord
     )  # fmt: skip
 
 
-def in_space(geometry: Geometry, joints: Joints) -> Motion:
+def in_space(geometry: Geometry, joints: Joints) -> LinkMotion:
     """The links in space, one after the other."""
     dtype = joints.turn.dtype
     read, write = (jnp.asarray(x, dtype) for x in geometry.slots)
@@ -209,13 +209,13 @@ def in_space(geometry: Geometry, joints: Joints) -> Motion:
     root = jnp.asarray(geometry.root, dtype)
     given = jnp.concatenate(columns, axis=2), joints.arm, read, write, root
     _, (link, rest) = lax.scan(outward, start, given)
-    return Motion(
+    return LinkMotion(
         link[:, :, :3], link[:, :, 3], link[:, :, 4], link[:, :, 5], rest[:, :, 2], rest[:, :, 0], rest[:, :, 3],
         rest[:, :, 4], rest[:, :, 1], rest[:, :, 5:],
     )  # fmt: skip
 
 
 @partial(jax.jit, static_argnums=0)
-def moving(geometry: Geometry, given: Given, q: Coordinates, v: Coordinates) -> Motion:
+def moving(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates) -> LinkMotion:
     """Where the links are and how they move. Jitted, so that it is traced once."""
     return in_space(geometry, seen_from_parents(geometry, given, q, v))

@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lagjax.bodies.tree.geometry import Geometry, Given
-from lagjax.bodies.tree.motion import Motion, applied, left, taken, times
+from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
+from lagjax.bodies.tree.motion import LinkMotion, applied, left, taken, times
 from lagjax.numerics import dense
 
 
@@ -39,7 +39,7 @@ class Accelerated(NamedTuple):
 
 
 def accelerated(
-    geometry: Geometry, given: Given, motion: Motion, torque: Float[Array, "n k"], wrench: Float[Array, "n 6"]
+    geometry: Geometry, given: LinkNumbers, motion: LinkMotion, torque: Float[Array, "n k"], wrench: Float[Array, "n 6"]
 ) -> Accelerated:
     """The accelerations under forces `torque` of joints, and moments and forces on centres of mass, `wrench`."""
     dtype = motion.turn.dtype

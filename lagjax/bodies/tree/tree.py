@@ -13,12 +13,12 @@ from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Load, check_loads, generalized_force
 from lagjax.bodies.rotation import product
 from lagjax.bodies.shapes import usual_shapes
-from lagjax.bodies.tree.geometry import Geometry, Given
+from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
 from lagjax.bodies.tree.links import links_of
 from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, rates_of, wrenches
 from lagjax.bodies.tree.motion import (
     Coordinates,
-    Motion,
+    LinkMotion,
     applied,
     flat,
     growth,
@@ -210,7 +210,7 @@ class Dynamics(NamedTuple):
         return Placed(self.geometry, poses, q), Placed(self.geometry, rates_of(motion, poses), v)
 
 
-def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[Given, Motion]:
+def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[LinkNumbers, LinkMotion]:
     x, u = flat(geometry, q), flat(geometry, v)
     given = geometry.at(params, x.numbers.dtype)
     return given, moving(geometry, given, x, u)
@@ -218,7 +218,7 @@ def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[G
 
 # Jitted, as all that calls no function of the user's, so that it is traced once.
 @partial(jax.jit, static_argnums=0)
-def _kinetic(geometry: Geometry, given: Given, motion: Motion, q: Coordinates, v: Coordinates) -> Array:
+def _kinetic(geometry: Geometry, given: LinkNumbers, motion: LinkMotion, q: Coordinates, v: Coordinates) -> Array:
     in_body = applied(jnp.swapaxes(motion.turn, 1, 2), motion.spin)
     twice = jnp.sum(in_body * applied(given.inertia, in_body)) + jnp.sum(given.mass[:, None] * motion.velocity**2)
     if len(geometry.links_of_quaternions):
@@ -228,7 +228,13 @@ def _kinetic(geometry: Geometry, given: Given, motion: Motion, q: Coordinates, v
 
 @partial(jax.jit, static_argnums=0)
 def _accelerations(
-    geometry: Geometry, given: Given, motion: Motion, wrench: Array, q: Coordinates, v: Coordinates, force: Coordinates
+    geometry: Geometry,
+    given: LinkNumbers,
+    motion: LinkMotion,
+    wrench: Array,
+    q: Coordinates,
+    v: Coordinates,
+    force: Coordinates,
 ) -> Coordinates:
     """The accelerations of coordinates under moments and forces on links, and a generalized force."""
     torque = numbers_of_links(geometry, force.numbers)
@@ -254,7 +260,7 @@ def _accelerations(
     return Coordinates(numbers, bent, found.links[links, 3:])
 
 
-def _of_growth(geometry: Geometry, given: Given) -> Array:
+def _of_growth(geometry: Geometry, given: LinkNumbers) -> Array:
     """The inertia of the growth of each quaternion."""
     return jnp.trace(given.inertia, axis1=1, axis2=2)[geometry.links_of_quaternions] / 3
 
