@@ -49,6 +49,7 @@ def every_joint():
         lj.spring(a_place(rng, b[3]), a_place(rng, b[5]), 2.0, 0.5, damping=0.7),
         lj.motor(a_place(rng, b[0]), a_place(rng, b[2]), lambda t, q, v, params: 1.3 - v["hinge"]),
         lj.applied(a_place(rng, b[7]), (1.0, 2.0, 3.0)),
+        lj.spring(a_place(rng, lj.ground), a_place(rng, b[4]), 1.5, 0.2, damping=0.4),
     ]
     system = tree.system(loads, potential=lambda t, q, params: 2.0 * q["slide"] ** 2 + q["pair"][0] * q["ring"][1])
     return rng, tree, system, {"m": jnp.asarray(1.3), "g": jnp.asarray(9.81)}

@@ -11,6 +11,7 @@ a moment: so a potential costs its own derivative, not that of the way to the li
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,11 +24,12 @@ from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
 from lagjax.bodies.tree.motion import LinkMotion
 
 
-class Placed:
+class Placed(eqx.Module):
     """What loads and closures read as q or v: bodies by name as poses, all else as it is in the tree's own q or v."""
 
-    def __init__(self, geometry: Geometry, poses: Pose, others: PyTree):
-        self.geometry, self.poses, self.others = geometry, poses, others
+    geometry: Geometry = eqx.field(static=True)
+    poses: Pose
+    others: PyTree
 
     def __getitem__(self, name: str) -> Any:
         place = self.geometry.body_at.get(name)
