@@ -7,6 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.bodies.tree.links import slots_of
+from lagjax.display import InSpace
 
 Y = (0.0, 1.0, 0.0)
 
@@ -238,5 +239,11 @@ def test_a_tree_is_drawn_by_itself():
     motion = lj.integrate(tree.system([lj.weight([rod])]), {"hinge": 0.3}, {"hinge": 0.0}, ts=jnp.linspace(0.0, 2.0, 5))
     # A physical pendulum of length 2/3 from its energy: v² = 2 g/l (cos q - cos 0.3).
     np.testing.assert_allclose(motion.v["hinge"] ** 2, 3 * 9.81 * (np.cos(motion.q["hinge"]) - np.cos(0.3)), atol=1e-8)
-    # Drawn by itself: the rod's box and the dot and line of its hinge.
-    assert "rod" in str(vars(motion.animate().points))
+    # Drawn by itself: the rod's box, in its middle, and the dot and line of its hinge.
+    film = motion.animate()
+    assert isinstance(film.points, InSpace)
+    box, *of_hinge = film.points.shapes
+    assert [shape.kind for shape in of_hinge] == ["dot", "line"]
+    middle = film.points.place(box.anchors[0])
+    np.testing.assert_allclose(np.sqrt(np.sum(middle**2, axis=1)), 0.5, rtol=1e-6)
+    np.testing.assert_allclose(middle[0], [-0.5 * np.sin(0.3), 0.0, -0.5 * np.cos(0.3)], atol=1e-6)
