@@ -152,8 +152,9 @@ class Body:
         return Marker.on(self, point, axis)
 
     def _entry(self, q: PyTree) -> Pose:
+        entry: Any = None
         if isinstance(q, Mapping) and self.name not in q:
-            given, entry = f"missing beside {', '.join(map(repr, q)) or 'nothing'}", None
+            given = f"missing beside {', '.join(map(repr, q)) or 'nothing'}"
         else:
             entry = q[self.name]
             is_array = isinstance(entry, jax.Array | np.ndarray)
