@@ -390,7 +390,7 @@ def _how_solved(equations, found):
 
 
 # Processor time of a first motion in a new process, in seconds: at least, and per thousand operations. Measured on a
-# busy machine by `benchmarks/speed/mechanisms.py`: eight programs of six mechanisms were within a factor of two.
+# busy machine by `benchmarks/speed/mechanisms.py`: all of its ten results are within a factor of two.
 FIRST_AT_LEAST, FIRST_WRITTEN, FIRST_IN_ARRAYS = 1.5, 4.5, 13.0
 
 
