@@ -249,8 +249,6 @@ class Meeting(eqx.Module):
         laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
         modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, at.given.slack, fired))
         gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
-        # A gap may be as large where all coordinates are zero.
-        scale = scale.at[:normals, 0].add(jnp.abs(gaps))
         closed = (modes == CLOSED)[:normals] | fired[:normals]
         closed = closed | (jnp.abs(gaps) <= _round_offs(4 * CLOSED_BELOW, scale[:normals, 0]))
         # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
