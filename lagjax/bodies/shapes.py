@@ -28,8 +28,8 @@ def box(place: Place, size: Any, color: str | None = None) -> Shape:
     >>> lj.box(door, (1.0, 0.05, 2.0))
     Shape(a solid on 'door')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb", and, when it is
-    drawn, for a size that is not three numbers.
+    **Raises:** `TypeError` for a place that is none; `ValueError` for a color that is not "#rrggbb", and, when it is
+    drawn, for a size that is not three numbers, or negative.
     """
     return Shape("solid", (_anchor(place),), CUBE, size, color)
 
@@ -42,7 +42,7 @@ def cylinder(place: Place, radius: Any, length: Any, color: str | None = None) -
     >>> lj.cylinder(wheel.at(axis=(0.0, 1.0, 0.0)), radius=1.0, length=0.1)
     Shape(a solid on 'wheel')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb".
+    **Raises:** as `lj.box` does.
     """
     return Shape("solid", (_anchor(place),), CYLINDER, _sizes(radius, radius, length), color)
 
@@ -55,7 +55,7 @@ def sphere(place: Place, radius: Any, color: str | None = None) -> Shape:
     >>> lj.sphere(ball, radius=1.0)
     Shape(a solid on 'ball')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb".
+    **Raises:** as `lj.box` does.
     """
     return Shape("solid", (_anchor(place),), SPHERE, _sizes(radius, radius, radius), color)
 
@@ -68,7 +68,7 @@ def disk(place: Place, radius: Any, color: str | None = None) -> Shape:
     >>> lj.disk(coin, radius=2.0)
     Shape(a solid on 'coin')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb".
+    **Raises:** as `lj.box` does.
     """
     return Shape("solid", (_anchor(place),), DISK, _sizes(radius, radius, radius), color)
 
@@ -95,7 +95,7 @@ def rod(a: Place, b: Place, radius: Any, color: str | None = None) -> Shape:
     >>> lj.rod(lj.ground, bob, radius=0.02)
     Shape(a rod on the ground, 'bob')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb".
+    **Raises:** as `lj.box` does.
     """
     return Shape("rod", (_anchor(a), _anchor(b)), TUBE, _sizes(radius, radius, 1.0), color)
 
@@ -123,7 +123,7 @@ def trail(place: Place, color: str | None = None) -> Shape:
     >>> lj.trail(pen.at((0.0, 0.0, -0.1)))
     Shape(a trail on 'pen')
 
-    **Raises:** `ValueError` for a color that is not "#rrggbb".
+    **Raises:** as `lj.box` does.
     """
     return Shape("trail", (_anchor(place),), color=color)
 

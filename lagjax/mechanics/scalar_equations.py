@@ -37,8 +37,8 @@ UP_TO, CONSTRAINED_UP_TO = 8, 16
 # Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
 # thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
 MATRIX = 64
-# A program of more operations compiles faster in arrays. A rattleback's 2,465 take 20 s of processor time written out,
-# 50 s in arrays; a vehicle's 7,106 take 34 s in arrays and, at the same rate, 60 s written out (not measured).
+# A program of more operations goes to arrays. The longest one below this that was measured, a rattleback's, takes 18 s
+# of processor time written out and 50 s in arrays (`benchmarks/speed/mechanisms.py`); none above it was.
 LONG = 3000
 # Two iterations are enough where the second one moves the state by less than this share of its size.
 SMALL_CORRECTION = 1e-7
