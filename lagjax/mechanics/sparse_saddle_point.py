@@ -55,7 +55,7 @@ BAND_AT_MOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class SparsePlan:
     """What is known of a system independently of values: blocks of M, colours of M and A, the band of S."""
 
     members: Int[np.ndarray, "blocks size"]
@@ -74,7 +74,7 @@ class Plan:
         return f"banded, half bandwidth {half_bandwidth}, {len(rows)} equations; {mass}"
 
 
-def plan(model: Model) -> Plan | None:
+def plan(model: Model) -> SparsePlan | None:
     """How to solve a system sparsely; None where the dense solve is as good. Only shapes and dtypes count."""
     if model.reacts or model.off is not None or model.n + model.m < UNKNOWNS_AT_LEAST:
         return None
@@ -85,7 +85,7 @@ def plan(model: Model) -> Plan | None:
 
 # The equations are traced at several places of one program.
 @once
-def _plan(structure, leaves: tuple) -> Plan | None:
+def _plan(structure, leaves: tuple) -> SparsePlan | None:
     model = jtu.tree_unflatten(structure, leaves)
     t, u = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
     given = [x if isinstance(x, jax.ShapeDtypeStruct) else None for x in leaves], t, u
@@ -120,7 +120,7 @@ def _plan(structure, leaves: tuple) -> Plan | None:
             return None
     where = np.flatnonzero(members.ravel() < u.size)
     place = where[np.argsort(members.ravel()[where])]
-    return Plan(members, place, *map(banded.colours, (coupled > 0, of_rows, of_rows.T)), band)
+    return SparsePlan(members, place, *map(banded.colours, (coupled > 0, of_rows, of_rows.T)), band)
 
 
 # The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
@@ -147,7 +147,7 @@ class Operators(NamedTuple):
 class Banded(NamedTuple):
     """The equations solved through S, by a plan. A state is given as (model, t, x, u)."""
 
-    plan: Plan
+    plan: SparsePlan
 
     def accelerations(self, model: Model, t: Array, x: Array, u: Array, baumgarte_rate: Array | None = None, kept=None):
         """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
@@ -234,7 +234,7 @@ class Banded(NamedTuple):
         return str(self.plan)
 
 
-def _undetermined(plan: Plan, operators: Operators, dtype: DTypeLike):
+def _undetermined(plan: SparsePlan, operators: Operators, dtype: DTypeLike):
     """Whether the constraints leave a massless direction free: what was added to M would decide there."""
     probe = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
     moved, _ = _eliminated(plan, operators, dtype)(operators.added * probe, jnp.zeros(operators.kept.size, dtype))
@@ -247,7 +247,7 @@ def _by_colours(push: Callable, coloured, y: Array):
     return jnp.sum(jnp.abs(jax.vmap(push)(jnp.where(seeds, y[None], 0.0))), axis=0)
 
 
-def _largest_inertia(plan: Plan, inertia: Callable, x: Array):
+def _largest_inertia(plan: SparsePlan, inertia: Callable, x: Array):
     return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
 
 
@@ -263,7 +263,7 @@ def _rows(model: Model, t: Array, x: Array, u: Array):
     return push, lambda multipliers: transposed(multipliers)[0], rate
 
 
-def _mass_inverse(plan: Plan, inertia: Callable, x: Array):
+def _mass_inverse(plan: SparsePlan, inertia: Callable, x: Array):
     """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for that."""
     n, size = x.size, plan.members.shape[1]
     products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
@@ -302,7 +302,7 @@ def _schur(plan, operators: Operators, dtype: DTypeLike):
     return of_kept, lambda r: invert(r[rows])[back]
 
 
-def _eliminated(plan: Plan, operators: Operators, dtype: DTypeLike) -> Callable:
+def _eliminated(plan: SparsePlan, operators: Operators, dtype: DTypeLike) -> Callable:
     """The function (F, gamma) -> (a, λ) that eliminates a, without refinement; it has no derivative by the state."""
     _, mass_inverse, _, push, pull, kept = operators
     _, invert = _schur(plan, operators, dtype)
@@ -315,7 +315,7 @@ def _eliminated(plan: Plan, operators: Operators, dtype: DTypeLike) -> Callable:
     return solve
 
 
-def _solve(plan: Plan, operators: Operators, forcing: Array, gamma: Array):
+def _solve(plan: SparsePlan, operators: Operators, forcing: Array, gamma: Array):
     """a and λ with the rows that are kept, refined; differentiated by the implicit function theorem."""
     inertia, mass_inverse, _, push, pull, kept = operators
 
@@ -339,7 +339,7 @@ def _solve(plan: Plan, operators: Operators, forcing: Array, gamma: Array):
     return a, -minus
 
 
-def _unconstrained(plan: Plan, inertia: Callable, forcing: Array):
+def _unconstrained(plan: SparsePlan, inertia: Callable, forcing: Array):
     """a without constraints, refined; a vanishing mass makes it infinite or NaN."""
 
     def refined(_, forcing: Array):
@@ -350,7 +350,7 @@ def _unconstrained(plan: Plan, inertia: Callable, forcing: Array):
     return lax.custom_linear_solve(inertia, forcing, refined, symmetric=True)
 
 
-def _gram(plan: Plan, push: Callable, pull: Callable, dtype: DTypeLike):
+def _gram(plan: SparsePlan, push: Callable, pull: Callable, dtype: DTypeLike):
     return banded.entries(lambda multipliers: push(pull(multipliers)), plan.band, dtype)
 
 

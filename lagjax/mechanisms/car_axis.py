@@ -25,7 +25,7 @@ from lagjax.mechanisms.mechanism import Mechanism
 from lagjax.system import Holonomic, System
 
 
-class Ends(NamedTuple):
+class AxleEnds(NamedTuple):
     """The two ends of the axle."""
 
     xl: Float[Array, ""] | float
@@ -73,18 +73,18 @@ MECHANISM = Mechanism(
     source="Bari test set for IVP solvers, problem 'caraxis'",
     system=system,
     params=PARAMS,
-    q0=Ends(0.0, 0.5, 1.0, 0.5),
-    v0=Ends(-0.5, 0.0, -0.5, 0.0),
+    q0=AxleEnds(0.0, 0.5, 1.0, 0.5),
+    v0=AxleEnds(-0.5, 0.0, -0.5, 0.0),
     end=3.0,
     freedom=2,
     reference=(
-        Ends(
+        AxleEnds(
             0.0493455784275402809122,
             0.496989460230171153861,
             1.04174252488542151681,
             0.373911027265361256927,
         ),
-        Ends(
+        AxleEnds(
             -0.0770583684040972357970,
             0.00744686658723778553466,
             0.0175568157537232222276,

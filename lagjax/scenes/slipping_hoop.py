@@ -70,7 +70,7 @@ def _in_phases(*motion, **options) -> HybridTrajectory:
     return traj
 
 
-class Friction(NamedTuple):
+class WithFriction(NamedTuple):
     """The angles at which the hoop slips and leaves; its speed and spin as it leaves, and where it lands."""
 
     slips: float
@@ -80,7 +80,7 @@ class Friction(NamedTuple):
     lands: float
 
 
-def exact(params: PyTree) -> Friction:
+def exact(params: PyTree) -> WithFriction:
     """From rest at the top; φ̇ by a quadrature of φ̈ = μ λ / (β m a), the rest in closed form."""
     mu, beta, g, a = (params[name] for name in ("mu", "beta", "g", "a"))
     l = params["R"] + a
@@ -105,7 +105,7 @@ def exact(params: PyTree) -> Friction:
     spin = np.sqrt(l * g * 2 * (1 - np.sin(at_slip)) / (1 + beta)) / a + gained
     down, fall = speed * np.cos(leaves), l * np.sin(leaves) + params["R"] - a
     flight = (-down + np.sqrt(down**2 + 2 * g * fall)) / g
-    return Friction(at_slip, leaves, speed, spin, l * np.cos(leaves) + speed * np.sin(leaves) * flight)
+    return WithFriction(at_slip, leaves, speed, spin, l * np.cos(leaves) + speed * np.sin(leaves) * flight)
 
 
 def _root(function, low, high) -> float:
@@ -113,12 +113,12 @@ def _root(function, low, high) -> float:
     return float(np.asarray(optimize.brentq(function, low, high, xtol=1e-15)))
 
 
-def seen(params: PyTree) -> Friction:
+def seen(params: PyTree) -> WithFriction:
     """The same as `exact`, but by integration with rtol 1e-11."""
     switches = roll_and_slip(params, np.array([0.0, 3.0]), rtol=1e-11, estimate_error=False).switches
     (slip, left, down), rate = switches.q["theta"][:3], switches.v["theta"][1]
     spin, l = switches.v["phi"][1], params["R"] + params["a"]
-    return Friction(*map(float, (slip, left, -l * rate, spin, switches.q["r"][2] * np.cos(down))))
+    return WithFriction(*map(float, (slip, left, -l * rate, spin, switches.q["r"][2] * np.cos(down))))
 
 
 def cases():
@@ -160,7 +160,7 @@ def picture():
     fig, axes = plots.figure(1, 2, size=(4.9, 3.8))
     lines, marks = np.geomspace(0.05, 20.0, 121), 2.0 ** np.arange(-4.0, 4.1, 0.5)
     curves, points = (
-        Friction(*map(np.array, zip(*(function(PARAMS | {"mu": mu}) for mu in many))))
+        WithFriction(*map(np.array, zip(*(function(PARAMS | {"mu": mu}) for mu in many))))
         for function, many in ((exact, lines), (seen, marks))
     )
     left, right = axes[0]
