@@ -71,6 +71,8 @@ def linear_map_primitive(
 
     def transposed(cotangents: Sequence, *operands, **params):
         points, directions = split(operands, count(params))
+        # A constant comes as a Python number that knows its dtype.
+        points = tuple(jnp.asarray(x) for x in points)
         wanted = tuple(ad.is_undefined_primal(x) for x in directions)
         like = [x.aval if w else x for x, w in zip(directions, wanted)]
         found = iter(transpose(points, like, wanted, cotangents, **params))

@@ -214,7 +214,7 @@ def _others(frame: OrbitFrame, z, guide):
     flow, nodes, period = frame.split(z)
     along, asked, value = frame.along, frame.asked, z[-1] * frame.unit
     parts = []
-    if flow.rows:
+    if flow.dimension < frame.scale.size:
         off = jax.vmap(flow.residual)(_times(frame, period), nodes)
         parts.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
@@ -300,7 +300,7 @@ def sizes_at(flow: Flow, t, z, period, scale):
     slope = jax.grad(lambda z: integral_at(flow, t, z))(z) * scale
     size = jnp.linalg.norm(slope)
     rows = jnp.zeros(0, z.dtype)
-    if flow.rows:
+    if flow.dimension < z.size:
         rows = jnp.linalg.norm(flow.normals(t, z, scale), axis=1)
 
     def positive(x: Array):

@@ -73,9 +73,10 @@ class Floquet(eqx.Module):
 
     - `multipliers` (k,): complex; first those that are 1 for a known reason, then by falling size. k is twice the
       number of coordinates minus the number of independent constraint equations (a holonomic one counts twice, because
-      it constrains the velocity too).
+      it constrains the velocity too); a state, or a massless coordinate of first order, counts once.
     - `trivial` (k,): whether a multiplier is 1 for a known reason; `reasons` (r,) says which of those in `words` apply.
     - `monodromy` (2n, 2n): M for displacements (q, v) in the order of their names, zero for those off the constraints.
+      What a displacement says of the velocities of states is ignored: they are determined.
     - `log_volume`: the logarithm of Liouville's product, ∮ tr P J dt; NaN for a motion with switches.
     - `error`: the estimated error of the entries of M, in units in which the state has size 1; from a second, less
       accurate run if nothing is traced, else from Liouville's formula, or of the size of the tolerance where that is

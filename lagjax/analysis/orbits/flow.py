@@ -8,8 +8,10 @@ and a frame of tangents, one in each column, is integrated along with z. Both to
 that step sizes suit the tangents too: at rest in a driven system only the tangents move.
 
 With constraints c(t, z) = 0 on positions and velocities the equations have reduced index, and the constraint manifold
-is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. The volume of a frame that
-spans it grows by Liouville's formula, with P the orthogonal projection onto the tangent space:
+is invariant; tangents that begin in its tangent space, C δ = 0 with C = ∂c/∂z, stay there. Coordinates of first order
+(states, and what has no mass) have velocities φ(t, q, v) that are determined: v_first - φ = 0 is among the equations c.
+So each of them adds one direction, not two. The volume of a frame that spans the tangent space grows by Liouville's
+formula, with P the orthogonal projection onto it:
 
     d/dt log volume = tr P J,        without constraints tr J
 
@@ -30,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate import Switches, solve_in_both_modes
 from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
-from lagjax.mechanics import equations_of
+from lagjax.mechanics import equations_of, resolved, with_first_order
 from lagjax.numerics import Dopri8, last_step, newton
 from lagjax.system import Model, constraints, coordinates
 
@@ -75,7 +77,10 @@ class Changes(NamedTuple):
 
 
 class Flow(eqx.Module):
-    """The motion of a system in vector form; `rows` are the indices of independent constraint equations."""
+    """The motion of a system in vector form; `rows` are the indices of independent constraint equations.
+
+    `model`: one that knows its coordinates of first order.
+    """
 
     model: Model
     rtol: Float[Array, ""]
@@ -87,6 +92,18 @@ class Flow(eqx.Module):
         """The number of coordinates."""
         return self.model.n
 
+    @property
+    def determined(self) -> np.ndarray:
+        """Which entries of z are velocities of coordinates of first order, (2n,) booleans."""
+        first = self.model.form.first_order
+        mask = np.zeros(self.size, bool) if first is None else first.mask(self.size)
+        return np.concatenate([np.zeros(self.size, bool), mask])
+
+    @property
+    def dimension(self) -> int:
+        """The dimension of the space of states: 2n without what constraints and determined velocities take away."""
+        return 2 * self.size - len(self.rows) - int(self.determined.sum())
+
     def state(self, z):
         """(q, v) in the user's structure."""
         return self.model.tree(z[: self.size]), self.model.tree(z[self.size :])
@@ -97,8 +114,10 @@ class Flow(eqx.Module):
 
     def rate(self, t, z):
         """f(t, z): the velocities and accelerations."""
-        a, _ = equations_of(self.model).accelerations(t, *self.state(z))
-        return jnp.concatenate([z[self.size :], self.model.vector(a)])
+        x, u = jnp.split(z, 2)
+        u = resolved(self.model, t, x, u)
+        a, _ = equations_of(self.model).accelerations(t, self.model.tree(x), self.model.tree(u))
+        return jnp.concatenate([u, self.model.vector(a)])
 
     def rates(self, times, nodes, passed: Passage, span) -> Float[Array, "2K 2n"]:
         """The rates at K nodes, and at the ends of the passages from there."""
@@ -106,32 +125,45 @@ class Flow(eqx.Module):
         return jax.vmap(self.rate)(*both)
 
     def residual(self, t, z):
-        """c(t, z): the independent constraint equations of positions and velocities."""
+        """c(t, z): the independent constraint equations of positions and velocities, and those of determined ones."""
+        off = (z - self._resolved(t, z))[np.flatnonzero(self.determined)]
+        return jnp.concatenate([self._constrained(t, z), off])
+
+    def _constrained(self, t, z):
         return _residual(self.model, t, z)[np.array(self.rows, int)]
+
+    def _resolved(self, t, z):
+        """z with the velocities that are determined."""
+        x, u = jnp.split(z, 2)
+        return jnp.concatenate([x, resolved(self.model, t, x, u)])
 
     def normals(self, t, z, scale):
         """C = ∂c/∂z, with z in units of `scale`."""
         return jax.jacfwd(lambda z: self.residual(t, z))(z) * scale[None]
 
     def onto_constraints(self, t, z, scale):
-        """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable."""
+        """The state near z that satisfies the constraints, nearest in units of `scale`; differentiable.
+
+        Velocities that are determined follow from the rest, whatever z says of them.
+        """
         if not self.rows:
-            return z
+            return self._resolved(t, z)
         fixed, fixed_t, fixed_scale = stop_gradient((self, t, scale))
 
         def step(at, r):
-            return fixed_scale * _shortest(fixed.normals(fixed_t, at, fixed_scale), r)
+            normals = jax.jacfwd(partial(fixed._constrained, fixed_t))(at) * fixed_scale[None]
+            return fixed_scale * _shortest(normals, r)
 
-        residual = partial(fixed.residual, fixed_t)
+        residual = partial(fixed._constrained, fixed_t)
         near = newton(residual, lambda z, r, i: step(z, r), lax.stop_gradient(z), ONTO_CONSTRAINTS)
-        return last_step(near, z, lambda z: step(near, self.residual(t, z)))
+        return self._resolved(t, last_step(near, z, lambda z: step(near, self._constrained(t, z))))
 
     def tangent_space(self, t, z, scale) -> Float[Array, "2n k"]:
         """An orthonormal basis of the tangent space, in units of `scale`."""
-        if not self.rows:
+        if self.dimension == z.size:
             return jnp.eye(z.size, dtype=z.dtype)
         normals = self.normals(t, z, scale)
-        basis = jnp.linalg.svd(lax.stop_gradient(normals))[2][len(self.rows) :].T
+        basis = jnp.linalg.svd(lax.stop_gradient(normals))[2][z.size - self.dimension :].T
         # This gives the derivative of the basis that rotates as little as possible.
         return basis - _shortest(normals, normals @ basis)
 
@@ -177,7 +209,8 @@ class Flow(eqx.Module):
 
 def flow_of(model: Model, rtol, rows=None, in_a_loop=True) -> Flow:
     """The flow of a system; `rows` come from `independent_rows_of`, by default all."""
-    return Flow(model, jnp.asarray(rtol, model.form.dtype), all_rows(model) if rows is None else rows, in_a_loop)
+    rtol, rows = jnp.asarray(rtol, model.form.dtype), all_rows(model) if rows is None else rows
+    return Flow(with_first_order(model), rtol, rows, in_a_loop)
 
 
 def scale_of(z, period):
@@ -250,7 +283,7 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
             return {"z": motion, "frame": jax.vmap(push, 1, 1)(y["frame"]), "growth": jnp.zeros_like(span)}
         jacobian = jax.vmap(push, 1, 1)(jnp.eye(z.size, dtype=z.dtype))
         growth = jnp.trace(jacobian)
-        if flow.rows:
+        if flow.dimension < z.size:
             normal = jnp.linalg.qr(flow.normals(t, y["z"] * scale, scale).T)[0]
             growth = growth - jnp.sum(normal * (jacobian @ normal))
         return {"z": motion, "frame": jacobian @ y["frame"], "growth": growth}

@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from lagjax.analysis.orbits.flow import all_rows, flow_of
+from lagjax.analysis.orbits.flow import flow_of
 from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_traced, numpy_of
@@ -152,7 +152,7 @@ def lyapunov_exponents(
     problem = problem_of(system, State(ts[0], q, v, params))
     s = problem.state
     model = model_of(problem.system, *s)
-    most = 2 * model.n - len(all_rows(model) if problem.rows is None else problem.rows)
+    most = flow_of(model, 1.0, problem.rows).dimension
     if not (isinstance(count, int) and 1 <= count <= most):
         raise ValueError(
             f"count must be between 1 and {most}, not {count!r}: the state space has {most} directions.\n"
@@ -194,7 +194,7 @@ def _followed(model: Model, s, ts, rtol, rows, count):
         passed = flow.passage(t, z, t1 - t, frame, scale, volume=count == basis.shape[1])
         z = flow.onto_constraints(t1, passed.z, scale)
         frame = passed.frame
-        if flow.rows:
+        if flow.dimension < z.size:
             basis_there = flow.tangent_space(t1, z, scale)
             frame = basis_there @ (basis_there.T @ frame)
         frame, growth = _orthonormal(frame)

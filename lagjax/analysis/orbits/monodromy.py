@@ -29,11 +29,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from lagjax.analysis.orbits.flow import TOLERANCE, Flow, all_rows, independent_rows_of, scale_of
+from lagjax.analysis.orbits.flow import TOLERANCE, Flow, flow_of, independent_rows_of, scale_of
 from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow
 from lagjax.jaxtools import WATCHED, compiled, is_eager, is_traced, numpy_of
 from lagjax.mechanics import are_angles, explain_failure, invariance
-from lagjax.system import State, System, check_system, coordinates, model_of, traced_system
+from lagjax.system import Model, State, System, check_system, coordinates, model_of, traced_system, with_rates
 
 # A direction shorter than this, relative to its possible length, is round-off.
 NO_DIRECTION = 1e-7
@@ -152,13 +152,13 @@ class OrbitProblem(NamedTuple):
 
 def problem_of(system: System, given: State) -> OrbitProblem:
     """Check a system at a state; unless JAX is tracing, dependent constraints are found and left out."""
-    check_system(system, *given[1:], states=False)
-    s = coordinates.prepared(*given)
+    check_system(system, *given[1:])
+    s = coordinates.prepared(*given._replace(v=with_rates(system, given.q, given.v)))
     system = traced_system(system, s)
     state = coordinates.state(*s)
     model = model_of(system, *state)
     rows = independent_rows_of(model, state)
-    check_freedom(model.n, len(all_rows(model) if rows is None else rows), rows is not None)
+    check_freedom(model, rows)
     known = invariance(model)
     conserves = not system.is_forced and system.is_holonomic
     reasons = Reasons(known.timeless, known.timeless and conserves, known.unseen, conserves)
@@ -173,15 +173,16 @@ def refuse_singular(problem: OrbitProblem):
         raise ValueError(words)
 
 
-def check_freedom(n: int, rows: int, known: bool) -> None:
-    """Raise if `rows` equations leave nothing to move; `known`: they are known to be independent."""
-    if rows < 2 * n:
+def check_freedom(model: Model, rows: tuple[int, ...] | None) -> None:
+    """Raise if constraints leave nothing to move; `rows`: those equations that are known to be independent."""
+    flow, known = flow_of(model, 1.0, rows), rows is not None
+    if flow.dimension > 0:
         return
     cause = "constraints that fix every coordinate" if known else "constraints that depend on each other"
     fix = "leave one out" + ("" if known else ", or call this outside of jit and vmap, where dependent ones are found")
     raise ValueError(
-        f"there are {2 * n} coordinates and velocities, and {rows} equations restrict them: nothing is left to "
-        f"move.\nUsual cause: {cause}.\nFix: {fix}."
+        f"there are {2 * model.n} coordinates and velocities, and {len(flow.rows)} equations restrict them: nothing is "
+        f"left to move.\nUsual cause: {cause}.\nFix: {fix}."
     )
 
 
@@ -250,10 +251,18 @@ def _followed(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop
     if passed.returns is not None:
         ended = ended & jnp.all(passed.returns)
     multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
-    matrix = scale[:, None] * (bases[0] @ whole @ bases[0].T) / scale[None]
+    matrix = scale[:, None] * (bases[0] @ whole @ _coordinates(flow, bases[0])) / scale[None]
     multipliers = jnp.where(ended, multipliers, jnp.nan)
     apart = _apart(flow, reasons, is_angle, passed.z[-1] - first, scale)
     return Period(multipliers, trivial, there, whole, matrix, jnp.sum(passed.growth), apart, ended)
+
+
+def _coordinates(flow: Flow | SwitchingFlow, basis):
+    """The matrix that takes a displacement to its tangent coordinates, whatever it says of determined velocities."""
+    if not flow.determined.any():
+        return basis.T
+    free = jnp.where(flow.determined[:, None], 0.0, basis)
+    return jnp.linalg.solve(free.T @ free, free.T)
 
 
 def _without(rows, matrix):

@@ -21,7 +21,7 @@ from lagjax.analysis.orbits.switching_problem import any_problem_of, refuse_unfo
 from lagjax.integrate import RESULTS, Report, reported
 from lagjax.jaxtools import hashable_partition, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import listed
-from lagjax.system import Hybrid, State, System, coordinates
+from lagjax.system import Held, Hybrid, State, System, coordinates
 
 # A driven system may change from one period to the next by this fraction of what it does in one.
 SAME = 1e-5
@@ -57,9 +57,11 @@ def periodic_orbit(
 
     **Main arguments:**
 
-    - `system`, `params`: a `System`, with or without constraints and elements, or a `Hybrid`, and its parameters.
+    - `system`, `params`: a `System`, with or without constraints, first-order states and elements, or a `Hybrid`, and
+      its parameters.
     - `start`: (q, v), a state near the orbit; `[q]`, `[q]/[t]`. With constraints it is replaced by the nearest state
-      that satisfies them. Where the motion has switches (impacts, sticking), a state between two of them.
+      that satisfies them; v may leave out states, whose rates are determined. Where the motion has switches (impacts,
+      sticking), a state between two of them.
     - `period`: the approximate period, `[t]`. If the system depends on time, the period is kept, and must be a multiple
       of that of the drive; otherwise it is found with the orbit. Where there are switches it is not searched for among
       several returns.
@@ -74,6 +76,7 @@ def periodic_orbit(
     - `turns`: the whole turns that angles make in a period, by name. By default those of the guess, rounded. (A
       coordinate is an angle if it appears only in sines and cosines.) Where there are switches, by default none.
     - `relative`: coordinates that need not come back, for relative periodic orbits; the system must not depend on them.
+      So do states that only sum up what the motion does, such as a running cost.
     - `parts`: into how many parts the period is divided, with unknown states at all their ends (multiple shooting); for
       orbits so unstable that a guess does not come near its start again.
     - `rtol`: the tolerance of the steps; 1e-12 by default in float64, 1e-5 in float32. `most`: the largest number of
@@ -87,6 +90,7 @@ def periodic_orbit(
 
     - `TypeError`, `ValueError` for a state of the wrong shape or dtype, for unknown names, for quantities that cannot
       be held, and where a driven system is not the same after `period`.
+    - `ValueError` for a state that has no periodic value, since nothing depends on it, and is not in `relative`.
     - `ValueError`, `RuntimeError` where the motion of the guess ends early, as `lj.integrate` raises them.
     - Warns (`lj.OrbitWarning`) where the search did not converge; under `jit` and `vmap` check `converged`.
 
@@ -148,6 +152,7 @@ def _asked(problem, names, hold, relative) -> OrbitRequest:
             f"'{depended_on[0]}' is named in relative, but the system depends on it: its value changes the motion.\n"
             "Fix: leave it out; whole turns of an angle are counted anyway."
         )
+    _refuse_quadratures(problem, wanted)
     mask = tuple(name in wanted for name in names)
     if driven:
         if hold is not None and hold != "period" and tuple(hold) not in ((), ("period",)):
@@ -173,6 +178,21 @@ def _asked(problem, names, hold, relative) -> OrbitRequest:
         )
     held = tuple(all_names.index(name) for name in entries)
     return OrbitRequest("period" not in hold, True, "energy" in hold, held, mask, problem.is_angle)
+
+
+def _refuse_quadratures(problem, relative: set[str]):
+    """Raise where a state only sums up what the motion does, and is not said to be relative."""
+    q, system = problem.state.q, user_system(problem)
+    names, free = (coordinates.like(q, np.array(x)) for x in (coordinates.names(q), problem.reasons.ignorable))
+    states = {name for phase in system.phases for name, rate in phase.states.items() if not isinstance(rate, Held)}
+    for state in sorted(states):
+        sums = [str(name) for name in np.ravel(names[state])[np.ravel(free[state])] if name not in relative]
+        if sums:
+            raise ValueError(
+                f"state '{sums[0]}' has no periodic value: nothing depends on it, so it only sums up its rate.\n"
+                "Usual cause: a running cost, or another quadrature, beside a motion that comes back without it.\n"
+                f"Fix: relative=\"{sums[0]}\"; then orbit.shift['{state}'] is how much a period adds."
+            )
 
 
 def _velocity(name: str):

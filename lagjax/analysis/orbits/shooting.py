@@ -234,7 +234,7 @@ def _searched(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, 
     flow, t = any_flow(system, s, rtol, rows), s.t
     guess = guessed(flow, t, flow.vector(s.q, s.v), period, asked, parts, turns)
     goal = Goal(integral_at(flow, t, guess.z), guess.z)
-    zero, size = jnp.zeros((), t.dtype), 2 * flow.size - len(flow.rows)
+    zero, size = jnp.zeros((), t.dtype), flow.dimension
     rows_of = parts * 2 * flow.size + asked.moves + asked.energy + len(asked.held)
     matrix, bases = jnp.zeros((rows_of, parts * size + 1), t.dtype), jnp.zeros((parts, 2 * flow.size, size), t.dtype)
     returns = zero > 0 if system.in_phases else None

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -47,14 +48,19 @@ class SwitchingFlow(eqx.Module):
         return self.start.rtol
 
     @property
-    def rows(self) -> tuple[int, ...]:
-        """The indices of independent constraint equations at the start."""
-        return self.start.rows
-
-    @property
     def size(self) -> int:
         """The number of coordinates."""
         return self.start.size
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Which entries of z are velocities of coordinates of first order."""
+        return self.start.determined
+
+    @property
+    def dimension(self) -> int:
+        """The dimension of the space of states in the first phase."""
+        return self.start.dimension
 
     def vector(self, q, v):
         """The vector z of (q, v)."""

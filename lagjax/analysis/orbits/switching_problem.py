@@ -10,35 +10,33 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.orbits.flow import all_rows, independent_rows_of
+from lagjax.analysis.orbits.flow import independent_rows_of
 from lagjax.analysis.orbits.monodromy import OrbitProblem, Reasons, check_freedom, problem_of, refuse_singular
 from lagjax.integrate import InElements, integrate, phases_in, traced_phases
 from lagjax.jaxtools import depends, is_traced
 from lagjax.mechanics import invariance
-from lagjax.system import Hybrid, State, System, check_system, coordinates, model_of, replace_fields
+from lagjax.system import Hybrid, State, System, check_system, coordinates, model_of, replace_fields, with_rates
 
 
 def any_problem_of(system: System | Hybrid, given: State, phase: str | int | None = None) -> OrbitProblem:
     """Check a system, in phases or not, at a state; `phase`: that in which a hybrid starts."""
-    check_system(system, *given[1:], states=False, phases=True, elements=True)
+    check_system(system, *given[1:], phases=True, elements=True)
     system = system.starting(phase, "phase")
     if not system.in_phases and system.elements is None:
         return problem_of(system, given)
-    for each in system.phases:
-        check_system(each, states=False, elements=True)
     if isinstance(system, Hybrid) and is_traced(system.first):
         raise ValueError(
             "the phase in which an orbit starts must be known while JAX is tracing, since it decides what may move.\n"
             'Fix: phase="flying", or a Python number; a loop over phases in place of vmap.'
         )
-    s = coordinates.prepared(*given)
+    s = coordinates.prepared(*given._replace(v=with_rates(system, given.q, given.v)))
     hybrid: Hybrid = traced_phases(system, s)
     # As a Python number it is known where JAX is tracing.
     hybrid = replace_fields(hybrid, first=int(hybrid.first))
     state = coordinates.state(*s)
     first = model_of(hybrid.first_phase, *state)
     rows = independent_rows_of(first, state)
-    check_freedom(first.n, len(all_rows(first) if rows is None else rows), rows is not None)
+    check_freedom(first, rows)
     timeless, unseen = _invariance(hybrid, state)
     # Forces and impacts do work, so that nothing is conserved; and no coordinate is known to be an angle for guards.
     return OrbitProblem(hybrid, s, Reasons(timeless, False, unseen, False), rows, (False,) * first.n)
