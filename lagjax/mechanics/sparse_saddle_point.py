@@ -3,8 +3,8 @@
     M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
 
 M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
-equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and Aᵀ are
-functions, derivatives of the user's, and S is found from its products with a few coloured vectors. Which entries can
+equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and S are
+found from their products with a few coloured vectors, M and A as derivatives of the user's functions. Which entries can
 be nonzero is read off the jaxpr (see below) and holds at every state.
 
 One step of iterative refinement on the whole system follows. It restores the digits that S, being a square, loses, and
@@ -28,7 +28,7 @@ Nothing here depends on values, so a plan holds at every state.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,10 +36,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.jaxtools import once, pattern
+from lagjax.jaxtools import length, once, pattern
 from lagjax.mechanics.lagrangian import forcing_and_inertia
 from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, slightly_off, vanishing
 from lagjax.numerics import banded, dense
@@ -56,13 +55,12 @@ BAND_AT_MOST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SparsePlan:
-    """What is known of a system independently of values: blocks of M, colours of M and A, the band of S."""
+    """What is known of a system independently of values: blocks of M, entries of M and A, the band of S."""
 
     members: Int[np.ndarray, "blocks size"]
     place: Int[np.ndarray, " n"]
-    of_mass: banded.Colours
-    of_rows: banded.Colours
-    of_columns: banded.Colours
+    of_mass: banded.Sparse
+    of_rows: banded.Sparse
     band: banded.Band | None
 
     def __str__(self):
@@ -120,9 +118,13 @@ def _plan(structure, leaves: tuple) -> SparsePlan | None:
             return None
     where = np.flatnonzero(members.ravel() < u.size)
     place = where[np.argsort(members.ravel()[where])]
-    return SparsePlan(members, place, *map(banded.colours, (coupled > 0, of_rows, of_rows.T)), band)
+    return SparsePlan(members, place, banded.sparse(coupled > 0), banded.sparse(of_rows), band)
 
 
+# A program multiplies with M and A some twenty times. By a function of up to this many operations that is faster (a
+# chain of 256 particles: 36 microseconds, 69 by entries); a longer one would make programs too long (an arm of four
+# jointed bodies: 92,000 operations, 26,000 by entries) and is slower (twelve particles, 20 sines in a link: 82 and 28).
+SHORT = 60
 # The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
 # A vanishing mass counts as this share of the largest: small enough for one refinement to correct.
@@ -134,14 +136,50 @@ NULL_SHIFT, NULL_POWER, NULL_ROUNDS = {np.dtype("float64"): 1e-9, np.dtype("floa
 
 
 class Operators(NamedTuple):
-    """The products with M, M⁻¹, A and Aᵀ at one state, what was added to M for M⁻¹, and which equations count."""
+    """The equations at one state: F, the products with M, M⁻¹, A and Aᵀ, and -gamma.
 
+    `of_mass`, `of_rows`: M and A by the colours of their columns. `added`: what was added to M for M⁻¹. Without
+    constraints what belongs to A is None.
+    """
+
+    forcing: Float[Array, " n"]
+    of_mass: Float[Array, "colours n"]
     inertia: Callable
     mass_inverse: Callable
     added: Float[Array, " n"]
-    push: Callable
-    pull: Callable
-    kept: Bool[Array, " m"]
+    of_rows: Any = None
+    push: Any = None
+    pull: Any = None
+    rate: Any = None
+
+
+def operators_at(plan: SparsePlan, model: Model, t: Array, x: Array, u: Array) -> Operators:
+    """The equations at one state."""
+    forcing, inertia = forcing_and_inertia(model, t, x, u)
+    of_mass = banded.compressed(inertia, plan.of_mass.colours, x.dtype)
+    inertia, _ = _multiplications(inertia, of_mass, plan.of_mass)
+    of_inertia = Operators(forcing, of_mass, inertia, *_mass_inverse(plan, of_mass))
+    if plan.band is None:
+        return of_inertia
+    push = _push(model, t, x, u)
+    of_rows = banded.compressed(push, plan.of_rows.colours, x.dtype)
+    push, pull = _multiplications(push, of_rows, plan.of_rows)
+    _, rate = jax.jvp(lambda t, x: constraints.velocity_residual(model, t, x, u), (t, x), (jnp.ones_like(t), u))
+    return of_inertia._replace(of_rows=of_rows, push=push, pull=pull, rate=rate)
+
+
+def _push(model: Model, t: Array, x: Array, u: Array) -> Callable:
+    """The product with A."""
+    return jax.linearize(lambda u: constraints.velocity_residual(model, t, x, u), u)[1]
+
+
+def _multiplications(push: Callable, products: Array, where: banded.Sparse) -> tuple[Callable, Callable]:
+    """The products with a matrix and with its transpose: by the function `push` if it is short, else by its entries."""
+    like = jax.ShapeDtypeStruct((len(where.in_column),), products.dtype)
+    if length(jax.make_jaxpr(push)(like).jaxpr) > SHORT:
+        return banded.multiplications(products, where)
+    transposed = jax.linear_transpose(push, like)
+    return push, lambda multipliers: transposed(multipliers)[0]
 
 
 class Banded(NamedTuple):
@@ -151,77 +189,68 @@ class Banded(NamedTuple):
 
     def accelerations(self, model: Model, t: Array, x: Array, u: Array, baumgarte_rate: Array | None = None, kept=None):
         """The accelerations and the stacked multipliers, as vectors; `kept` (m,) says which equations to solve with."""
-        plan = self.plan
-        forcing, inertia = forcing_and_inertia(model, t, x, u)
-        if plan.band is None:
-            return _unconstrained(plan, inertia, forcing), jnp.zeros(0, x.dtype)
-        push, pull, rate = _rows(model, t, x, u)
-        gamma = -rate
+        operators = operators_at(self.plan, model, t, x, u)
+        if self.plan.band is None:
+            return _unconstrained(operators), jnp.zeros(0, x.dtype)
+        gamma = -operators.rate
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
-        kept = _independent(plan, push, pull, x.dtype) if kept is None else kept
-        operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-        a, multipliers = _solve(plan, operators, forcing, gamma)
-        shortest = partial(_shortest, plan, push, pull)
+        return self._solved(operators, _independent(self.plan, operators) if kept is None else kept, gamma)
+
+    def _solved(self, operators: Operators, kept: Array, gamma: Array):
+        a, multipliers = _solve(self.plan, operators, kept, gamma)
+        shortest = partial(_shortest, self.plan, operators)
         return a, lax.cond(jnp.all(kept), lambda x: x, shortest, multipliers)
 
     def independent(
         self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
     ) -> Bool[Array, " m"]:
         """Which constraint equations to solve with; see `numerics.banded.independent`."""
-        push, pull, _ = _rows(model, t, x, u)
-        return _independent(self.plan, push, pull, x.dtype, dependent_below)
+        return _independent(self.plan, operators_at(self.plan, model, t, x, u), dependent_below)
 
     def displacement(self, model: Model, t: Array, x: Array, u: Array) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
-        plan = self.plan
-        _, inertia = forcing_and_inertia(model, t, x, u)
-        push, pull, _ = _rows(model, t, x, u)
-        kept = _independent(plan, push, pull, x.dtype)
-        operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-        schur, invert = _schur(plan, operators, x.dtype)
+        operators = operators_at(self.plan, model, t, x, u)
+        kept = _independent(self.plan, operators)
+        schur, invert = _schur(self.plan, operators, kept)
 
         def of_residuals(which: np.ndarray, r: Array):
             r = jnp.where(kept, jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r), 0.0)
             multipliers = lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)
-            return operators.mass_inverse(pull(multipliers))
+            return operators.mass_inverse(operators.pull(multipliers))
 
         return of_residuals
 
-    def row_sizes(self, model: Model, t: Array, x: Array, u: Array, norm=jnp.sum) -> Float[Array, " m"]:
-        """`Σ_j |A_ij|` of each constraint equation, or another norm: columns of one colour share no row."""
+    def row_sizes(self, model: Model, t: Array, x: Array, u: Array) -> Float[Array, " m"]:
+        """`Σ_j |A_ij|` of each constraint equation: columns of one colour share no row."""
         if self.plan.band is None:
             return jnp.zeros(0, x.dtype)
-        push, _, _ = _rows(model, t, x, u)
-        return norm(jnp.abs(banded.compressed(push, self.plan.of_rows, x.dtype)), axis=0)
+        return jnp.sum(jnp.abs(banded.compressed(_push(model, t, x, u), self.plan.of_rows.colours, x.dtype)), axis=0)
 
     def verdict(self, model: Model, t: Array, x: Array, u: Array) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
-        plan, state = self.plan, (model, t, x, u)
-        a, multipliers = self.accelerations(*state)
-        forcing, inertia = forcing_and_inertia(*state)
-        known = [forcing, model.lagrangian(t, x, u)]
+        plan, operators = self.plan, operators_at(self.plan, model, t, x, u)
+        known = [operators.forcing, model.lagrangian(t, x, u)]
         singular, contradictory = jnp.zeros((), bool), jnp.zeros((), bool)
-        if plan.band is not None:
-            push, pull, rate = _rows(*state)
+        mass = jnp.max(jnp.abs(operators.of_mass), axis=0)
+        if plan.band is None:
+            a, multipliers = _unconstrained(operators), jnp.zeros(0, x.dtype)
+        else:
+            rate, sizes = operators.rate, jnp.abs(operators.of_rows)
             known.append(rate)
-            kept = _independent(plan, push, pull, x.dtype)
-
-            def at(x: Array, u: Array) -> Array:
-                return self.row_sizes(model, t, x, u, jnp.max)
-
-            vanishes = vanishing(at(x, u), at(*map(slightly_off, (x, u))))
-            operators = Operators(inertia, *_mass_inverse(plan, inertia, x), push, pull, kept)
-            singular = jnp.any(vanishes) | _undetermined(plan, operators, x.dtype)
-            # |A| |a| and |A|ᵀ |λ|, colour by colour.
-            terms = _by_colours(push, plan.of_rows, a) + jnp.abs(rate)
-            forces = jnp.abs(forcing) + _by_colours(pull, plan.of_columns, multipliers)
-            round_off = acceleration_round_off(_largest_inertia(plan, inertia, x), forces, x, u)
-            tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + self.row_sizes(*state) * round_off
-            contradictory = jnp.any(~kept & (jnp.abs(push(a) + rate) > tolerance))
+            kept = _independent(plan, operators)
+            a, multipliers = self._solved(operators, kept, -rate)
+            nearby = _push(model, t, *map(slightly_off, (x, u)))
+            nearby = jnp.abs(banded.compressed(nearby, plan.of_rows.colours, x.dtype))
+            vanishes = vanishing(jnp.max(sizes, axis=0), jnp.max(nearby, axis=0))
+            singular = jnp.any(vanishes) | _undetermined(plan, operators, kept)
+            push, pull = banded.multiplications(sizes, plan.of_rows)
+            terms, forces = push(jnp.abs(a)) + jnp.abs(rate), jnp.abs(operators.forcing) + pull(jnp.abs(multipliers))
+            round_off = acceleration_round_off(mass, forces, x, u)
+            tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + jnp.sum(sizes, axis=0) * round_off
+            contradictory = jnp.any(~kept & (jnp.abs(operators.push(a) + rate) > tolerance))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
         solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
-        mass = _largest_inertia(plan, inertia, x)
         return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory, mass)
 
     def solution_or_nan(self, *state):
@@ -234,49 +263,28 @@ class Banded(NamedTuple):
         return str(self.plan)
 
 
-def _undetermined(plan: SparsePlan, operators: Operators, dtype: DTypeLike):
+def _undetermined(plan: SparsePlan, operators: Operators, kept: Array):
     """Whether the constraints leave a massless direction free: what was added to M would decide there."""
-    probe = jnp.cos(jnp.arange(operators.added.size, dtype=dtype))
-    moved, _ = _eliminated(plan, operators, dtype)(operators.added * probe, jnp.zeros(operators.kept.size, dtype))
+    added = operators.added
+    probe = jnp.cos(jnp.arange(added.size, dtype=added.dtype))
+    moved, _ = _eliminated(plan, operators, kept)(added * probe, jnp.zeros_like(operators.rate))
     return jnp.max(jnp.abs(moved)) > CORRECTION_AT_MOST**0.5
 
 
-def _by_colours(push: Callable, coloured, y: Array):
-    """The product of the absolute values of y and of the matrix that `push` multiplies with."""
-    seeds = np.arange(coloured.count)[:, None] == coloured.of_column[None, :]
-    return jnp.sum(jnp.abs(jax.vmap(push)(jnp.where(seeds, y[None], 0.0))), axis=0)
-
-
-def _largest_inertia(plan: SparsePlan, inertia: Callable, x: Array):
-    return jnp.max(jnp.abs(banded.compressed(inertia, plan.of_mass, x.dtype)), axis=0)
-
-
-def _rows(model: Model, t: Array, x: Array, u: Array):
-    """The products with A and Aᵀ, and d/dt of the velocity residual at constant velocity: -gamma."""
-
-    def residual(t: Array, x: Array, u: Array):
-        return constraints.velocity_residual(model, t, x, u)
-
-    _, rate = jax.jvp(lambda t, x: residual(t, x, u), (t, x), (jnp.ones_like(t), u))
-    _, push = jax.linearize(lambda u: residual(t, x, u), u)
-    transposed = jax.linear_transpose(push, u)
-    return push, lambda multipliers: transposed(multipliers)[0], rate
-
-
-def _mass_inverse(plan: SparsePlan, inertia: Callable, x: Array):
+def _mass_inverse(plan: SparsePlan, of_mass: Array):
     """The product with M⁻¹, block by block, without derivatives; and what was added to the diagonal for that."""
-    n, size = x.size, plan.members.shape[1]
-    products = lax.stop_gradient(banded.compressed(inertia, plan.of_mass, x.dtype))
-    least = VANISHING_MASS[np.dtype(x.dtype)] * jnp.max(jnp.abs(products))
+    n, size = of_mass.shape[1], plan.members.shape[1]
+    products = lax.stop_gradient(of_mass)
+    least = VANISHING_MASS[np.dtype(of_mass.dtype)] * jnp.max(jnp.abs(products))
     if size == 1:
         added = jnp.where(products[0] == 0, least, 0.0)
         return lambda f: f / (products[0] + added), added
     i, j, inside = plan.members[:, :, None], plan.members[:, None, :], plan.members < n
     both = inside[:, :, None] & inside[:, None, :]
-    entries = products[np.append(plan.of_mass.of_column, 0)[j], np.minimum(i, n - 1)]
-    blocks = jnp.where(both, entries, jnp.eye(size, dtype=x.dtype)[None])
+    entries = products[np.append(plan.of_mass.colours.of_column, 0)[j], np.minimum(i, n - 1)]
+    blocks = jnp.where(both, entries, jnp.eye(size, dtype=of_mass.dtype)[None])
     added = jnp.where(jnp.all(blocks == 0, axis=2), least, 0.0)
-    inverted = jax.vmap(dense.inverse)(blocks + added[:, :, None] * jnp.eye(size, dtype=x.dtype)[None])
+    inverted = jax.vmap(dense.inverse)(blocks + added[:, :, None] * jnp.eye(size, dtype=of_mass.dtype)[None])
 
     def apply(f):
         parts = jnp.append(f, 0.0)[plan.members]
@@ -285,16 +293,15 @@ def _mass_inverse(plan: SparsePlan, inertia: Callable, x: Array):
     return apply, added.reshape(-1)[plan.place]
 
 
-def _schur(plan, operators: Operators, dtype: DTypeLike):
+def _schur(plan, operators: Operators, kept: Array):
     """The products with S and with its inverse; rows that are not kept are those of the unit matrix."""
-    _, mass_inverse, _, push, pull, kept = operators
     rows = plan.band.order.rows
     back = np.argsort(rows)
 
     def product(multipliers: Array) -> Array:
-        return push(mass_inverse(pull(multipliers)))
+        return operators.push(operators.mass_inverse(operators.pull(multipliers)))
 
-    invert = banded.solver(banded.keep(banded.entries(product, plan.band, dtype), kept[rows]))
+    invert = banded.solver(banded.keep(banded.entries(product, plan.band, operators.rate.dtype), kept[rows]))
 
     def of_kept(multipliers: Array):
         return jnp.where(kept, product(jnp.where(kept, multipliers, 0.0)), multipliers)
@@ -302,22 +309,22 @@ def _schur(plan, operators: Operators, dtype: DTypeLike):
     return of_kept, lambda r: invert(r[rows])[back]
 
 
-def _eliminated(plan: SparsePlan, operators: Operators, dtype: DTypeLike) -> Callable:
+def _eliminated(plan: SparsePlan, operators: Operators, kept: Array) -> Callable:
     """The function (F, gamma) -> (a, λ) that eliminates a, without refinement; it has no derivative by the state."""
-    _, mass_inverse, _, push, pull, kept = operators
-    _, invert = _schur(plan, operators, dtype)
+    mass_inverse = operators.mass_inverse
+    _, invert = _schur(plan, operators, kept)
 
     def solve(forcing: Array, gamma: Array):
         free = mass_inverse(forcing)
-        multipliers = invert(jnp.where(kept, gamma - push(free), 0.0))
-        return free + mass_inverse(pull(multipliers)), multipliers
+        multipliers = invert(jnp.where(kept, gamma - operators.push(free), 0.0))
+        return free + mass_inverse(operators.pull(multipliers)), multipliers
 
     return solve
 
 
-def _solve(plan: SparsePlan, operators: Operators, forcing: Array, gamma: Array):
+def _solve(plan: SparsePlan, operators: Operators, kept: Array, gamma: Array):
     """a and λ with the rows that are kept, refined; differentiated by the implicit function theorem."""
-    inertia, mass_inverse, _, push, pull, kept = operators
+    inertia, mass_inverse, push, pull = operators.inertia, operators.mass_inverse, operators.push, operators.pull
 
     def product(unknown):
         a, minus = jnp.split(unknown, [n])
@@ -325,7 +332,7 @@ def _solve(plan: SparsePlan, operators: Operators, forcing: Array, gamma: Array)
 
     def refined(_, known):
         forcing, gamma = jnp.split(known, [n])
-        solve = _eliminated(plan, operators, forcing.dtype)
+        solve = _eliminated(plan, operators, kept)
         a, multipliers = solve(forcing, gamma)
         by_constraints = pull(multipliers)
         da, more = solve(forcing + by_constraints - inertia(a), gamma - push(a))
@@ -334,44 +341,49 @@ def _solve(plan: SparsePlan, operators: Operators, forcing: Array, gamma: Array)
         return jnp.where(converged, jnp.concatenate([a + da, -(multipliers + more)]), jnp.nan)
 
     # One vector of unknowns: with two, JAX 0.10 fails in a second derivative that leaves one of them unchanged.
-    known, n = jnp.concatenate([forcing, jnp.where(kept, gamma, 0.0)]), forcing.size
+    n = operators.forcing.size
+    known = jnp.concatenate([operators.forcing, jnp.where(kept, gamma, 0.0)])
     a, minus = jnp.split(lax.custom_linear_solve(product, known, refined, symmetric=True), [n])
     return a, -minus
 
 
-def _unconstrained(plan: SparsePlan, inertia: Callable, forcing: Array):
+def _unconstrained(operators: Operators):
     """a without constraints, refined; a vanishing mass makes it infinite or NaN."""
+    inertia, mass_inverse = operators.inertia, operators.mass_inverse
 
     def refined(_, forcing: Array):
-        mass_inverse, added = _mass_inverse(plan, inertia, forcing)
-        a = jnp.where(added == 0, mass_inverse(forcing), jnp.nan)
+        a = jnp.where(operators.added == 0, mass_inverse(forcing), jnp.nan)
         return a + mass_inverse(forcing - inertia(a))
 
-    return lax.custom_linear_solve(inertia, forcing, refined, symmetric=True)
+    return lax.custom_linear_solve(inertia, operators.forcing, refined, symmetric=True)
 
 
-def _gram(plan: SparsePlan, push: Callable, pull: Callable, dtype: DTypeLike):
-    return banded.entries(lambda multipliers: push(pull(multipliers)), plan.band, dtype)
+def _gram(plan: SparsePlan, operators: Operators):
+    dtype = operators.rate.dtype
+    return banded.entries(lambda multipliers: operators.push(operators.pull(multipliers)), plan.band, dtype)
 
 
-def _independent(plan, push: Callable, pull: Callable, dtype: DTypeLike, dependent_below: float | None = None):
+def _independent(plan, operators: Operators, dependent_below: float | None = None):
     rows = plan.band.order.rows
-    least = DEPENDENT_BELOW[np.dtype(dtype)]
+    least = DEPENDENT_BELOW[np.dtype(operators.rate.dtype)]
     least = least if dependent_below is None else max(least, dependent_below)
-    return banded.independent(_gram(plan, push, pull, dtype), least)[np.argsort(rows)]
+    return banded.independent(_gram(plan, operators), least)[np.argsort(rows)]
 
 
-def _shortest(plan, push: Callable, pull: Callable, multipliers: Array):
+def _shortest(plan, operators: Operators, multipliers: Array):
     """The shortest multipliers that exert the force of these: their part outside the null space of Aᵀ."""
     rows = plan.band.order.rows
     back, dtype = np.argsort(rows), multipliers.dtype
-    gram = lax.stop_gradient(_gram(plan, push, pull, dtype))
+    gram = lax.stop_gradient(_gram(plan, operators))
     shift = NULL_SHIFT[np.dtype(dtype)] * jnp.max(gram[:, 0])
     invert = banded.solver(gram.at[:, 0].add(shift))
 
     def smaller(x: Array, _):
         return lax.custom_linear_solve(
-            lambda y: push(pull(y)) + shift * y, shift * x, lambda _, r: invert(r[rows])[back], symmetric=True
+            lambda y: operators.push(operators.pull(y)) + shift * y,
+            shift * x,
+            lambda _, r: invert(r[rows])[back],
+            symmetric=True,
         ), None
 
     def outside(x: Array, _):

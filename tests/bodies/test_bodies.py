@@ -238,3 +238,29 @@ def test_a_torsion_spring():
         np.testing.assert_allclose(closer.potential(0.0, q, v, params), 2.0 * (angle - 0.3) ** 2, rtol=1e-14)
         np.testing.assert_allclose(closer.dissipation(0.0, q, v, params), 0.25 * 9.0, rtol=1e-14)
     assert lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0).dissipation is None
+
+
+@pytest.mark.exhaustive
+def test_an_arm_in_space():
+    """Five jointed bodies in maximal coordinates, 35 numbers and 30 equations: the accelerations of their tree."""
+    links = [lj.Body(f"link {i}", 1.0 + 0.1 * i, (0.1, 0.11, 0.05)) for i in range(5)]
+    axes = [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)] * 3
+    places = [lj.ground.at(axis=axes[0])] + [link.at((0.0, 0.0, 0.5), axis) for link, axis in zip(links, axes[1:])]
+    hinges = {
+        f"hinge {i}": lj.revolute(place, link.at((0.0, 0.0, -0.5), axis))
+        for i, (place, link, axis) in enumerate(zip(places, links, axes))
+    }
+    weight = [lj.weight(links)]
+    tree = lj.Tree(links, hinges)
+    q = {name: jnp.asarray(0.3 + 0.1 * i) for i, name in enumerate(hinges)}
+    v = {name: jnp.asarray(0.2 - 0.1 * i) for i, name in enumerate(hinges)}
+    in_angles, _ = lj.accelerations(tree.system(weight), 0.0, q, v, None)
+
+    def rates(q, v):
+        return jax.jvp(tree.poses, (q,), (v,))[1]
+
+    expected = jax.jvp(rates, (q, v), (v, in_angles))[1]
+    a, _ = lj.accelerations(lj.multibody(links, hinges, weight), 0.0, tree.poses(q), tree.rates(q, v), None)
+    for link in links:
+        np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-12)
+        np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-12)

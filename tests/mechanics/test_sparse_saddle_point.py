@@ -7,6 +7,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 import lagjax as lj
+from lagjax.jaxtools import length
 from lagjax.mechanics import sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing
@@ -53,6 +54,20 @@ def with_masses(masses):
     return system, q, v, params | {"m": jnp.asarray(masses)}
 
 
+def wavy_links(t, q, params):
+    """The links of a chain whose lengths change with the place, by a function of many operations."""
+    waves = sum(1e-3 / k * jnp.sin(k * q[1:, 0]) for k in range(1, 21))
+    return jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1 + waves
+
+
+def wavy(count):
+    """A free chain of such links."""
+    place = jnp.arange(float(count))
+    q, v = jnp.stack([0.8 * place, 0.6 * place], axis=1), jnp.stack([jnp.sin(place), jnp.zeros(count)], axis=1)
+    system = lj.System(particles, {"links": lj.Holonomic(wavy_links)})
+    return system, q, v, {"m": jnp.linspace(1.0, 2.0, count), "g": 9.81}
+
+
 def largest(x):
     """The largest entry."""
     return np.max(np.abs(x))
@@ -63,13 +78,20 @@ CASES = {
     "loop": lambda: loop(12),
     "net": lambda: net(4, 3),
     "bars": lambda: bars(8),
+    "long links": lambda: wavy(12),
     "mass ratio 1e6": lambda: with_masses(np.where(np.arange(12) % 2, 1.0, 1e-6)),
     "massless between others": lambda: with_masses(np.where(np.arange(12) % 3 == 1, 0.0, 1.0)),
 }
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.exhaustive] * (x in ("net", "bars"))) for x in CASES]
+    "name",
+    [
+        pytest.param(
+            x, marks=[pytest.mark.exhaustive] * (x in ("net", "bars")) + [pytest.mark.slow] * (x == "long links")
+        )
+        for x in CASES
+    ],
 )
 def test_same_as_dense(name):
     """Accelerations and multipliers of chain, loop, net and jointed bars are those of the dense equations."""
@@ -255,3 +277,22 @@ def test_gradient_of_a_motion():
     forward, reverse = jax.jit(jax.jacfwd(end))(9.81), jax.jit(jax.grad(end))(9.81)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     np.testing.assert_allclose(forward, (end(9.82) - end(9.80)) / 0.02, rtol=1e-5)
+
+
+def test_long_constraints_are_derived_once(monkeypatch):
+    """A and M are numbers where their functions are long: less than half of a program that calls these."""
+    system, *state = wavy(12)
+    t, q, v, params = coordinates.state(0.0, *state)
+    model = model_of(system, t, q, v, params)
+    plan = sparse_saddle_point.plan(model)
+    assert plan is not None
+
+    def operations():
+        def program(*state):
+            return sparse_saddle_point.Banded(plan).verdict(model, *state)[:2]
+
+        return length(jax.make_jaxpr(program)(t, *model.vectors(q, v)).jaxpr)
+
+    few = operations()
+    monkeypatch.setattr(sparse_saddle_point, "SHORT", 10**9)
+    assert 2 * few < operations()

@@ -105,6 +105,65 @@ def compressed(push: Callable, coloured: Colours, dtype: DTypeLike) -> Float[Arr
     return jax.vmap(push)(jnp.asarray(seeds, dtype))
 
 
+class Sparse(NamedTuple):
+    """Where a matrix may have entries: its columns' colours, the columns of each row, the rows of each column.
+
+    Rows and columns with fewer entries than others are filled up with the number of all columns, or rows.
+    """
+
+    colours: Colours
+    in_row: Int[np.ndarray, "m k"]
+    in_column: Int[np.ndarray, "n l"]
+
+
+def sparse(pattern: Bool[np.ndarray, "m n"]) -> Sparse:
+    """Choose colours for a pattern.
+
+    >>> import numpy as np
+    >>> print(sparse(np.array([[1, 1, 0], [0, 0, 1]], bool)).in_row)
+    [[0 1]
+     [2 3]]
+    """
+    return Sparse(colours(pattern), _listed(pattern), _listed(pattern.T))
+
+
+def _listed(pattern: Bool[np.ndarray, "m n"]) -> Int[np.ndarray, "m k"]:
+    m, n = pattern.shape
+    found = [np.flatnonzero(row) for row in pattern]
+    listed = np.full((m, max(map(len, found), default=0)), n)
+    for row, columns in zip(listed, found):
+        row[: len(columns)] = columns
+    return listed
+
+
+def multiplications(
+    products: Float[Array, "colours m"], where: Sparse
+) -> tuple[Callable[[Float[Array, " n"]], Float[Array, " m"]], Callable[[Float[Array, " m"]], Float[Array, " n"]]]:
+    """Multiplication with a matrix, given by its `compressed` products, and with its transpose.
+
+    A program that multiplies many times then contains the function that the matrix was known as once.
+
+    >>> import jax.numpy as jnp
+    >>> import numpy as np
+    >>> where = sparse(np.array([[1, 1, 0], [0, 0, 1]], bool))
+    >>> push, pull = multiplications(jnp.array([[2.0, 3.0], [5.0, 0.0]]), where)
+    >>> print(push(jnp.array([1.0, 10.0, 100.0])), pull(jnp.array([1.0, 10.0])))
+    [ 52. 300.] [ 2.  5. 30.]
+    """
+    m, n = len(where.in_row), len(where.in_column)
+    colour = np.append(where.colours.of_column, 0)
+    of_rows = jnp.where(where.in_row < n, products[colour[where.in_row], np.arange(m)[:, None]], 0.0)
+    of_columns = jnp.where(where.in_column < m, products[colour[:n, None], np.minimum(where.in_column, m - 1)], 0.0)
+
+    def push(y: Array) -> Array:
+        return jnp.sum(of_rows * jnp.append(y, 0.0)[where.in_row], axis=1)
+
+    def pull(multipliers: Array) -> Array:
+        return jnp.sum(of_columns * jnp.append(multipliers, 0.0)[where.in_column], axis=1)
+
+    return push, pull
+
+
 def blocks(pattern: Bool[np.ndarray, "n n"]) -> list[list[int]]:
     """The sets of rows that a pattern couples, directly or through others.
 
