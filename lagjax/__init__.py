@@ -155,6 +155,7 @@ if TYPE_CHECKING:
         mesh,
         motor,
         multibody,
+        planar,
         prismatic,
         revolute,
         rod,
@@ -211,7 +212,7 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
         "Body Load Marker Pose Tree applied box cylinder cylindrical disk fixed ground line mesh motor multibody "
-        "prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
+        "planar prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.models": "RobotModel read_mjcf read_urdf",
@@ -260,6 +261,7 @@ __all__ = [
     "revolute",
     "universal",
     "cylindrical",
+    "planar",
     "prismatic",
     "fixed",
     "rolling",

@@ -6,6 +6,7 @@ from lagjax.bodies.joints import (
     cylindrical,
     fixed,
     named,
+    planar,
     prismatic,
     revolute,
     rolling,
@@ -13,7 +14,7 @@ from lagjax.bodies.joints import (
     spherical,
     universal,
 )
-from lagjax.bodies.loads import Load, applied, generalized_force, motor, spring, torsion, weight
+from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
 from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
@@ -36,6 +37,7 @@ __all__ = [
     "mesh",
     "motor",
     "multibody",
+    "planar",
     "prismatic",
     "revolute",
     "rod",

@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Iterable, Mapping
 
-import jax
-
 from lagjax.bodies.body import Body, check_bodies
 from lagjax.bodies.joints import named
-from lagjax.bodies.loads import Load, check_loads, generalized_force
+from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.shapes import usual_shapes
 from lagjax.display import Drawing
 from lagjax.system import Holonomic, Nonholonomic, System
@@ -58,32 +56,17 @@ def multibody(
     if twice or units.keys() & joints.keys():
         name = sorted(twice or units.keys() & joints.keys())[0]
         raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")
-    force, dissipation = others.pop("force", None), others.pop("dissipation", None)
+    beside = Acting(others.pop("force", None), others.pop("dissipation", None))
+    acting = beside.with_loads(loads, lambda q, v, params: (q, v))
 
     def total(t, q, v, params):
         kinetic = sum(body.kinetic(q, v, params) for body in bodies)
         potential = sum(load.potential(t, q, v, params) for load in loads if load.potential is not None)
         return kinetic - potential + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
 
-    def friction(t, q, v, params):
-        lost = sum(load.dissipation(t, q, v, params) for load in loads if load.dissipation is not None)
-        return lost + (0.0 if dissipation is None else dissipation(t, q, v, params))
-
-    def driven(t, q, v, params):
-        given = generalized_force(loads, t, q, v, params)
-        return given if force is None else jax.tree.map(lambda x, y: x + y, given, force(t, q, v, params))
-
     looks_like = [*(joint.function for joint in joints.values()), *(load.potential for load in loads)]
     setattr(total, "drawing", Drawing(lambda params: usual_shapes(bodies, looks_like, params)))
-    has_dissipation = any(load.dissipation is not None for load in loads)
-    has_power = any(load.power is not None for load in loads)
-    return System(
-        total,
-        units | joints,
-        force=driven if has_power else force,
-        dissipation=friction if has_dissipation else dissipation,
-        **others,
-    )
+    return System(total, units | joints, force=acting.force, dissipation=acting.dissipation, **others)
 
 
 def _check_joints(joints: Mapping | None):

@@ -77,6 +77,8 @@ class Body:
     principal moments, if the body's axes are the principal ones, or the symmetric (3, 3) matrix. Both may be functions
     of params.
 
+    Where all of them are zero it is a frame, as between two joints of a `lj.Tree`.
+
     **Raises:** `ValueError` for a mass or an inertia that no body has: each principal moment is at most the sum of the
     two others.
 
@@ -92,8 +94,12 @@ class Body:
             given = np.asarray(self.inertia, float)
             object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
             _check_inertia(self.name, given)
-        if not callable(self.mass) and not self.mass > 0:
-            raise ValueError(f"the mass of '{self.name}' must be positive, and is {self.mass}.")
+        massless = not callable(self.inertia) and not np.any(self.inertia)
+        if not callable(self.mass) and not (self.mass > 0 or massless and self.mass == 0):
+            raise ValueError(
+                f"the mass of '{self.name}' must be positive, and is {self.mass}.\n"
+                "Fix: its mass; of a frame in a lj.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)."
+            )
 
     @property
     def unit(self) -> Holonomic:

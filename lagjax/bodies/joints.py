@@ -9,6 +9,7 @@ A joint joins two markers, a and b: its rows are what must vanish, said for a pl
 | `tilt` | 2 | the axes are parallel |
 | `cross` | 1 | the axes are at right angles |
 | `turn` | 3 | the frames are parallel |
+| `above` | 1 | the point of b lies in the plane at right angles to the axis of a |
 
 The multiplier of a point's row is a force along an axis of space (`aside`: of a), of a row of axes a torque.
 """
@@ -110,6 +111,23 @@ def prismatic(a: Marker, b: Marker) -> Holonomic:
     return _joined(a, b, aside, turn)
 
 
+def planar(a: Marker, b: Marker) -> Holonomic:
+    """Hold a point in the plane at right angles to an axis, and the axes together: a plate on a table, three equations.
+
+    >>> import lagjax as lj
+    >>> plate = lj.Body("plate", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"plate": lj.Pose.at((0.2, 0.5, 0.1), angle=1.0)}
+    >>> joint = planar(lj.ground.at(), plate.at())
+    >>> print(joint.g(0.0, q, None))
+    [0.1 0.  0. ]
+
+    **Returns:** a constraint with the rows of its sentence, in this order.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
+    """
+    return _joined(a, b, above, tilt)
+
+
 def fixed(a: Marker, b: Marker) -> Holonomic:
     """Make two bodies one, their markers' points and frames alike: six equations.
 
@@ -206,6 +224,11 @@ def apart(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "3"]:
 def aside(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "2"]:
     """The parts of that way at right angles to the axis of a."""
     return a.axes(q)[:2] @ apart(a, b, q, params)
+
+
+def above(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "1"]:
+    """The part of that way along the axis of a."""
+    return jnp.dot(a.axis(q), apart(a, b, q, params))[None]
 
 
 def tilt(a: Marker, b: Marker, q: PyTree, params: PyTree) -> Float[Array, "2"]:

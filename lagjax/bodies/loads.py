@@ -174,10 +174,37 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     return Load(power=power)
 
 
-def generalized_force(loads: Iterable[Load], t, q: PyTree, v: PyTree, params: PyTree) -> PyTree:
-    """The generalized force of loads' powers."""
-    powers = [load.power for load in loads if load.power is not None]
-    return jax.grad(lambda w: sum(power(t, q, w, v, params) for power in powers))(v)
+class Acting(NamedTuple):
+    """What acts beside L: a generalized force and Rayleigh's function, each None where there is none.
+
+    >>> Acting(None, None).force is None
+    True
+    """
+
+    force: Callable | None
+    dissipation: Callable | None
+
+    def with_loads(self, loads: Iterable[Load], placed: Callable) -> "Acting":
+        """The same with the powers and dissipations of loads, which read q and v as `placed(q, v, params)` has them."""
+        powers = [load.power for load in loads if load.power is not None]
+        losses = [load.dissipation for load in loads if load.dissipation is not None]
+
+        def driven(t, q, v, params):
+            at, moving = placed(q, v, params)
+
+            def power(w):
+                rates = placed(q, w, params)[1]
+                return sum(of_load(t, at, rates, moving, params) for of_load in powers)
+
+            given = jax.grad(power)(v)
+            return given if self.force is None else jax.tree.map(jnp.add, given, self.force(t, q, v, params))
+
+        def friction(t, q, v, params):
+            at, moving = placed(q, v, params)
+            lost = sum(of_load(t, at, moving, params) for of_load in losses)
+            return jnp.asarray(lost if self.dissipation is None else lost + self.dissipation(t, q, v, params))
+
+        return Acting(driven if powers else self.force, friction if losses else self.dissipation)
 
 
 def check_loads(whose: str, loads: Iterable[Load]) -> tuple[Load, ...]:

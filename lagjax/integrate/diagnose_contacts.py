@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from lagjax.integrate.arguments import REFUSED
 from lagjax.integrate.trajectory.results import RESULTS, is_among, message
-from lagjax.mechanics import consistent_state, describe, listed
+from lagjax.mechanics import consistent_state, describe, explain_failure, listed
 from lagjax.system import Holonomic, State, System, constraints, coordinates, model_of
 
 # A gap is fixed by constraints if at most this part of its slope is independent of theirs.
@@ -71,6 +72,10 @@ def of_elements(trajectory, start: State) -> Exception:
             "Usual cause: Painlevé's paradox, friction that pushes a contact together harder than it is pushed apart.\n"
             "Fix: a smaller friction, or a contact with a spring and a damper in place of a rigid one."
         )
+    if is_among(result, REFUSED):
+        state = coordinates.as_arrays(s, s.t.dtype)
+        if reason := explain_failure(model_of(replace(user, elements=None), *state), state):
+            return ValueError(reason)
     return RuntimeError(f"at {when}: {message(result)}")
 
 

@@ -5,8 +5,10 @@ constraint equations. With them
 
     a = a₀ + M⁻¹ Aᵀ λ,    S λ = gamma - A a₀,    S = A M⁻¹ Aᵀ
 
-and nothing of size n × n is formed. That f solves the equations of L is checked where a motion starts and at each call
-from Python, there and at other velocities, along a few directions w: w·(M a - F) takes derivatives of L forward alone.
+and nothing of size n × n is formed. A force that depends on the multipliers, B λ, is solved with as elsewhere, by the
+accelerations M⁻¹ B that it causes (`multiplier_forces.py`). That f solves the equations of L is checked where a motion
+starts and at each call from Python, there and at other velocities, along a few directions w: w·(M a - F) takes
+derivatives of L forward alone.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, §6.1 (forward dynamics), §8.4 (constraint forces by M⁻¹).
 """
@@ -22,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.mechanics.first_order import is_determined, resolved
 from lagjax.mechanics.lagrangian import applied_force
+from lagjax.mechanics.multiplier_forces import Reactions, response, with_reactions
 from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, chosen, minimum_norm
 from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense
 from lagjax.system import Model, constraints
@@ -33,13 +36,28 @@ DIRECTIONS, BLOCK = 3, 64
 
 
 class Solver(NamedTuple):
-    """The equations at one state: a₀ without multipliers, A, gamma, M⁻¹ Aᵀ as rows, and S with its independent rows."""
+    """The equations at one state: a₀ without multipliers, A, gamma, M⁻¹ Aᵀ as rows, and S with its independent rows.
+
+    `reactions`: M⁻¹ B of a force that depends on multipliers, None where it does not.
+    """
 
     free: Float[Array, " n"]
     rows: constraints.ConstraintRows
     responses: Float[Array, "m n"]
     schur: Float[Array, "m m"]
     independent: Bool[Array, " m"]
+    reactions: Float[Array, "n m"] | None
+
+    def solved(self, gamma: Float[Array, " m"]) -> Reactions:
+        """a and λ with A a = gamma, and whether there are no others."""
+
+        def held(a: Array, gamma: Array) -> tuple[Array, Array]:
+            wanted = jnp.where(self.independent, gamma - self.rows.jacobian @ a, 0.0)
+            multipliers = dense.solve(self.schur, wanted)
+            a = a + multipliers @ self.responses
+            return a, minimum_norm(self.rows.jacobian, multipliers, self.independent)
+
+        return with_reactions(held, self.free, gamma, self.reactions)
 
 
 class ForwardDynamics(NamedTuple):
@@ -63,10 +81,7 @@ class ForwardDynamics(NamedTuple):
         gamma = solver.rows.gamma
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
-        wanted = jnp.where(solver.independent, gamma - solver.rows.jacobian @ solver.free, 0.0)
-        multipliers = dense.solve(solver.schur, wanted)
-        a = solver.free + multipliers @ solver.responses
-        return a, minimum_norm(solver.rows.jacobian, multipliers, solver.independent)
+        return solver.solved(gamma)[:2]
 
     def independent(
         self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
@@ -96,8 +111,8 @@ class ForwardDynamics(NamedTuple):
             solver = _solver(*state, None)
             scale = 1 / jnp.sqrt(jnp.abs(jnp.diagonal(solver.schur)))
             conditioned = dense.reciprocal_condition(scale[:, None] * solver.schur * scale[None, :])
-            singular |= conditioned <= SINGULAR_BELOW[np.dtype(x.dtype)]
             jacobian, gamma = solver.rows
+            singular |= (conditioned <= SINGULAR_BELOW[np.dtype(x.dtype)]) | ~solver.solved(gamma).unique
             terms = jnp.abs(jacobian) @ jnp.abs(a) + jnp.abs(gamma)
             forces = jnp.abs(mass * a) + jnp.abs(multipliers) @ jnp.abs(jacobian)
             round_off = self.row_sizes(*state) * acceleration_round_off(mass, forces, x, u)
@@ -179,4 +194,6 @@ def _solver(model: Model, t: Array, x: Array, u: Array, independent: Array | Non
     independent = chosen(model, rows.jacobian) if independent is None else independent
     both = independent[:, None] & independent[None, :]
     schur = jnp.where(both, responses @ rows.jacobian.T, jnp.eye(model.m, dtype=x.dtype))
-    return Solver(free, rows, responses, schur, independent)
+    loads = response(model, t, x, resolved(model, t, x, u))
+    reactions = None if loads is None else jax.vmap(push, in_axes=1, out_axes=1)(loads)
+    return Solver(free, rows, responses, schur, independent, reactions)

@@ -1,8 +1,4 @@
-"""Joint positions: from them to the poses of links, and back from two markers to the positions of what joins them.
-
-    e_child = e_parent E e(s),      p_child = p_parent + R(e_parent) o + R(e_parent E) d(s)
-
-(o, E) is the joint's placement; e(s) turns and d(s) slides by its position s:
+"""Joint positions, counted from the file's drawing, and the way back to them from the markers that joints join.
 
     revolute     an angle about the axis
     prismatic    a length along the axis
@@ -12,19 +8,17 @@
 The position of a floating joint is the `lj.Pose` of its body in space, as in q.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, PyTree
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix
-from lagjax.models.parts import RobotJoint, unmoved
-from lagjax.system import Holonomic
+from lagjax.models.parts import RobotJoint
 
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 # Axes that are meant to be parallel, at right angles, or to meet.
@@ -47,72 +41,6 @@ def frame_of(axis: np.ndarray) -> np.ndarray:
 def quaternion_of(axes: np.ndarray) -> np.ndarray:
     """The unit quaternion of a rotation matrix."""
     return Rotation.from_matrix(axes).as_quat(scalar_first=True)
-
-
-class Chains(NamedTuple):
-    """The joints as arrays, parents first: the places of parents among the links before (0: the ground), placements as
-    quaternions and origins, axes, and the centres of mass of links."""
-
-    parent: np.ndarray
-    turn: np.ndarray
-    origin: np.ndarray
-    axis: np.ndarray
-    centre: np.ndarray
-
-    @classmethod
-    def of(cls, joints: Sequence[RobotJoint], centres: Mapping[str, np.ndarray]) -> "Chains":
-        """The arrays of joints; the pose of a floating one is in space."""
-        place = {None: 0} | {joint.child: i + 1 for i, joint in enumerate(joints)}
-        held = [
-            joint if joint.kind != "floating" else joint._replace(parent=None, placement=unmoved()) for joint in joints
-        ]
-        rows = [(place[x.parent], quaternion_of(x.placement.axes), x.placement.origin, x.axis, centres[x.child])
-                for x in held]  # fmt: skip
-        return cls(*map(np.array, zip(*rows)))
-
-
-def poses(joints: Sequence[RobotJoint], chains: Chains, s: Mapping[str, PyTree]) -> Pose:
-    """The poses of all links, stacked, by the positions of joints. One loop, so that it compiles as fast for many."""
-    turned, slid = _motions(joints, chains, s)
-    # What came before: the ground, then the links.
-    start = jnp.zeros((len(joints) + 1, 7), turned.dtype).at[:, 3].set(1.0)
-
-    def place(frames, x):
-        i, parent, turn, origin, turned, slid = x
-        position, quaternion = frames[parent, :3], frames[parent, 3:]
-        of_joint = product(quaternion, turn)
-        position = position + rotation_matrix(quaternion) @ origin + rotation_matrix(of_joint) @ slid
-        return frames.at[i].set(jnp.concatenate([position, product(of_joint, turned)])), None
-
-    fixed = [jnp.asarray(x, turned.dtype) for x in (chains.turn, chains.origin)]
-    frames, _ = lax.scan(place, start, (np.arange(1, len(joints) + 1), chains.parent, *fixed, turned, slid))
-    position, quaternion = frames[1:, :3], frames[1:, 3:]
-    return Pose(position + jax.vmap(_turned)(quaternion, jnp.asarray(chains.centre, turned.dtype)), quaternion)
-
-
-def _turned(e: Float[Array, "4"], r: Float[Array, "3"]) -> Float[Array, "3"]:
-    return rotation_matrix(e) @ r
-
-
-def _motions(joints: Sequence[RobotJoint], chains: Chains, s: Mapping[str, PyTree]) -> tuple[Array, Array]:
-    """The quaternions (n, 4) by which joints turn, and the vectors (n, 3) by which they slide, in their frames."""
-    zero = jnp.zeros_like(jax.tree.leaves(dict(s))[0].ravel()[0])
-    angles = {"revolute": lambda x: x, "planar": lambda x: x[2]}
-    half = jnp.stack([angles[x.kind](s[x.name]) if x.kind in angles else zero for x in joints]) / 2
-    length = jnp.stack([s[x.name] if x.kind == "prismatic" else zero for x in joints])
-    axis = jnp.asarray(chains.axis, half.dtype)
-    turned = jnp.concatenate([jnp.cos(half)[:, None], jnp.sin(half)[:, None] * axis], axis=1)
-    slid = length[:, None] * axis
-    for i, x in enumerate(joints):
-        if x.kind == "planar":
-            slid = slid.at[i].set(s[x.name][:2] @ jnp.asarray(frame_of(x.axis)[:2], half.dtype))
-        elif x.kind == "spherical":
-            turned = turned.at[i].set(s[x.name])
-        elif x.kind == "floating":
-            position, quaternion = s[x.name]
-            turned = turned.at[i].set(quaternion)
-            slid = slid.at[i].set(position - _turned(quaternion, jnp.asarray(chains.centre[i], half.dtype)))
-    return turned, slid
 
 
 class BodyJoint(NamedTuple):
@@ -177,14 +105,8 @@ def _marker(body: Body | Ground, point: np.ndarray, rows: np.ndarray) -> Marker:
     return Marker(body, tuple(point.tolist()), tuple(map(tuple, rows.tolist())))
 
 
-def in_a_plane(a: Marker, b: Marker) -> Holonomic:
-    """Hold a point in the plane at right angles to a's axis, and the axes parallel: three equations."""
-
-    def plane(t, q, params):
-        apart = b.position(q, params) - a.position(q, params)
-        return jnp.append(a.axes(q)[:2] @ b.axis(q), jnp.dot(a.axis(q), apart))
-
-    return Holonomic(plane)
+def _turned(e: Float[Array, "4"], r: Float[Array, "3"]) -> Float[Array, "3"]:
+    return rotation_matrix(e) @ r
 
 
 class Seen(NamedTuple):

@@ -12,17 +12,17 @@ from jaxtyping import Array, PyTree
 
 from lagjax.bodies import (
     Body,
+    Ground,
     Load,
     Marker,
     Pose,
     Tree,
     cylindrical,
     fixed,
-    generalized_force,
     ground,
     line,
     multibody,
-    named,
+    planar,
     prismatic,
     revolute,
     spherical,
@@ -33,21 +33,20 @@ from lagjax.bodies import (
 from lagjax.display import Drawing, Shape
 from lagjax.models.joint_positions import (
     BodyJoint,
-    Chains,
     all_positions,
     connected,
     drawn,
-    in_a_plane,
-    poses,
     rate_squared,
 )
 from lagjax.models.looks import looks_of
-from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink
-from lagjax.system import Holonomic, Nonholonomic, System
+from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink, unmoved
+from lagjax.system import Holonomic, System
 
-EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": in_a_plane,
+EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
              "universal": universal, "cylindrical": cylindrical, "fixed": fixed}  # fmt: skip
 
+# The axis of joints that have none.
+UPWARD = (0.0, 0.0, 1.0)
 # How many of a kind `print` lists.
 LISTED = 6
 
@@ -175,22 +174,15 @@ class RobotModel:
     def joint_system(self, loads: Iterable[Load] = (), closures: Mapping | None = None, **others) -> System:
         """Return the system in joint coordinates: q and v are positions and rates of joints by name.
 
-        Where all joints turn, slide, are spherical or floating, it is that of a `lj.Tree`, solved at O(n). With rotors,
-        planar joints or moving links without mass, L is composed of the poses, its mass matrix is a dense one, and its
-        quaternions have constraints. Springs of joints count whole turns.
+        It is that of `tree()`, solved at O(n). Springs of joints count whole turns.
 
         `loads` are those of `lj.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and the
         position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
         `states` and `elements` of `lj.System`, in joint coordinates.
         """
-        for name in self.links:
-            if not self._mass_from(name):
-                raise self._massless([joint for joint in self.joints.values() if joint.child == name])
-        loads, closing = tuple(loads), self._loops() | dict(closures or {})
-        rotors = [joint for joint in self.joints.values() if joint.armature]
         springs = [joint for joint in self.joints.values() if joint.stiffness]
         dampers = [joint for joint in self.joints.values() if joint.damping]
-        force, dissipation = others.pop("force", None), others.pop("dissipation", None)
+        dissipation = others.pop("dissipation", None)
 
         def of_springs(t, q, params):
             return sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
@@ -199,62 +191,39 @@ class RobotModel:
             own = sum(x.damping * _squared(x, q, v) / 2 for x in dampers)
             return own if dissipation is None else own + dissipation(t, q, v, params)
 
-        dissipation_in_joints = of_dampers if dampers else dissipation
-        if not rotors and self._is_a_tree:
-            system = self.tree().system(
-                [weight(self.bodies.values(), self.gravity), *loads],
-                closing,
-                of_springs if springs else None,
-                force=force,
-                dissipation=dissipation_in_joints,
-                **others,
-            )
-            setattr(system.lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
-            return system
-        losses = [load.dissipation for load in loads if load.dissipation is not None]
-        potentials = [load.potential for load in loads if load.potential is not None]
-
-        def lagrangian(t, q, v, params):
-            poses, rates = jax.jvp(self._stacked, (q,), (v,))
-            of_rotors = sum(x.armature * _squared(x, q, v) / 2 for x in rotors)
-            by_name = q | self._named(poses), v | self._named(rates)
-            of_loads = sum(potential(t, *by_name, params) for potential in potentials)
-            return self._energies(poses, rates) + of_rotors - of_springs(t, q, params) - of_loads
-
-        def friction(t, q, v, params):
-            of_loads = sum(loss(t, *self._with_poses(q, v), params) for loss in losses)
-            return of_loads if dissipation_in_joints is None else of_loads + dissipation_in_joints(t, q, v, params)
-
-        def driven(t, q, v, params):
-            of_loads = generalized_force(loads, t, *self._moving(q, v), params)
-            given = jax.vjp(self._poses, q)[1](of_loads)[0]
-            return given if force is None else jax.tree.map(jnp.add, given, force(t, q, v, params))
-
-        setattr(lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
-        turning = [x for x in self.joints.values() if x.kind in ("spherical", "floating")]
-        return System(
-            lagrangian,
-            {f"{x.name} is turned": _unit(x) for x in turning}
-            | {name: self._through_joints(x) for name, x in named(closing).items()},
-            force=driven if any(load.power is not None for load in loads) else force,
-            dissipation=friction if losses else dissipation_in_joints,
+        system = self.tree().system(
+            [weight(self.bodies.values(), self.gravity), *loads],
+            self._loops() | dict(closures or {}),
+            of_springs if springs else None,
+            dissipation=of_dampers if dampers else dissipation,
             **others,
         )
+        setattr(system.lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
+        return system
 
     def tree(self) -> Tree:
-        """Return the `lj.Tree` of its bodies: its poses, and systems at O(n); without what acts, and without loops.
+        """Return the `lj.Tree` of its links, with the rotors of joints; without what else acts, and without loops.
 
-        **Raises:** `TypeError` for planar joints; `ValueError` for a link without mass that moves, by its line.
+        **Raises:** `ValueError` for a link without mass that moves and carries none, by its line.
         """
-        equations = {x.joints[0].name: EQUATIONS[x.kind](x.a, x.b)
-                     for x in self._between.values() if x.kind != "floating"}  # fmt: skip
-        return Tree(list(self.bodies.values()), equations)
+        return self._tree
 
-    @property
-    def _is_a_tree(self) -> bool:
-        """Whether `lj.Tree` has coordinates for it."""
-        kinds = {joint.kind for joint in self.joints.values()}
-        return len(self.bodies) == len(self.links) and "planar" not in kinds
+    @cached_property
+    def _tree(self) -> Tree:
+        for name in self.links:
+            if not self._mass_from(name):
+                raise self._massless([joint for joint in self.joints.values() if joint.child == name])
+        frames = {name: Body(name, 0.0, (0.0, 0.0, 0.0)) for name in self.links if name not in self.bodies}
+        bodies = {name: frames.get(name) or self.bodies[name] for name in self.links}
+
+        def end(head: str | None, frame: Placement, joint: RobotJoint) -> Marker:
+            body, centre = (ground, np.zeros(3)) if head is None else (bodies[head], self.links[head].centre)
+            return _marker(body, centre, frame, joint.axis if joint.axis.any() else UPWARD)
+
+        equations = {x.name: EQUATIONS[x.kind](end(x.parent, x.placement, x), end(x.child, unmoved(), x))
+                     for x in self.joints.values() if x.kind != "floating"}  # fmt: skip
+        armature = {x.name: x.armature for x in self.joints.values() if x.armature}
+        return Tree(list(bodies.values()), equations, armature)
 
     def _drawn_poses(self, q: PyTree, params: PyTree) -> dict[str, Pose]:
         return self._poses(q)
@@ -263,30 +232,11 @@ class RobotModel:
         """How it is drawn: bodies, and at each joint a dot with arms to the bodies' centres."""
         found = list(looks_of(self.shapes, self.bodies.values()))
         for joint in self.joints.values():
-            for head, frame in ((joint.parent, joint.placement), self.frames[joint.child]):
+            for head, frame in ((joint.parent, joint.placement), (joint.child, unmoved())):
                 if head is None or head in self.bodies:
-                    marker = self._marker(head, frame, joint.axis)
+                    marker = self._marker(head, frame, UPWARD)
                     found += [line(marker)] if head is None else [line(marker), line(marker.body, marker)]
         return tuple(found)
-
-    def _energies(self, poses: Pose, rates: Pose) -> Array:
-        """Kinetic energy minus that in the field of weight, of all bodies at once."""
-        dtype = poses.position.dtype
-        mass = jnp.array([body.mass for body in self.bodies.values()], dtype)
-        inertia = jnp.array([body.inertia for body in self.bodies.values()], dtype)
-        one = Body("one", lambda params: params[0], lambda params: params[1])
-
-        def kinetic(pose: Pose, rate: Pose, mass: Array, inertia: Array) -> Array:
-            return one.kinetic({"one": pose}, {"one": rate}, (mass, inertia))
-
-        moving = jax.vmap(kinetic)(poses, rates, mass, inertia)
-        return jnp.sum(moving) + mass @ poses.position @ jnp.array(self.gravity, dtype)
-
-    def _through_joints(self, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
-        """A constraint of poses as one of joint coordinates."""
-        if isinstance(constraint, Holonomic):
-            return Holonomic(lambda t, q, params: constraint.g(t, q | self._poses(q), params))
-        return Nonholonomic(lambda t, q, v, params: constraint.phi(t, *self._with_poses(q, v), params))
 
     def _loops(self) -> dict[str, Holonomic]:
         ends = [[self._marker(head, frame, (0.0, 0.0, 1.0)) for head, frame in loop.places] for loop in self.loops]
@@ -308,30 +258,12 @@ class RobotModel:
     def _of(self, joint: RobotJoint) -> BodyJoint:
         return next(x for x in self._between.values() if joint in x.joints)
 
-    def _stacked(self, s: Mapping) -> Pose:
-        """The poses of all bodies as arrays."""
-        found = poses(tuple(self.joints.values()), self._chains, s)
-        place = {joint.child: i for i, joint in enumerate(self.joints.values())}
-        places = np.array([place[name] for name in self.bodies])
-        return jax.tree.map(lambda x: x[places], found)
-
-    def _named(self, stacked: Pose) -> dict[str, Pose]:
-        return {name: Pose(stacked.position[i], stacked.quaternion[i]) for i, name in enumerate(self.bodies)}
-
     def _poses(self, s: Mapping) -> dict[str, Pose]:
-        return self._named(self._stacked(s))
-
-    @cached_property
-    def _chains(self) -> Chains:
-        return Chains.of(tuple(self.joints.values()), {name: link.centre for name, link in self.links.items()})
+        poses = self._tree.poses(s)
+        return {name: poses[name] for name in self.bodies}
 
     def _moving(self, s: Mapping, w: Mapping) -> tuple[dict[str, Pose], dict[str, Pose]]:
         return jax.jvp(self._poses, (s,), (w,))
-
-    def _with_poses(self, s: Mapping, w: Mapping) -> tuple[dict, dict]:
-        """Positions of joints and poses of bodies by name, and their rates."""
-        poses, rates = self._moving(s, w)
-        return dict(s) | poses, dict(w) | rates
 
     @cached_property
     def _of_joints(self) -> Callable:
@@ -349,8 +281,7 @@ class RobotModel:
         if head is not None and head not in self.bodies:
             raise ValueError(f"'{head}' has no mass, and no place on it holds anything.\nFix: a place on a body.")
         body, centre = (ground, np.zeros(3)) if head is None else (self.bodies[head], self.links[head].centre)
-        rows = np.array(ground.at(axis=axis).frame) @ frame.axes.T
-        return Marker(body, tuple((frame.origin - centre).tolist()), tuple(map(tuple, rows.tolist())))
+        return _marker(body, centre, frame, axis)
 
     @cached_property
     def _between(self) -> dict[str, BodyJoint]:
@@ -437,16 +368,16 @@ def _given(default: dict, given: Mapping | None) -> dict:
 def _squared(joint: RobotJoint, q: Mapping, v: Mapping) -> Array:
     """The square of a joint's rate: of a spherical one, of its angular velocity."""
     if joint.kind == "spherical":
-        return jnp.sum(spin_in_body(q[joint.name], v[joint.name]) ** 2)
+        # Quaternions of trees may have any length.
+        e = q[joint.name]
+        return jnp.sum((spin_in_body(e, v[joint.name]) / jnp.sum(e**2)) ** 2)
     return v[joint.name] ** 2
 
 
-def _unit(joint: RobotJoint) -> Holonomic:
-    def unit_quaternion(t, q, params):
-        e = q[joint.name] if joint.kind == "spherical" else q[joint.name].quaternion
-        return (jnp.sum(e**2) - 1) / 2
-
-    return Holonomic(unit_quaternion)
+def _marker(body: Body | Ground, centre: np.ndarray, frame: Placement, axis: ArrayLike) -> Marker:
+    """A place on a body by a frame in its link, and an axis of that frame; `centre` is the body's, there."""
+    rows = np.array(ground.at(axis=axis).frame) @ frame.axes.T
+    return Marker(body, tuple((frame.origin - centre).tolist()), tuple(map(tuple, rows.tolist())))
 
 
 def _on_body(shape: LinkShape, merged: MergedLinks) -> LinkShape:

@@ -5,6 +5,7 @@ form, (t, x, u), and does not ask again for the user's structure, the shapes of 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -207,8 +208,8 @@ class Model(eqx.Module):
 
     @property
     def solves_itself(self) -> bool:
-        """Whether the user's own forward dynamics solve the equations; not where the force depends on multipliers."""
-        return getattr(self.system, "forward_dynamics", None) is not None and not self.reacts
+        """Whether the user's own forward dynamics solve the equations."""
+        return getattr(self.system, "forward_dynamics", None) is not None
 
     @property
     def is_returned(self) -> bool:
@@ -228,7 +229,7 @@ class Model(eqx.Module):
     def alone(self, name: str) -> "Model":
         """The same with a single one of its constraints."""
         residuals = tuple(residual for residual in self.form.residuals if residual.name == name)
-        system = eqx.tree_at(lambda s: s.constraints, self.system, {name: self.system.constraints[name]})
+        system = replace(self.system, constraints={name: self.system.constraints[name]})
         return unchecked(system, self.params, self.form._replace(residuals=residuals))
 
     def mapped(self, change: Callable) -> "Model":

@@ -10,6 +10,7 @@ import copy
 import pickle
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import FrameType, FunctionType
 from typing import Any, ClassVar
 
@@ -214,9 +215,7 @@ class System(eqx.Module):
     @property
     def first_phase(self) -> "System":
         """The system itself, without its elements."""
-        if self.elements is None:
-            return self
-        return unchecked(*(None if name == "elements" else getattr(self, name) for name in FIELDS))
+        return self if self.elements is None else replace(self, elements=None)
 
     def starting(self, start, argument: str = "start") -> "System":
         """The system itself; raise if `start` names a phase."""

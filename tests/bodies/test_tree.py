@@ -33,8 +33,10 @@ def like(rng, q):
 def every_joint():
     """A tree with all kinds of joints, forks, a free body, functions of params, and all kinds of loads."""
     rng = np.random.default_rng(1)
-    b = [a_body(rng, f"b{i}", mass=(lambda params: params["m"]) if i in (2, 5) else None) for i in range(8)]
+    b = [a_body(rng, f"b{i}", mass=(lambda params: params["m"]) if i in (2, 5) else None) for i in range(10)]
+    frames = [lj.Body(name, 0.0, (0.0, 0.0, 0.0)) for name in ("mount", "sight")]
     pairs = [(lj.ground, b[0]), (b[0], b[1]), (b[0], b[2]), (b[1], b[3]), (b[1], b[4]), (b[4], b[5]), (b[2], b[6])]
+    pairs += [(b[3], b[8]), (b[8], frames[0]), (frames[0], b[9]), (b[9], frames[1])]
     places = [(a_place(rng, x), a_place(rng, y)) for x, y in pairs]
     joints = {
         "hinge": lj.revolute(*places[0]),
@@ -43,8 +45,13 @@ def every_joint():
         "ball": lj.spherical(*places[4]),
         "ring": lj.cylindrical(*places[5]),
         "weld": lj.fixed(*places[6]),
+        "cross": lj.universal(*places[7]),
+        "plate": lj.planar(*places[8]),
+        "socket": lj.spherical(*places[9]),
+        "end": lj.fixed(*places[10]),
     }
-    tree = lj.Tree(b, joints)
+    rotors = {"hinge": 0.4, "pair": (0.2, 0.0), "ball": 0.3, "plate": lambda params: params["m"] * jnp.arange(3.0)}
+    tree = lj.Tree([*b, *frames], joints, rotors)
     loads = [
         lj.weight(b[:5], g=lambda params: jnp.array([0.0, 1.0, -params["g"]])),
         lj.spring(a_place(rng, b[3]), a_place(rng, b[5]), 2.0, 0.5, damping=0.7),
@@ -61,9 +68,10 @@ def test_shapes_of_coordinates():
     _, tree, _, _ = every_joint()
     shapes = {name: jax.tree.map(jnp.shape, x) for name, x in tree.reference().items()}
     assert shapes == {
-        "hinge": (), "slide": (), "pair": (2,), "ball": (4,), "ring": (2,), "b7": lj.Pose((3,), (4,)),
+        "hinge": (), "slide": (), "pair": (2,), "ball": (4,), "ring": (2,), "cross": (2,), "plate": (3,),
+        "socket": (4,), "b7": lj.Pose((3,), (4,)),
     }  # fmt: skip
-    assert repr(tree) == "Tree(8 bodies; hinge, slide, pair, ball, ring, b7)"
+    assert repr(tree) == "Tree(12 bodies; hinge, slide, pair, ball, ring, cross, plate, socket, b7)"
 
 
 @pytest.mark.exhaustive
@@ -77,6 +85,11 @@ def test_poses_and_rates():
     for body in tree.bodies:
         for x, y in zip(rates[body.name], moved[body.name]):
             np.testing.assert_allclose(x, y, atol=1e-13)
+    for name in ("cross", "plate", "socket", "end", "ring"):
+        joint = tree.joints[name]
+        assert isinstance(joint, lj.Holonomic)
+        residual = joint.g(0.0, poses, params)
+        np.testing.assert_allclose(residual, 0.0, atol=1e-13, err_msg=name)
     a, b = tree.bodies[0].at((0.1, 0.2, 0.3), Y), tree.bodies[1].at((0.0, 0.0, 1.0), Y)
     two = lj.Tree(tree.bodies[:2], {"a": lj.prismatic(lj.ground.at(axis=Y), a), "b": lj.revolute(a, b)})
     poses = two.poses({"a": 0.4, "b": 0.7})
@@ -199,7 +212,7 @@ def test_what_is_no_tree_is_refused():
         with pytest.raises(ValueError, match=said):
             lj.Tree(bodies, joints)
     with pytest.raises(TypeError, match="none that a tree has coordinates for"):
-        lj.Tree([a], {"x": lj.universal(lj.ground.at(), a.at())})
+        lj.Tree([a], {"x": lj.Holonomic(lambda t, q, params: q["a"].position)})
     with pytest.raises(TypeError, match="no lj.Load"):
         lj.Tree([a], {"x": hinge}).system([hinge])
 

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.elements.in_modes import in_modes
+from lagjax.mechanics import equations_of
+from lagjax.mechanics.forward_dynamics import ForwardDynamics
+from lagjax.system import State, model_of
 
 
 def lagrangian(t, q, v, params):
@@ -54,6 +58,29 @@ def test_forward_dynamics_that_are_wrong():
             lj.accelerations(system, 0.0, Q, v, PARAMS)
     with pytest.raises(ValueError, match="do not solve the equations of L"):
         lj.integrate(system, Q, 0 * V, PARAMS, ts=jnp.linspace(0.0, 1.0, 3))
+
+
+def test_forces_of_multipliers_and_elements():
+    """Friction on a rod is solved with as L's equations are, and not without it; a system in modes keeps its f."""
+
+    def rubbed(t, q, v, multipliers, params):
+        return jnp.array([0.0, 1.0]) * 0.3 * multipliers["rod"] * q[0]
+
+    found = []
+    for f, force in ((polar, rubbed), (None, rubbed), (polar, None)):
+        system = lj.System(lagrangian, ROD, force=force, forward_dynamics=f)
+        found.append(lj.accelerations(system, 0.0, Q, V.at[0].set(0.0), PARAMS))
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(found[0][1]["rod"], found[1][1]["rod"], rtol=1e-13)
+    assert np.abs(found[0][0] - found[2][0]).max() > 0.1
+    wall = lj.Contact(lambda t, q, params: q[0] - 1.0, friction=0.3, sliding=lambda t, q, v, params: q[0] * v[1])
+    for f in (polar, None):
+        system = lj.System(lagrangian, elements={"wall": wall}, forward_dynamics=f)
+        start = State(jnp.zeros(()), Q, V, {"m": jnp.asarray(3.0)})
+        in_its_modes, laws = in_modes(system, start)
+        given = laws.at_first(start.t, start.params)
+        solver = equations_of(model_of(in_its_modes, *start[:3], given)).form
+        assert isinstance(solver, ForwardDynamics) == (f is polar)
 
 
 def test_forward_dynamics_of_the_wrong_kind():

@@ -3,25 +3,30 @@
 Masses, inertias and places that are functions of params are called once for each function, however many links have it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PyTree
 
+from lagjax.bodies.body import valued
 from lagjax.bodies.tree.links import Entry, Link, Slots, slots_of
 
 
 class LinkNumbers(NamedTuple):
-    """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links."""
+    """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links.
+
+    `armature`: the inertia that the rate of each freedom has besides, of its rotor.
+    """
 
     mass: Float[Array, " n"]
     inertia: Float[Array, "n 3 3"]
     a: Float[Array, "n 3"]
     b: Float[Array, "n 3"]
+    armature: Float[Array, "n k"]
 
 
 class Geometry:
@@ -31,8 +36,8 @@ class Geometry:
     which freedoms turn, `slides` which slide; k is the largest number of freedoms of a joint between two bodies.
     """
 
-    def __init__(self, links: Sequence[Link], entries: Sequence[Entry]):
-        self.links, self.entries = links, entries
+    def __init__(self, links: Sequence[Link], entries: Sequence[Entry], armature: Mapping[str, ArrayLike | Callable]):
+        self.links, self.entries, self.armature = links, entries, armature
         kinds = np.array([link.kind for link in links])
         self.n, self.k = len(links), 3 if "ball" in kinds else 1
         self.frame_a = np.array([link.a.frame for link in links])
@@ -93,4 +98,20 @@ class Geometry:
             values([(0.0, 0.0, 0.0) if body is None else body.inertia for body in bodies], inertia),
             values([link.a.place for link in self.links]),
             values([link.b.place for link in self.links]),
+            jnp.asarray(self._armatures(params), dtype),
         )
+
+    def _armatures(self, params: PyTree) -> Any:
+        """Those of the freedoms of each link, (n, k)."""
+        of: Any = jnp if any(map(callable, self.armature.values())) else np
+        numbers, balls = [of.zeros(0)], [of.zeros(0)]
+        for entry in self.entries:
+            given = of.asarray(valued(self.armature.get(entry.name, 0.0), params))
+            rotors = of.broadcast_to(given, entry.rotors).ravel()
+            (balls if entry.kinds in (("ball",), ("free",)) else numbers).append(rotors)
+        # Behind the last one that of links without a number.
+        first = of.concatenate([*numbers, of.zeros(1)])[self.numbers]
+        if self.k == 1:
+            return first[:, None]
+        of_balls = of.concatenate(balls)[self.quaternions]
+        return of.where(self.ball[:, None], of_balls[:, None], of.stack([first, 0 * first, 0 * first], 1))

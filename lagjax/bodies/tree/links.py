@@ -1,7 +1,7 @@
 """The links of a tree: its bodies in an order in which each comes after its parent, and what joins it to that.
 
 A joint of several freedoms that turn about or slide along axes is a row of links, of which all but the last have no
-body. A body on which no joint ends is free.
+body. A body on which no joint ends is free. Links without mass need not have a body: what hangs on them has inertia.
 
 Both passes over the links, outward and inward, need only what belongs to few links at a time: those that still have
 children to come. Each of these has a slot, which its last child takes over; a chain has one, and a tree of n links that
@@ -9,13 +9,13 @@ always fork at most log2(n), as the largest branch comes last.
 """
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lagjax.bodies.body import Body, Ground, Marker, ground
-from lagjax.bodies.joints import Joined, apart, aside, tilt, turn
+from lagjax.bodies.joints import Joined, above, apart, aside, cross, tilt, turn
 from lagjax.system import Holonomic
 
 # The freedoms that a joint leaves, from the rows that it has as a constraint.
@@ -23,13 +23,17 @@ FREEDOMS = {
     (apart, tilt): ("turn",),
     (aside, turn): ("slide",),
     (aside, tilt): ("slide", "turn"),
+    (apart, cross): ("turn", "turn"),
+    (above, tilt): ("slide", "slide", "turn"),
     (apart,): ("ball",),
     (apart, turn): ("held",),
 }
 # What a joint of each kind has in q: numbers, or a quaternion.
-SIZES = {("turn",): (), ("slide",): (), ("slide", "turn"): (2,), ("ball",): (4,), ("held",): None}
-# Both ends of a link without a body.
+SIZES = {("turn",): (), ("slide",): (), ("slide", "turn"): (2,), ("turn", "turn"): (2,),
+         ("slide", "slide", "turn"): (3,), ("ball",): (4,), ("held",): None}  # fmt: skip
+# Both ends of a link without a body; and where the second axis of a cross is on it, along the first one's first vector.
 BETWEEN = Marker(Ground("between"), (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+CROSSED = replace(BETWEEN, frame=((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,11 @@ class Entry(NamedTuple):
         one = (4,) if self.kinds == ("free",) else SIZES[self.kinds]
         assert one is not None
         return one if self.count is None else (self.count, *one)
+
+    @property
+    def rotors(self) -> tuple[int, ...]:
+        """The shape of its armature: one for a ball, one for each other freedom."""
+        return self.shape[:-1] if self.kinds in (("ball",), ("free",)) else self.shape
 
 
 def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence]) -> tuple[list[Link], list[Entry]]:
@@ -104,13 +113,31 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
     return _in_order(bodies, held_by), entries
 
 
+def check_armature(entries: Sequence[Entry], armature: Mapping) -> dict[str, Any]:
+    """The armature by the names of joints; raises where it is of none, or no inertia."""
+    shapes = {entry.name: entry.rotors for entry in entries if entry.kinds != ("free",)}
+    for name, given in armature.items():
+        if name not in shapes:
+            listed = f"one of {', '.join(map(repr, shapes))}" if shapes else "leave it out"
+            raise ValueError(f"armature '{name}' belongs to no joint with a coordinate.\nFix: {listed}.")
+        if callable(given):
+            continue
+        numbers, shape = np.asarray(given), shapes[name]
+        if numbers.shape not in ((), shape) or not np.all(numbers >= 0):
+            raise ValueError(
+                f"the armature of '{name}' must be a moment of inertia that is not negative"
+                f"{f', or {shape} of them' if shape else ''}, and is {given}."
+            )
+    return dict(armature)
+
+
 def _joint(name: str, joint: Holonomic, bodies: Set[Body]) -> tuple[Joined, tuple[str, ...]]:
     joined = joint.g if isinstance(joint, Holonomic) else None
     kinds = FREEDOMS.get(joined.rows) if isinstance(joined, Joined) else None
     if kinds is None or not isinstance(joined, Joined):
         raise TypeError(
             f"joint '{name}' is none that a tree has coordinates for: lj.revolute, lj.prismatic, lj.cylindrical, "
-            "lj.spherical, lj.fixed, or a list of some of one kind.\n"
+            "lj.spherical, lj.universal, lj.planar, lj.fixed, or a list of some of one kind.\n"
             "Fix: a constraint of another kind goes into tree.system(closures={...})."
         )
     for marker in (joined.a, joined.b):
@@ -125,6 +152,31 @@ def _joint(name: str, joint: Holonomic, bodies: Set[Body]) -> tuple[Joined, tupl
             "Fix: lj.revolute(lj.ground.at(...), body.at(...)), the parent's first."
         )
     return joined, kinds
+
+
+def _steps(joined: Joined, kinds: tuple[str, ...]) -> list[tuple[str, Marker, Marker]]:
+    """The links of a joint in order: the freedom of each, its place on the link before, and on the link itself."""
+    if kinds == ("turn", "turn"):
+        return [("turn", joined.a, BETWEEN), ("turn", CROSSED, joined.b)]
+    if kinds == ("slide", "slide", "turn"):
+        first, second = (_along(BETWEEN, i) for i in (0, 1))
+        return [("slide", _along(joined.a, 0), first), ("slide", second, second), ("turn", BETWEEN, joined.b)]
+    between = [BETWEEN] * (len(kinds) - 1)
+    return list(zip(kinds, [joined.a, *between], [*between, joined.b]))
+
+
+def _along(marker: Marker, i: int) -> Marker:
+    """The same place with vector i of its frame as the axis."""
+    return replace(marker, frame=tuple(marker.frame[(i + j) % 3] for j in (1, 2, 3)))
+
+
+def _check_masses(body: Body, kinds: tuple[str, ...], mass: bool):
+    """`mass`: whether the body, or one that hangs on it, has any."""
+    if kinds != ("held",) and not mass:
+        raise ValueError(
+            f"the body '{body.name}' moves and has no mass, and nothing that has some hangs on it.\n"
+            "Usual cause: a frame that should be fixed.\nFix: its mass and inertia, or lj.fixed(parent, child)."
+        )
 
 
 def _in_order(bodies: Sequence[Body], held_by: Mapping) -> list[Link]:
@@ -146,15 +198,19 @@ def _in_order(bodies: Sequence[Body], held_by: Mapping) -> list[Link]:
     size: dict[Body | Ground, int] = {}
     for body in reversed(met):
         size[body] = 1 + sum(size[child] for child in children.get(body, ()))
+    has_mass: dict[Body, bool] = {}
+    for body in reversed(met):
+        own = callable(body.mass) or body.mass > 0
+        has_mass[body] = own or any(has_mass[child] for child in children.get(body, ()))
+        _check_masses(body, held_by[body.name][2], has_mass[body])
     links, last, ahead = [], {ground: -1}, _smallest_first(children.get(ground, ()), size)
     while ahead:
         body = ahead.pop()
         _, joined, kinds, at = held_by[body.name]
-        parent, a = last[joined.a.body], joined.a
-        for i, kind in enumerate(kinds):
-            ends = i == len(kinds) - 1
-            links.append(Link(body if ends else None, parent, kind, a, joined.b if ends else BETWEEN, at + i))
-            parent, a = len(links) - 1, BETWEEN
+        parent = last[joined.a.body]
+        for i, (kind, a, b) in enumerate(_steps(joined, kinds)):
+            links.append(Link(body if b is joined.b else None, parent, kind, a, b, at + i))
+            parent = len(links) - 1
         last[body] = parent
         ahead += _smallest_first(children.get(body, ()), size)
     return links

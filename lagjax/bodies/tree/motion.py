@@ -150,10 +150,18 @@ def _dot(a: Array, b: Array) -> Array:
     return applied(a[..., None, :], b)[..., 0]
 
 
+def joint_rates(geometry: Geometry, q: Coordinates, v: Coordinates) -> Float[Array, "n k"]:
+    """The rate of each freedom: of a hinge or slide that of its number, of a ball its angular velocity."""
+    rates = numbers_of_links(geometry, v.numbers)
+    if geometry.k == 1:
+        return rates
+    return jnp.where(geometry.ball[:, None], of_links(spins(q.quaternions, v.quaternions), geometry.quaternions), rates)
+
+
 def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates) -> Joints:
     """The links as seen from their parents."""
     dtype = q.numbers.dtype
-    s, rates = numbers_of_links(geometry, q.numbers)[:, 0], numbers_of_links(geometry, v.numbers)
+    s, rates = numbers_of_links(geometry, q.numbers)[:, 0], joint_rates(geometry, q, v)
     turns, slides = (jnp.asarray(x, dtype) for x in (geometry.turns, geometry.slides))
     half = s * turns[:, 0] / 2
     nothing = jnp.zeros_like(half)
@@ -170,8 +178,6 @@ def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v:
         unit = q.quaternions / jnp.sqrt(_dot(q.quaternions, q.quaternions))[:, None]
         spin = of_links(spins(q.quaternions, v.quaternions), geometry.quaternions)
         e = jnp.where((geometry.ball | geometry.free)[:, None], of_links(unit, geometry.quaternions), e)
-        if geometry.k == 3:
-            rates = jnp.where(geometry.ball[:, None], spin, rates)
         base_spin = jnp.where(free, spin, 0.0)
         base_velocity = jnp.where(free, of_links(v.positions, geometry.quaternions), 0.0)
         offset = jnp.where(free, of_links(q.positions, geometry.quaternions), offset)

@@ -13,10 +13,11 @@ velocities alone accelerate:
 
     X a_p = (ω̇_p, r̈_p + ω̇_p × d),     c = (γ, ω_p × (ω_p × o) + 2 ω_p × v_j + γ × b' + ω × (ω × b')),     γ = ω_p × ω_j
 
-S has a column for each freedom of the joint. A column of zeros stands for one that is not there, with D = 1. A free
-body has a = -I⁻¹ p.
+S has a column for each freedom of the joint. A column of zeros stands for one that is not there, with D = 1. A rotor
+that turns with a joint has an inertia on its diagonal of D, and no part in what the joint passes on. A free body has
+a = -I⁻¹ p.
 
-Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes.
+Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes; §9.6 (rotors).
 """
 
 from typing import NamedTuple
@@ -48,7 +49,7 @@ def accelerated(
     twist = turns * motion.axes
     levered = jnp.swapaxes(jnp.cross(jnp.swapaxes(twist, 1, 2), arm[:, None, :]), 1, 2)
     freedoms = jnp.concatenate([twist, levered + slides * motion.axes], axis=1)
-    unused = (1 - turns - slides)[:, 0, :]
+    beside = (1 - turns - slides)[:, 0, :] + given.armature
     gamma = jnp.cross(before, motion.joint_spin)
     bias = jnp.concatenate(
         [
@@ -71,11 +72,11 @@ def accelerated(
     has_free = bool(geometry.free.any())
 
     def inward(slots: Array, x: tuple) -> tuple[Array, tuple]:
-        own, freedoms, bias, shift, torque, unused, read, write = x
+        own, freedoms, bias, shift, torque, beside, read, write = x
         both = own + taken(slots, write)
         articulated, load = both[:, :6], both[:, 6]
         pushed = times(articulated, freedoms)
-        solve = _inverse(times(freedoms.T, pushed) + jnp.diag(unused))
+        solve = _inverse(times(freedoms.T, pushed) + jnp.diag(beside))
         force = torque - applied(freedoms.T, load)
         rows = times(solve, pushed.T)
         passed = articulated - times(pushed, rows)
@@ -85,7 +86,7 @@ def accelerated(
         return kept, (rows, applied(solve, force), both if has_free else ())
 
     start = jnp.zeros((read.shape[1], 6, 7), dtype)
-    given_inward = own, freedoms, bias, shift, torque, unused, read, write
+    given_inward = own, freedoms, bias, shift, torque, beside, read, write
     _, (rows, force, every) = lax.scan(inward, start, given_inward, reverse=True)
 
     free = jnp.zeros((geometry.n, 6), dtype)

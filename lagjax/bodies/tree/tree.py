@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.bodies.body import Body, Pose, check_bodies
 from lagjax.bodies.joints import named
-from lagjax.bodies.loads import Load, check_loads, generalized_force
+from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
 from lagjax.bodies.shapes import usual_shapes
 from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
-from lagjax.bodies.tree.links import links_of
+from lagjax.bodies.tree.links import check_armature, links_of
 from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, rates_of, wrenches
 from lagjax.bodies.tree.motion import (
     Coordinates,
@@ -22,6 +23,7 @@ from lagjax.bodies.tree.motion import (
     applied,
     flat,
     growth,
+    joint_rates,
     moving,
     numbers_of_links,
     of_links,
@@ -51,22 +53,40 @@ class Tree:
     **Arguments:**
 
     - `bodies`: `lj.Body`s of different names.
-    - `joints`: by name, `lj.revolute`, `lj.prismatic`, `lj.cylindrical`, `lj.spherical` or `lj.fixed`, from a place on
-      the parent (or `lj.ground`) to one on the body that hangs there; or a list of joints of one kind.
+    - `joints`: by name, `lj.revolute`, `lj.prismatic`, `lj.cylindrical`, `lj.universal`, `lj.planar`, `lj.spherical` or
+      `lj.fixed`, from a place on the parent (or `lj.ground`) to one on the body that hangs there; or a list of joints
+      of one kind.
+    - `armature`: by the name of a joint, the inertia of rotors that turn with it, behind gears by the square of their
+      ratio: it adds ½ armature v² to the kinetic energy, `[L] [t]²/[q]²`. A number, or an array with one for each
+      number of q (for each quaternion), or a function of params.
 
-    Coordinates: `q[name]` of a joint is an angle, a length, both in an array (2,) of a cylindrical joint, or a
-    quaternion (4,) of a spherical one, and an array of these for a list; zero where the two frames (`lj.Marker`) are
-    alike, a quaternion then (1, 0, 0, 0). A fixed joint has none. A body on which no joint ends is free, and
-    `q[body.name]` its `lj.Pose`. Quaternions may have any length: they are read as e / |e|, and no constraint holds
-    them.
+    Coordinates, zero where the two frames (`lj.Marker`) are alike:
+
+    | joint | `q[name]` |
+    |---|---|
+    | revolute, prismatic | an angle, a length |
+    | cylindrical | (2,): the length, the angle |
+    | planar | (3,): lengths along the first two vectors of the parent's frame, the angle |
+    | universal | (2,): angles about both axes; at zero the frames' first vectors lie along each other's axes |
+    | spherical | a quaternion (4,), then (1, 0, 0, 0), of any length: read as e / abs(e), and no constraint holds it |
+    | fixed | none |
+
+    An array of these for a list. A body on which no joint ends is free, and `q[body.name]` its `lj.Pose`.
+
+    Bodies without mass and inertia are frames, for joints that follow on each other at one place.
 
     **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,
-    or two things of one name.
+    two things of one name, armature of no joint, and for a body without mass that moves and carries none.
 
-    Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 4 (trees), ch. 7 (the recursion).
+    Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 4 (trees), ch. 7 (the recursion), §9.6 (rotors).
     """
 
-    def __init__(self, bodies: Iterable[Body], joints: Mapping[str, Holonomic | Sequence[Holonomic]] | None = None):
+    def __init__(
+        self,
+        bodies: Iterable[Body],
+        joints: Mapping[str, Holonomic | Sequence[Holonomic]] | None = None,
+        armature: Mapping[str, ArrayLike | Callable] | None = None,
+    ):
         bodies = check_bodies("lj.Tree", bodies)
         names = [body.name for body in bodies]
         if len(set(names)) < len(names):
@@ -78,9 +98,9 @@ class Tree:
                 "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}, or {'links': [...]} for a list."
             )
         self.bodies = bodies
-        self._geometry = Geometry(*links_of(bodies, joints or {}))
-        rows = ([x] if isinstance(x, Holonomic) else x for x in (joints or {}).values())
-        self._joints = [joint for row in rows for joint in row]
+        links, entries = links_of(bodies, joints or {})
+        self._geometry = Geometry(links, entries, check_armature(entries, armature or {}))
+        self.joints = dict(joints or {})
 
     def __repr__(self):
         entries = ", ".join(entry.name for entry in self._geometry.entries)
@@ -102,10 +122,9 @@ class Tree:
 
     def rates(self, q: PyTree, v: PyTree, params: PyTree = None) -> dict[str, Pose]:
         """The rates of their poses by name, for `body.velocity(q, v)` and the like."""
-        q, v = (jax.tree.map(jnp.asarray, x) for x in (q, v))
-        _, motion = _moving(self._geometry, q, v, params)
-        rates = rates_of(motion, poses_of(motion))
-        return {body.name: Placed(self._geometry, rates, v)[body.name] for body in self.bodies}
+        # As the derivative of the poses, which shows that it is linear in v; 0.0 makes whole numbers floats.
+        q, v = (jax.tree.map(lambda x: jnp.asarray(x) + 0.0, x) for x in (q, v))
+        return jax.jvp(lambda q: self.poses(q, params), (q,), (v,))[1]
 
     def system(
         self,
@@ -133,20 +152,21 @@ class Tree:
         **Raises:** `TypeError` for a load that is none, or an argument that `lj.System` has not.
         """
         loads = check_loads("tree.system", loads)
-        force, dissipation = others.pop("force", None), others.pop("dissipation", None)
-        dynamics = Dynamics(self._geometry, loads, potential, force, dissipation)
+        dynamics = Dynamics(self._geometry, loads, potential)
+        beside = Acting(others.pop("force", None), others.pop("dissipation", None))
+        acting = beside.with_loads(loads, dynamics.placed)
 
         def total(t, q, v, params):
             return dynamics.lagrangian(t, q, v, params)
 
-        looks_like = [*(joint.function for joint in self._joints), *(load.potential for load in loads)]
-
+        rows = [[x] if isinstance(x, Holonomic) else x for x in self.joints.values()]
+        looks_like = [*(joint.function for row in rows for joint in row), *(load.potential for load in loads)]
         setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), self.poses))
         return System(
             total,
-            {name: _closure(self._geometry, c) for name, c in named(closures or {}).items()},
-            force=dynamics.driven if any(load.power is not None for load in loads) else force,
-            dissipation=dynamics.friction if any(load.dissipation is not None for load in loads) else dissipation,
+            {name: _closure(dynamics, c) for name, c in named(closures or {}).items()},
+            force=acting.force,
+            dissipation=acting.dissipation,
             forward_dynamics=dynamics.articulated_body_recursion,
             **others,
         )
@@ -158,8 +178,6 @@ class Dynamics(NamedTuple):
     geometry: Geometry
     loads: tuple[Load, ...]
     potential: Callable | None
-    force: Callable | None
-    dissipation: Callable | None
 
     def lagrangian(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
         """T - V. The growth of quaternions has an inertia, for a regular mass matrix, and no part in the rest."""
@@ -184,27 +202,8 @@ class Dynamics(NamedTuple):
         a = _accelerations(geometry, given, motion, wrench, *(flat(geometry, x) for x in (q, v, force)))
         return {name: jax.tree.map(jnp.zeros_like, y) for name, y in q.items()} | unflat(geometry, a)
 
-    def friction(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
-        """Rayleigh's function of loads and of the user."""
-        placed, moving = self._placed(q, v, params)
-        lost = sum(x.dissipation(t, placed, moving, params) for x in self.loads if x.dissipation is not None)
-        return jnp.asarray(lost + (0.0 if self.dissipation is None else self.dissipation(t, q, v, params)))
-
-    def driven(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> PyTree:
-        """The generalized force of loads and of the user."""
-        placed, moving = self._placed(q, v, params)
-
-        def of_rates(load: Load) -> Callable:
-            def power(t, q, w, v, params):
-                return load.power(t, placed, self._placed(q, w, params)[1], moving, params)  # pyright: ignore
-
-            return power
-
-        powers = [Load(power=of_rates(load)) for load in self.loads if load.power is not None]
-        given = generalized_force(powers, t, q, v, params)
-        return given if self.force is None else jax.tree.map(lambda x, y: x + y, given, self.force(t, q, v, params))
-
-    def _placed(self, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Placed]:
+    def placed(self, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Placed]:
+        """q and v as loads and closures read them."""
         _, motion = _moving(self.geometry, q, v, params)
         poses = poses_of(motion)
         return Placed(self.geometry, poses, q), Placed(self.geometry, rates_of(motion, poses), v)
@@ -221,6 +220,8 @@ def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[L
 def _kinetic(geometry: Geometry, given: LinkNumbers, motion: LinkMotion, q: Coordinates, v: Coordinates) -> Array:
     in_body = applied(jnp.swapaxes(motion.turn, 1, 2), motion.spin)
     twice = jnp.sum(in_body * applied(given.inertia, in_body)) + jnp.sum(given.mass[:, None] * motion.velocity**2)
+    if geometry.armature:
+        twice = twice + jnp.sum(given.armature * joint_rates(geometry, q, v) ** 2)
     if len(geometry.links_of_quaternions):
         twice = twice + jnp.sum(_of_growth(geometry, given) * growth(q.quaternions, v.quaternions) ** 2)
     return twice / 2
@@ -261,24 +262,22 @@ def _accelerations(
 
 
 def _of_growth(geometry: Geometry, given: LinkNumbers) -> Array:
-    """The inertia of the growth of each quaternion."""
-    return jnp.trace(given.inertia, axis1=1, axis2=2)[geometry.links_of_quaternions] / 3
+    """The inertia of the growth of each quaternion; any will do for one of a frame."""
+    own = jnp.trace(given.inertia, axis1=1, axis2=2)[geometry.links_of_quaternions] / 3
+    return jnp.where(own > 0, own, 1.0)
 
 
-def _closure(geometry: Geometry, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
+def _closure(dynamics: Dynamics, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
     """A constraint of poses as one of joint coordinates."""
     if isinstance(constraint, Holonomic):
 
         def closes(t, q, params):
-            _, motion = _moving(geometry, q, jax.tree.map(jnp.zeros_like, q), params)
-            return constraint.g(t, Placed(geometry, poses_of(motion), q), params)
+            placed, _ = dynamics.placed(q, jax.tree.map(jnp.zeros_like, q), params)
+            return constraint.g(t, placed, params)
 
         return Holonomic(closes)
 
     def moves(t, q, v, params):
-        _, motion = _moving(geometry, q, v, params)
-        poses = poses_of(motion)
-        placed = Placed(geometry, poses, q), Placed(geometry, rates_of(motion, poses), v)
-        return constraint.phi(t, *placed, params)
+        return constraint.phi(t, *dynamics.placed(q, v, params), params)
 
     return Nonholonomic(moves)

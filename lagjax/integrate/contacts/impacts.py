@@ -32,6 +32,7 @@ Laws*, §6; Kane, *A dynamics puzzle* (1984), on the energy.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -101,11 +102,7 @@ class _Rebound(eqx.Module):
     def _unit(self, contact, t: Array, q: PyTree, v: PyTree, params: PyTree):
         """Return the least change of the velocities that changes the residual of the last entry of `contact` by one,
         but no other residual, of `contact` or of the constraints that hold; and whether there is such a change."""
-        before = self.before
-        system = System(
-            before.lagrangian, before.constraints | contact, before.force, before.dissipation, before.states,
-            forward_dynamics=before.forward_dynamics,
-        )  # fmt: skip
+        system = replace(self.before, constraints=self.before.constraints | contact)
         model = model_of(system, t, q, v, params)
         change = model.belongs_to(list(contact)[-1]).astype(model.form.dtype)
         found = velocity_change(model, t, q, v, jnp.asarray(change))

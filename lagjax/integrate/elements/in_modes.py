@@ -104,15 +104,12 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
     as_constraints = {law.name: Holonomic(law.gap) for law in (*normals, *compliant)}
     as_constraints |= {law.name: Nonholonomic(law.sliding) for law in tangents}
     check_use(replace(plain, constraints=as_constraints, force=None))
-    constraints: dict[str, Any] = {name: type(c)(OfParams(c.function)) for name, c in plain.constraints.items()}
+    always = plain.map(lambda function, role: OfParams(function))
+    constraints: dict[str, Any] = dict(always.constraints)
     constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
     constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
-    force = None if plain.force is None else OfParams(plain.force)
-    if tangents or compliant:
-        force = WithElements(plain.force, tangents, compliant)
-    dissipation = None if plain.dissipation is None else OfParams(plain.dissipation)
-    states = {name: OfParams(f) for name, f in plain.states.items()}
-    masked = System(OfParams(plain.lagrangian), constraints, force, dissipation, states)
+    force = WithElements(plain.force, tangents, compliant) if tangents or compliant else always.force
+    masked = replace(always, constraints=constraints, force=force)
     guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
     count = max(guarded, default=0) + len(sampled)
     # The order of the stacked equations is known only with their shapes.

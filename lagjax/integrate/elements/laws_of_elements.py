@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,7 @@ from lagjax.integrate.elements.coefficients import takes_of_coefficient
 from lagjax.integrate.elements.compliant import Compliant
 from lagjax.integrate.elements.laws import Normal, Tangent
 from lagjax.integrate.elements.sampled import Sampled
-from lagjax.jaxtools import depends
+from lagjax.jaxtools import depends, is_linear
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -154,7 +155,14 @@ def check_linear(sliding: Callable, t: Array, q: PyTree, v: PyTree, params: PyTr
     """Raise if a sliding velocity is not linear in v."""
     u, unflatten = coordinates.flatten(v)
     program = jax.make_jaxpr(jax.jacfwd(lambda u: sliding(t, q, unflatten(u), params)))(u).jaxpr
-    if depends(program, program.invars):
+    arrays, rest = eqx.partition((t, q, params), eqx.is_array_like)
+
+    def slips(u: Array, arrays: tuple):
+        t, q, params = eqx.combine(arrays, rest)
+        return jnp.ravel(sliding(t, q, unflatten(u), params))
+
+    # A loop hides which of its numbers depend on which: what it makes is looked at.
+    if depends(program, program.invars) and not is_linear(slips, u.size, u.dtype, arrays):
         raise ValueError(
             "sliding(t, q, v, params) must be linear in v, but its slope depends on v.\n"
             "Usual cause: a speed, jnp.abs of the velocity or its length.\n"

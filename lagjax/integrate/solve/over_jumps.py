@@ -16,6 +16,7 @@ Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory se
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -130,11 +131,7 @@ def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
     if which:
         differences = jumps.numbers(system, 2)
         sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
-        mixed = Mixed(smooth.force, sliding)
-        smooth = System(
-            smooth.lagrangian, smooth.constraints, mixed, smooth.dissipation, smooth.states,
-            forward_dynamics=smooth.forward_dynamics,
-        )  # fmt: skip
+        smooth = replace(smooth, force=Mixed(smooth.force, sliding))
     guards = tuple(ModeGuard(guard, sliding if i in which else None, i) for i, guard in enumerate(guards))
     pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
     return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)

@@ -1,0 +1,97 @@
+"""Motions of trees with contacts, friction, states, sampled control and phases, against the same L by hand."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.integrate.elements.laws_of_elements import check_linear
+
+Y, G = (0.0, 1.0, 0.0), 9.81
+UPPER, LOWER = RODS = [lj.Body(name, lambda params: params["m"], (1 / 12, 1 / 12, 0.0)) for name in ("upper", "lower")]
+JOINTS = {
+    "a": lj.revolute(lj.ground.at(axis=Y), UPPER.at((0.0, 0.0, 0.5), Y)),
+    "b": lj.revolute(UPPER.at((0.0, 0.0, -0.5), Y), LOWER.at((0.0, 0.0, 0.5), Y)),
+}
+TREE, TIP = lj.Tree(RODS, JOINTS), LOWER.at((0.0, 0.0, -0.5))
+PARAMS = {"m": 1.3}
+Q, V = {"a": 0.9, "b": 0.3}, {"a": 0.0, "b": 0.0}
+
+
+def by_hand(t, q, v, params):
+    """Two rods of length one in the angles of their joints."""
+    a, b = q["a"], q["a"] + q["b"]
+    da, db = v["a"], v["a"] + v["b"]
+    turning = da**2 + db**2
+    moving = da**2 / 4 + da**2 + db**2 / 4 + da * db * jnp.cos(a - b)
+    return turning / 24 + params["m"] * (moving / 2 + G * (1.5 * jnp.cos(a) + jnp.cos(b) / 2))
+
+
+def tip(t, q, params):
+    """Where the tip is, by the tree."""
+    return TIP.position(TREE.poses(q, params), params)
+
+
+def slides(t, q, v, params):
+    """How fast the tip moves along x, by the tree."""
+    return TIP.velocity(TREE.poses(q, params), TREE.rates(q, v, params), params)[0]
+
+
+def tip_by_hand(t, q, params):
+    """How high the tip is."""
+    return -jnp.cos(q["a"]) - jnp.cos(q["a"] + q["b"])
+
+
+def slides_by_hand(t, q, v, params):
+    """How fast the tip moves along x."""
+    return -jnp.cos(q["a"]) * v["a"] - jnp.cos(q["a"] + q["b"]) * (v["a"] + v["b"])
+
+
+def floor(height, sliding):
+    """A rough floor below the tip."""
+    gap = lambda t, q, params: height(t, q, params) + 1.6
+    return lj.Contact(gap, restitution=0.4, friction=0.3, sliding=sliding)
+
+
+IN_JOINTS = {
+    "friction": lj.Friction(lambda t, q, v, params: v["b"], 0.5, normal=1.0),
+    "stop": lj.Stop(lambda t, q, params: q["b"], low=-0.5, high=0.5, restitution=0.3),
+}
+
+
+def apart(one, other):
+    """By how much two motions differ."""
+    assert jax.tree.structure(one.q) == jax.tree.structure(other.q)
+    return max(np.max(np.abs(x - y)) for x, y in zip(*(jax.tree.leaves((traj.q, traj.v)) for traj in (one, other))))
+
+
+@pytest.mark.slow
+def test_sliding_of_a_place_on_a_tree():
+    """The velocity of a place, by rates from a loop over bodies, is seen to be linear; its square is not."""
+    q, v, params = jax.tree.map(jnp.asarray, (Q, {"a": 0.7, "b": -0.2}, PARAMS))
+    check_linear(slides, jnp.zeros(()), q, v, params)
+    np.testing.assert_allclose(jax.jit(slides)(0.0, q, v, params), slides_by_hand(0.0, q, v, params), rtol=1e-13)
+    with pytest.raises(ValueError, match="must be linear in v"):
+        check_linear(lambda *state: slides(*state) ** 2, jnp.zeros(()), q, v, params)
+
+
+@pytest.mark.exhaustive
+def test_contacts_and_friction():
+    """A tip that strikes a rough floor, and friction and a stop in a joint, as with L by hand; not a wrong f."""
+    trees = {**IN_JOINTS, "tip": floor(lambda *x: tip(*x)[2], slides)}
+    hands = {**IN_JOINTS, "tip": floor(tip_by_hand, slides_by_hand)}
+    tree = TREE.system([lj.weight(RODS)], elements=trees)
+    hand, ts = lj.System(by_hand, elements=hands), jnp.linspace(0.0, 1.5, 7)
+    ours, theirs = (lj.integrate(x, Q, V, PARAMS, ts=ts, rtol=1e-10, estimate_error=False) for x in (tree, hand))
+    assert isinstance(ours, lj.HybridTrajectory) and isinstance(theirs, lj.HybridTrajectory)
+    assert len(ours.switches) == len(theirs.switches) > 4
+    np.testing.assert_array_equal(ours.modes, theirs.modes)
+    assert apart(ours, theirs) < 1e-8
+    for name in ours.multipliers:
+        np.testing.assert_allclose(ours.multipliers[name], theirs.multipliers[name], atol=1e-7)
+    wrong = replace(tree, forward_dynamics=lambda t, q, v, force, params: force)
+    with pytest.raises(ValueError, match="do not solve the equations of L"):
+        lj.integrate(wrong, Q, V, PARAMS, ts=ts)
