@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space
-from lagjax.system import Holonomic
+from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
 # By how much of their sum moments of inertia may miss the triangle inequality: those of thin plates reach it.
 ROUNDED = 1e-9
@@ -62,6 +62,20 @@ def valued(x: ArrayLike | Callable, params: PyTree) -> Any:
     return x(params) if callable(x) else x
 
 
+def check_takes_params(role: str, owner: str, given):
+    """Raise a `TypeError`, where a function is given, unless it takes params alone."""
+    if callable(given):
+        check_arguments(
+            Call(role, given, ("params",), f" of {owner}"), "a function of the state, as a force may be one"
+        )
+
+
+def check_takes_state(role: str, owner: str, given):
+    """Raise a `TypeError`, where a function is given, unless it takes (t, q, v, params)."""
+    if callable(given):
+        check_arguments(Call(role, given, OF_STATE, f" of {owner}"), "a function of params alone, as a mass may be one")
+
+
 @dataclass(frozen=True)
 class Body:
     """A rigid body in space, whose coordinates are `q[name]`, a `lj.Pose`.
@@ -90,6 +104,8 @@ class Body:
     inertia: tuple | Callable
 
     def __post_init__(self):
+        check_takes_params("mass", f"'{self.name}'", self.mass)
+        check_takes_params("inertia", f"'{self.name}'", self.inertia)
         if not callable(self.inertia):
             given = np.asarray(self.inertia, float)
             object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
@@ -251,6 +267,7 @@ class Marker:
         first = near - (near @ along) * along
         first = first / np.sqrt(np.sum(first**2))
         rows = np.stack([first, np.cross(along, first), along])
+        check_takes_params("a point", f"'{body.name}'", point)
         place = point if callable(point) else tuple(np.asarray(point, float).tolist())
         if not callable(place) and len(place) != 3:
             raise ValueError(f"a point of '{body.name}' must be three numbers, not {point}.")

@@ -12,7 +12,15 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from lagjax.bodies.body import Body, Marker, check_bodies, check_markers, valued
+from lagjax.bodies.body import (
+    Body,
+    Marker,
+    check_bodies,
+    check_markers,
+    check_takes_params,
+    check_takes_state,
+    valued,
+)
 from lagjax.bodies.shapes import line, looks
 
 
@@ -39,8 +47,9 @@ def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) 
     >>> print(weight([stone]).potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
     58.86
 
-    **Raises:** `TypeError` unless `bodies` is a list of them; L's check names what is wrong with `g`.
+    **Raises:** `TypeError` unless `bodies` is a list of them and `g` takes params if it is a function.
     """
+    check_takes_params("g", "lj.weight", g)
     return Load(Weight(check_bodies("lj.weight", bodies), g))
 
 
@@ -77,9 +86,11 @@ def spring(
     >>> print(pull.potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, {"k": 10.0}))
     20.0
 
-    **Raises:** `TypeError` unless both are markers; L's check names what is wrong with the numbers.
+    **Raises:** `TypeError` unless both are markers, and for a function of anything but params.
     """
     check_markers("a spring is held at two places on bodies", a, b)
+    for role, given in {"stiffness": stiffness, "length": length, "damping": damping}.items():
+        check_takes_params(role, "lj.spring", given)
 
     def potential(t, q, v, params):
         gap = b.position(q, params) - a.position(q, params)
@@ -115,9 +126,11 @@ def torsion(
     >>> print(closer.potential(0.0, {"door": lj.Pose.at(angle=2.5)}, None, None))
     6.0
 
-    **Raises:** `TypeError` unless both are markers; L's check names what is wrong with the numbers.
+    **Raises:** `TypeError` unless both are markers, and for a function of anything but params.
     """
     check_markers("a spring is held at two places on bodies", a, b)
+    for role, given in {"stiffness": stiffness, "angle": angle, "damping": damping}.items():
+        check_takes_params(role, "lj.torsion", given)
 
     def potential(t, q, v, params):
         along, across, _ = a.axes(q)
@@ -141,9 +154,10 @@ def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
     >>> print(motor(lj.ground.at(), wheel.at(), 5.0).power(0.0, {"wheel": pose}, turning, turning, None))
     15.0
 
-    **Raises:** `TypeError` unless both are markers; the check of forces names what is wrong with the torque.
+    **Raises:** `TypeError` unless both are markers, and for a function of anything but the state.
     """
     check_markers("a motor is held at two places on bodies", a, b)
+    check_takes_state("torque", "lj.motor", torque)
 
     def power(t, q, w, v, params):
         turning = torque(t, q, v, params) if callable(torque) else torque
@@ -162,9 +176,10 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     >>> print(applied(rim, (0.0, 2.0, 0.0)).power(0.0, {"wheel": pose}, turning, turning, None))
     6.0
 
-    **Raises:** `TypeError` unless `at` is a marker; the check of forces names what is wrong with the force.
+    **Raises:** `TypeError` unless `at` is a marker, and for a function of anything but the state.
     """
     check_markers("a force acts at a place on a body", at)
+    check_takes_state("force", "lj.applied", force)
 
     def power(t, q, w, v, params):
         given = force(t, q, v, params) if callable(force) else force

@@ -225,6 +225,27 @@ def test_bad_systems_of_bodies():
         lj.applied(rod, (1.0, 0.0, 0.0))
 
 
+def test_functions_of_other_arguments():
+    """Numbers are functions of params, forces of the state: the other one is refused where it is given."""
+    rod = lj.Body("rod", 1.0, lambda params: params["I"])
+    of_state, of_params = lambda t, q, v, params: 1.0, lambda params: params["torque"]
+    with pytest.raises(
+        TypeError, match=r"mass\(params\) of 'beam' is called with 1 argument, but .*f\(t, q, v, params\)"
+    ):
+        lj.Body("beam", of_state, (1.0, 1.0, 2.0))
+    with pytest.raises(TypeError, match=r"a point\(params\) of 'rod' is called with 1 argument"):
+        rod.at(of_state)
+    with pytest.raises(TypeError, match=r"g\(params\) of lj.weight"):
+        lj.weight([rod], of_state)
+    for load, role in ((lj.spring, "length"), (lj.torsion, "damping")):
+        with pytest.raises(TypeError, match=rf"{role}\(params\) of lj.{load.__name__}"):
+            load(lj.ground.at(), rod.at(), of_params, **{role: of_state})
+    with pytest.raises(TypeError, match=r"torque\(t, q, v, params\) of lj.motor is .*\n.*a function of params alone"):
+        lj.motor(lj.ground.at(), rod.at(), of_params)
+    with pytest.raises(TypeError, match=r"force\(t, q, v, params\) of lj.applied"):
+        lj.applied(rod.at(), of_params)
+
+
 def test_a_torsion_spring():
     """A turn by 2.5 about a tilted axis with a rate of 3: V = ½ k (θ - α)², the power lost c times the rate squared."""
     axis, point = np.array([1.0, 2.0, -0.5]), (0.2, 0.0, 0.0)
