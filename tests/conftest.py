@@ -25,6 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from jax._src import compiler  # noqa: E402
 
 from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
 
@@ -42,6 +43,23 @@ MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
 SIZE, MOST_PAGES = Path("/proc/self/statm"), 4 * 2**30 // os.sysconf("SC_PAGE_SIZE")
 # Freed memory is not always returned to the system.
 allowed = [MOST_PAGES]
+# Programs compiled since the maps were counted: the list of 30,000 maps takes the kernel 10 ms.
+since_counted = [0]
+
+
+backend_compile = compiler.backend_compile_and_load
+
+
+def compile_without_fusion_emitters(backend, module, devices, options, callbacks):
+    """Compile with XLA's older loop emitter, in two thirds of the time, where few optimisations are asked for."""
+    since_counted[0] += 1
+    if jax.config.read("jax_disable_most_optimizations"):
+        # By JAX's own function: `XLA_FLAGS` would change the optimised tests too, which run in the same process.
+        options.env_option_overrides = [*options.env_option_overrides, ("xla_cpu_use_fusion_emitters", False)]
+    return backend_compile(backend, module, devices, options, callbacks)
+
+
+compiler.backend_compile_and_load = compile_without_fusion_emitters
 
 
 def as_users_get_it(item):
@@ -88,9 +106,10 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True)
 def room_for_programs():
-    """Clear the compiled programs of earlier tests if there are very many."""
-    if not MAPS.exists():
+    """Clear the compiled programs of earlier tests if there are very many; the maps are counted once in 50 programs."""
+    if not MAPS.exists() or since_counted[0] < 50:
         return
+    since_counted[0] = 0
     pages = lambda: int(SIZE.read_text().split()[1])
     if MAPS.read_bytes().count(b"\n") > MOST_MAPS or pages() > allowed[0]:
         PROGRAMS.clear()
