@@ -143,6 +143,7 @@ if TYPE_CHECKING:
         Load,
         Marker,
         Pose,
+        Surface,
         Tree,
         applied,
         box,
@@ -211,8 +212,9 @@ LATER = {
     ),
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
-        "Body Load Marker Pose Tree applied box cylinder cylindrical disk fixed ground line mesh motor multibody "
-        "planar prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail universal weight"
+        "Body Load Marker Pose Surface Tree applied box cylinder cylindrical disk fixed ground line mesh motor "
+        "multibody planar prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail "
+        "universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.models": "RobotModel read_mjcf read_urdf",
@@ -253,6 +255,7 @@ __all__ = [
     "Elements",
     "Body",
     "Pose",
+    "Surface",
     "ground",
     "Marker",
     "Tree",

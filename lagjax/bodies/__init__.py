@@ -9,12 +9,11 @@ from lagjax.bodies.joints import (
     planar,
     prismatic,
     revolute,
-    rolling,
-    rolling_sphere,
     spherical,
     universal,
 )
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
+from lagjax.bodies.rolling import Surface, rolling, rolling_sphere
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
 from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
@@ -25,6 +24,7 @@ __all__ = [
     "Load",
     "Marker",
     "Pose",
+    "Surface",
     "Tree",
     "applied",
     "box",

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Ground, Marker, check_markers, valued
-from lagjax.bodies.shapes import disk, line, looks, sphere
+from lagjax.bodies.body import Ground, Marker, check_markers
+from lagjax.bodies.shapes import line
 from lagjax.display import Shape
 from lagjax.system import Holonomic, Nonholonomic
 
@@ -145,71 +145,6 @@ def fixed(a: Marker, b: Marker) -> Holonomic:
     return _joined(a, b, apart, turn)
 
 
-def rolling(wheel: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
-    """Let the rim of a thin wheel roll on a plane without slipping: one equation for positions, two for velocities.
-
-    `wheel` is its centre and its axis, `floor` a point of the plane and the normal, `radius` a number or a function of
-    params. The rim's lowest point lies from the centre along d, the part of the normal at right angles to the axis a:
-
-        d = n - (n·a) a,      g = (c - p)·n - R |d|,      phi = (velocity of the wheel - that of the floor, there)
-
-    Not for a wheel that lies flat, where d = 0.
-
-    >>> import lagjax as lj
-    >>> wheel = lj.Body("wheel", 1.0, (1.0, 2.0, 1.0))
-    >>> upright = lj.Pose.at((0.0, 0.0, 0.5))
-    >>> q, v = {"wheel": upright}, {"wheel": upright.moving((2.0, 0.0, 0.0), spin=(0.0, 4.0, 0.0))}
-    >>> contact = rolling(wheel.at(axis=(0.0, 1.0, 0.0)), lj.ground.at(), radius=0.5)
-    >>> print(contact["touches"].g(0.0, q, None), contact["rolls"].phi(0.0, q, v, None))
-    0.0 [0. 0.]
-
-    **Returns:** {"touches": `Holonomic`, "rolls": `Nonholonomic`}.
-
-    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
-
-    Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
-    """
-    contact = _on_plane(wheel, floor, radius, lambda n, a: n - jnp.dot(n, a) * a)
-    looks(contact["touches"].function, disk(wheel, radius))
-    return contact
-
-
-def rolling_sphere(ball: Marker, floor: Marker, radius) -> dict[str, Holonomic | Nonholonomic]:
-    """Let a sphere roll on a plane without slipping; `ball` is its centre, the rest as in `lj.rolling`.
-
-    >>> import lagjax as lj
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> contact = rolling_sphere(ball.at(), lj.ground.at(), radius=1.0)
-    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
-    0.25
-
-    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
-    """
-    contact = _on_plane(ball, floor, radius, lambda n, a: n)
-    looks(contact["touches"].function, sphere(ball, radius))
-    return contact
-
-
-def _on_plane(wheel: Marker, floor: Marker, radius, down) -> dict[str, Holonomic | Nonholonomic]:
-    _check_two(wheel, floor)
-
-    def arm(q: PyTree, params: PyTree) -> Array:
-        d = down(floor.axis(q), wheel.axis(q))
-        return -valued(radius, params) * d / jnp.sqrt(jnp.sum(d**2))
-
-    def touches(t, q, params):
-        return jnp.dot(wheel.position(q, params) + arm(q, params) - floor.position(q, params), floor.axis(q))
-
-    def rolls(t, q, v, params):
-        to_rim = arm(q, params)
-        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), to_rim)
-        from_floor = wheel.position(q, params) + to_rim - floor.position(q, params)
-        of_floor = floor.velocity(q, v, params) + jnp.cross(floor.body.spin(q, v), from_floor)
-        return floor.axes(q)[:2] @ (of_wheel - of_floor)
-
-    return {"touches": Holonomic(touches), "rolls": Nonholonomic(rolls)}
-
-
 def named(joints: Mapping[str, Holonomic | Nonholonomic | Mapping]) -> dict[str, Holonomic | Nonholonomic]:
     """Joints by name, those of several parts as "wheel touches", "wheel rolls"."""
     parts = {name: joint if isinstance(joint, Mapping) else {"": joint} for name, joint in joints.items()}
@@ -271,11 +206,12 @@ class Joined:
 
 
 def _joined(a: Marker, b: Marker, *rows: Callable) -> Holonomic:
-    _check_two(a, b)
+    check_two(a, b)
     return Holonomic(Joined(a, b, rows))
 
 
-def _check_two(a: Marker, b: Marker):
+def check_two(a: Marker, b: Marker):
+    """Raise a `TypeError` unless both are markers, and a `ValueError` for two on one body."""
     check_markers("a joint joins two places on bodies", a, b)
     if a.body == b.body:
         raise ValueError(

@@ -6,7 +6,7 @@ import numpy as np
 
 from lagjax.display.in_space.scenery import InSpace
 from lagjax.display.in_space.shapes import Shape
-from lagjax.display.in_space.surfaces import Surface
+from lagjax.display.in_space.surfaces import Faces
 from lagjax.display.in_space.view import Grid, View, labelled
 from lagjax.display.plots import COLOURS
 
@@ -71,7 +71,7 @@ def trails(motion: InSpace, view: View) -> list[Mark]:
     return found
 
 
-def _faces(vertices: np.ndarray, surface: Surface, color, view: View):
+def _faces(vertices: np.ndarray, surface: Faces, color, view: View):
     at, near, _ = view.seen(vertices)
     faces, p = surface.faces, vertices[surface.faces]
     normal = np.cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1])

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display.in_space.surfaces import Surface
+from lagjax.display.in_space.surfaces import Faces
 
 COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 
@@ -41,7 +41,7 @@ class Shape:
 
     kind: str
     anchors: tuple[Anchor, ...]
-    surface: Surface | None = None
+    surface: Faces | None = None
     size: Any = (1.0, 1.0, 1.0)
     color: str | None = None
 

@@ -16,7 +16,7 @@ PIECES, SIDES, BELTS = 3, 20, 10
 SECTORS = 4
 
 
-class Surface(NamedTuple):
+class Faces(NamedTuple):
     """Flat faces: `vertices` (n, 3); `faces` (m, 4), the last two equal for a triangle, anticlockwise from outside;
     `light` (m,), from 0 to 1: how much lighter a face is; `closed`: whether those that look away are hidden.
     """
@@ -27,7 +27,7 @@ class Surface(NamedTuple):
     closed: bool
 
 
-def surface(vertices: ArrayLike, faces: Sequence[Sequence[int]]) -> Surface:
+def surface(vertices: ArrayLike, faces: Sequence[Sequence[int]]) -> Faces:
     """The surface with these vertices (n, 3) and faces, each of three or more indices of its corners in order.
 
     >>> print(surface([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]).faces)
@@ -50,7 +50,7 @@ def surface(vertices: ArrayLike, faces: Sequence[Sequence[int]]) -> Surface:
     # A polygon of more than four corners becomes a fan of triangles.
     fans = [_fan(face) if len(face) > 4 else np.resize(np.append(face, face[-1]), 4)[None] for face in corners]
     found = np.concatenate(fans) if fans else np.zeros((0, 4), int)
-    return Surface(points, found, np.zeros(len(found)), closed=False)
+    return Faces(points, found, np.zeros(len(found)), closed=False)
 
 
 def _fan(face: np.ndarray):
@@ -66,9 +66,9 @@ def _patch(count_u: int, count_v: int, point):
     return np.asarray(point(u.reshape(-1), v.reshape(-1)), float).T, faces, i, j
 
 
-def _together(parts, closed: bool) -> Surface:
+def _together(parts, closed: bool) -> Faces:
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
-    return Surface(
+    return Faces(
         np.concatenate([vertices for vertices, _, _ in parts]),
         np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts)]),
         np.concatenate([light for _, _, light in parts]),
@@ -76,7 +76,7 @@ def _together(parts, closed: bool) -> Surface:
     )
 
 
-def _cube() -> Surface:
+def _cube() -> Faces:
     """Edges of length one about the origin."""
     parts = []
     for axis in range(3):
@@ -105,7 +105,7 @@ def _ring(z0: float, z1: float, r0: float, r1: float, pieces: int):
     return vertices, faces, i * SECTORS // SIDES % 2
 
 
-def _cylinder(caps: bool) -> Surface:
+def _cylinder(caps: bool) -> Faces:
     """Of radius one and length one about the z axis."""
     tops = [_ring(0.5, 0.5, 1.0, 0.0, 1), _ring(-0.5, -0.5, 0.0, 1.0, 1)]
     side = _ring(-0.5, 0.5, 1.0, 1.0, PIECES)
@@ -114,7 +114,7 @@ def _cylinder(caps: bool) -> Surface:
     return _together([(vertices, faces, 0 * light) for vertices, faces, light in (side, *tops)], closed=True)
 
 
-def _sphere() -> Surface:
+def _sphere() -> Faces:
     """Of radius one."""
 
     def point(u: np.ndarray, v: np.ndarray):
@@ -122,13 +122,13 @@ def _sphere() -> Surface:
         return r * np.cos(2 * np.pi * u), r * np.sin(2 * np.pi * u), -np.cos(np.pi * v)
 
     vertices, faces, i, j = _patch(SIDES, BELTS, point)
-    return Surface(vertices, faces, (i * SECTORS // SIDES + j * 2 // BELTS) % 2, closed=True)
+    return Faces(vertices, faces, (i * SECTORS // SIDES + j * 2 // BELTS) % 2, closed=True)
 
 
-def _disk() -> Surface:
+def _disk() -> Faces:
     """Of radius one in the plane z = 0, seen from both sides."""
     vertices, faces, light = _ring(0.0, 0.0, 1.0, 0.0, 2)
-    return Surface(vertices, faces, light, closed=False)
+    return Faces(vertices, faces, light, closed=False)
 
 
 CUBE, CYLINDER, TUBE, SPHERE, DISK = _cube(), _cylinder(caps=True), _cylinder(caps=False), _sphere(), _disk()

@@ -1,0 +1,152 @@
+"""Balls and disks that roll on surfaces f = 0, against closed forms (Routh, *Advanced Rigid Dynamics*, §§ 214-224)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from lagjax.bodies.rolling import tangents
+
+G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
+MASS = 1.3
+
+
+def quadric(r, params):
+    """c + b·r + Σ d_i r_i², a sphere, a cylinder or a plane by its numbers."""
+    return params["c"] + jnp.dot(params["b"], r) + jnp.sum(params["d"] * r**2)
+
+
+def rolling_ball():
+    """A solid ball on a quadric, under its weight."""
+    ball = lj.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3)
+    contact = lj.rolling_sphere(ball.at(), lj.Surface(quadric), SMALL)
+    return lj.multibody([ball], {"wall": contact}, [lj.weight([ball])])
+
+
+def numbers(c, b, d):
+    """Parameters of a quadric."""
+    return {"c": jnp.asarray(c), "b": jnp.asarray(b), "d": jnp.asarray(d)}
+
+
+IN_CYLINDER = numbers(LARGE**2, (0.0, 0.0, 0.0), (-1.0, -1.0, 0.0))
+
+
+def in_the_cylinder(turning, upwards, about_radius):
+    """A ball that rolls inside a vertical cylinder: v + ω × a e_r = 0."""
+    angle, path = 0.7, LARGE - SMALL
+    radial, across, up = np.array(
+        [[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0], [0, 0, 1]]
+    )
+    spin = about_radius * radial + upwards / SMALL * across - path * turning / SMALL * up
+    pose = lj.Pose.at(path * radial, (1.0, 2.0, 0.0), 0.4)
+    return {"ball": pose}, {"ball": pose.moving(path * turning * across + upwards * up, spin)}
+
+
+def on_a_slope(path, angle, speed):
+    """Place, direction and velocity of a ball on a circle about the origin, at an angle from the upward vertical."""
+    place = np.array([path * np.sin(angle), 0.0, path * np.cos(angle)])
+    along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    return place, along, speed * along
+
+
+@pytest.mark.slow
+def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
+    """Its acceleration: z'' (1 + k) = -g - k a Ω ω_r in a vertical cylinder; g sin θ/(1 + k) along a slope."""
+    system, sphere = rolling_ball(), (1.0, 1.0, 1.0)
+    turning, about_radius = 3.0, 2.0
+    q, v = in_the_cylinder(turning, 0.5, about_radius)
+    for residual in lj.constraint_residual(system, 0.0, q, v, IN_CYLINDER).values():
+        np.testing.assert_allclose(residual, 0.0, atol=1e-14)
+    a, _ = lj.accelerations(system, 0.0, q, v, IN_CYLINDER)
+    expected = -(G + SHARE * SMALL * turning * about_radius) / (1 + SHARE)
+    np.testing.assert_allclose(a["ball"].position[2], expected, rtol=1e-12)
+    radial = q["ball"].position * np.array([1.0, 1.0, 0.0])
+    np.testing.assert_allclose(a["ball"].position[:2], -(turning**2) * radial[:2], rtol=1e-12)
+
+    zero = (0.0, 0.0, 0.0)
+    for path, side, params in (
+        (LARGE - SMALL, 1.0, numbers(LARGE**2, zero, tuple(-x for x in sphere))),
+        (LARGE + SMALL, -1.0, numbers(-(LARGE**2), zero, sphere)),
+    ):
+        angle, speed = (2.6 if side > 0 else 0.4), 0.7
+        place, along, velocity = on_a_slope(path, angle, speed)
+        # v + ω × arm = 0: the point of contact lies outwards of the centre in a bowl, and inwards on a globe.
+        spin = np.cross(velocity, side * place / path) / SMALL
+        pose = lj.Pose.at(place)
+        q, v = {"ball": pose}, {"ball": pose.moving(velocity, spin)}
+        for residual in lj.constraint_residual(system, 0.0, q, v, params).values():
+            np.testing.assert_allclose(residual, 0.0, atol=1e-14)
+        a, _ = lj.accelerations(system, 0.0, q, v, params)
+        expected = G * np.sin(angle) / (1 + SHARE) * along - speed**2 / path * place / path
+        np.testing.assert_allclose(a["ball"].position, expected, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_ball_goes_up_and_down_in_a_cylinder():
+    """Its height is harmonic, with √(2/7) of the frequency with which it goes round; also the derivative by z'."""
+    system, turning, about_radius = rolling_ball(), 6.0, -3.0
+    rate = turning * np.sqrt(SHARE / (1 + SHARE))
+    ts = jnp.linspace(0.0, 2 * np.pi / rate, 7)
+
+    def height(upwards):
+        q, v = in_the_cylinder(turning, 0.0, about_radius)
+        moving = v["ball"]
+        across = jnp.array([-np.sin(0.7), np.cos(0.7), 0.0])
+        more = q["ball"].moving(upwards * jnp.array([0.0, 0.0, 1.0]), upwards / SMALL * across)
+        v = {"ball": jax.tree.map(jnp.add, moving, more)}
+        traj = lj.integrate(system, q, v, IN_CYLINDER, ts=ts, rtol=1e-11, atol=1e-11)
+        return traj.q["ball"].position[:, 2]
+
+    found, slope = jax.jvp(height, (jnp.asarray(0.5),), (jnp.asarray(1.0),))
+    fall = -(G + SHARE * SMALL * turning * about_radius) / (1 + SHARE)
+    expected = 0.5 / rate * np.sin(rate * ts) + fall / rate**2 * (1 - np.cos(rate * ts))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(slope, np.sin(rate * ts) / rate, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_point_of_contact():
+    """On an ellipsoid balls and wheels touch where f is least on them: g = 0 there, and grows as the distance."""
+    squares = np.array([4.0, 2.0, 1.0])
+    inside = lj.Surface(lambda r, params: 1.0 - jnp.sum(r**2 / squares))
+    place = np.sqrt(squares) * np.array([0.48, 0.6, 0.64])
+    normal = -place / squares / np.linalg.norm(place / squares)
+    body = lj.Body("wheel", 1.0, (1.0, 1.0, 1.0))
+    ball, wheel = lj.rolling_sphere(body.at(), inside, 0.1), lj.rolling(body.at(), inside, 0.1)
+    turned = lj.Pose.at(axis=(1.0, 2.0, 0.5), angle=0.8)
+    axis = np.asarray(body.direction({"wheel": turned}, (0.0, 0.0, 1.0)))
+    to_rim = normal - (normal @ axis) * axis
+    for contact, arm in ((ball, 0.1 * normal), (wheel, 0.1 * to_rim / np.linalg.norm(to_rim))):
+
+        def gap(height, contact=contact, arm=arm):
+            return contact["touches"].g(0.0, {"wheel": turned._replace(position=place + arm + height * normal)}, None)
+
+        value, slope = jax.jit(lambda x, gap=gap: jax.jvp(gap, (x,), (jnp.ones_like(x),)))(jnp.asarray(0.0))
+        np.testing.assert_allclose(value, 0.0, atol=1e-15)
+        np.testing.assert_allclose(slope, 1.0, rtol=1e-13)
+    # Straight below the centre is not where it touches.
+    centre = place + 0.1 * normal
+    down = -centre / squares / np.linalg.norm(centre / squares)
+    assert abs(1.0 - np.sum((centre - 0.1 * down) ** 2 / squares)) > 5e-5
+
+
+def test_tangents():
+    """Two unit vectors at right angles to each other and to the normal, whatever it is."""
+    for seed in range(5):
+        normal = np.random.default_rng(seed).normal(size=3)
+        normal = normal / np.linalg.norm(normal)
+        both = np.asarray(tangents(jnp.asarray(normal), jnp.eye(3)))
+        np.testing.assert_allclose(both @ both.T, np.eye(2), atol=1e-14)
+        np.testing.assert_allclose(both @ normal, 0.0, atol=1e-14)
+
+
+def test_what_is_no_surface():
+    """Surfaces that are none are refused with the way to write one."""
+    with pytest.raises(TypeError, match="takes a function f.r, params., not float.\nFix: lj.Surface"):
+        lj.Surface(1.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="is on a marker, and Body is none"):
+        lj.Surface(lambda r, params: r[2], on=lj.Body("table", 1.0, (1.0, 1.0, 1.0)))
+    ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="both places are on 'ball'"):
+        lj.rolling_sphere(ball.at(), lj.Surface(lambda r, params: r[2], on=ball.at()), 1.0)
