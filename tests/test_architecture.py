@@ -9,6 +9,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import jax.numpy as np
@@ -30,6 +31,12 @@ OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pa
 OPTIONAL |= {"casadi", "mujoco", "zarr"}
 
 
+@cache
+def nodes_of(source):
+    """The nodes of a source, the module first; parsed once for all tests."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
 def room(module):
     """The room of a dotted module name, `lagjax.integrate.solve.programs` -> "integrate"."""
     parts = module.split(".")
@@ -42,10 +49,11 @@ def module_name(path):
     return ".".join(part for part in parts if part != "__init__")
 
 
+@cache
 def internal_imports(source):
     """Every `lagjax.*` module that a source imports; names of modules imported from packages included."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names if alias.name.split(".")[0] == "lagjax"}
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "lagjax":
@@ -67,7 +75,7 @@ def upward_imports(name, source):
 def nested_imports(source):
     """Imports inside functions, except of optional extras."""
     found = []
-    for function in ast.walk(ast.parse(source)):
+    for function in nodes_of(source):
         if isinstance(function, (ast.FunctionDef, ast.AsyncFunctionDef)):
             for node in ast.walk(function):
                 if isinstance(node, (ast.Import, ast.ImportFrom)):
@@ -97,9 +105,10 @@ def door(module):
     return ".".join(parts[: 3 if parts[1] == "analysis" and (ROOT / Path(*parts[1:3])).is_dir() else 2])
 
 
+@cache
 def handed_out(package):
     """The names that the `__init__` of a package imports or assigns."""
-    tree = ast.parse((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())
+    tree = nodes_of((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())[0]
     imported = [alias.asname or alias.name for x in tree.body if isinstance(x, ast.ImportFrom) for alias in x.names]
     targets = [target for x in tree.body if isinstance(x, ast.Assign) for target in x.targets]
     assigned = [target.id for target in targets if isinstance(target, ast.Name)]
@@ -109,7 +118,7 @@ def handed_out(package):
 def past_the_door(name, source):
     """The imports of a module from other rooms that these do not hand out."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             modules = [alias.name for alias in node.names if alias.name.startswith("lagjax.")]
             found += [module for module in modules if room(module) != room(name) and module != door(module)]
@@ -206,7 +215,7 @@ def test_the_page_of_the_house():
 def private_imports(source):
     """The modules of JAX without a stability guarantee that a source imports."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -260,7 +269,7 @@ def test_files_are_small():
 def test_modules_and_public_names_have_docstrings():
     """Every module, and every public function and class in it, has a docstring."""
     for path in FILES:
-        tree = ast.parse(path.read_text())
+        tree = nodes_of(path.read_text())[0]
         assert ast.get_docstring(tree), module_name(path)
         for node in tree.body:
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
@@ -289,7 +298,7 @@ def test_exports():
 def written_examples(source):
     """The names of everything whose docstring has an example; "" for the module."""
     documented = (ast.FunctionDef, ast.ClassDef, ast.Module)
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, documented)]
+    nodes = [node for node in nodes_of(source) if isinstance(node, documented)]
     return {getattr(node, "name", "") for node in nodes if ">>>" in (ast.get_docstring(node) or "")}
 
 
@@ -316,7 +325,7 @@ def test_types_are_shipped():
 
 def absent(source: str) -> list[str]:
     """What a file reads from modules of lagjax that these do not have, such as `balance.holonomic` after a renaming."""
-    nodes = list(ast.walk(ast.parse(source)))
+    nodes = nodes_of(source)
     modules = {}
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lagjax"):
