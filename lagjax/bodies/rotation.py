@@ -13,6 +13,11 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from lagjax.jaxtools import judging
+
+# Not a jump of a force that reads a quaternion: e and -e are one rotation.
+_is_larger = judging(jnp.greater)
+
 
 def product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """The quaternion that turns as `b` and then as `a`."""
@@ -66,5 +71,6 @@ def quaternion_of(turned: Float[Array, "3 3"]) -> Float[Array, "4"]:
     ]
     best, largest = rows[0], rows[0][0]
     for k in (1, 2, 3):
-        best, largest = (jnp.where(rows[k][k] > largest, x, y) for x, y in ((rows[k], best), (rows[k][k], largest)))
+        is_larger = _is_larger(rows[k][k], largest)
+        best, largest = (jnp.where(is_larger, x, y) for x, y in ((rows[k], best), (rows[k][k], largest)))
     return best / (2 * jnp.sqrt(largest))

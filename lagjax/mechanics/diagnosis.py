@@ -22,9 +22,11 @@ OFF_ABOVE = 1e-6
 
 def explain_failure(model: Model, s: coordinates.State) -> str | None:
     """Say in the user's names why the equations fail at a state; None where they do not."""
-    if model.solves_itself and (disagreement := explain_disagreement(model, s)):
-        return disagreement
     found = examined(model, s)
+    # What divides by a singular matrix does not solve its equations either.
+    if model.solves_itself and not explain_singular(np.asarray(found.matrix), model, s):
+        if disagreement := explain_disagreement(model, s):
+            return disagreement
     linear, rows, lagrangian = found.linear, found.rows, found.lagrangian
     names = model.names
     place = where(s)

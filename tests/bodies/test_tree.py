@@ -217,6 +217,35 @@ def test_what_is_no_tree_is_refused():
         lj.Tree([a], {"x": hinge}).system([hinge])
 
 
+def test_armature_and_frames_that_are_none_are_refused():
+    """Rotors of no joint or without an inertia, frames that carry nothing, moments without a mass."""
+    frame, rod = lj.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.Body("rod", 1.0, (1.0, 1.0, 1.0))
+    hinge, on = lj.revolute(lj.ground.at(), rod.at()), lj.revolute(rod.at(), frame.at())
+    for bodies, joints, armature, said in (
+        ([rod], {"x": hinge}, {"y": 1.0}, "armature 'y' belongs to no joint"),
+        ([rod], {}, {"rod": 1.0}, "armature 'rod' belongs to no joint"),
+        ([rod], {"x": hinge}, {"x": -1.0}, "must be a moment of inertia that is not negative"),
+        ([rod], {"x": [hinge]}, {"x": (1.0, 2.0)}, "or \\(1,\\) of them"),
+        ([rod, frame], {"x": hinge, "y": on}, {}, "'frame' moves and has no mass"),
+        ([frame], {}, {}, "'frame' moves and has no mass"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            lj.Tree(bodies, joints, armature)
+    with pytest.raises(ValueError, match="the mass of 'x' must be positive"):
+        lj.Body("x", 0.0, (1.0, 1.0, 1.0))
+
+
+@pytest.mark.exhaustive
+def test_a_singular_tree():
+    """Two hinges about one axis with nothing between them are named as singular, not as a wrong recursion."""
+    frame, rod = lj.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.Body("rod", 1.0, (1.0, 1.0, 1.0))
+    last = lj.revolute(frame.at(), rod.at((1.0, 0.0, 0.0)))
+    twice = lj.Tree([frame, rod], {"x": lj.revolute(lj.ground.at(), frame.at()), "y": last})
+    q = {"x": 0.1, "y": 0.2}
+    with pytest.raises(ValueError, match="singular"):
+        lj.accelerations(twice.system(), 0.0, q, q, None)
+
+
 @pytest.mark.exhaustive
 def test_a_closed_loop():
     """A four-bar closed by a joint moves as with angles solved by hand: a parallelogram's coupler does not turn."""
