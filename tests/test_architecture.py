@@ -32,9 +32,15 @@ OPTIONAL |= {"casadi", "mujoco", "zarr"}
 
 
 @cache
+def tree_of(source):
+    """The syntax tree of a source, parsed once for all tests."""
+    return ast.parse(source)
+
+
+@cache
 def nodes_of(source):
-    """The nodes of a source, the module first; parsed once for all tests."""
-    return tuple(ast.walk(ast.parse(source)))
+    """All nodes of a source."""
+    return tuple(ast.walk(tree_of(source)))
 
 
 def room(module):
@@ -108,7 +114,7 @@ def door(module):
 @cache
 def handed_out(package):
     """The names that the `__init__` of a package imports or assigns."""
-    tree = nodes_of((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())[0]
+    tree = tree_of((ROOT.parent / Path(*package.split(".")) / "__init__.py").read_text())
     imported = [alias.asname or alias.name for x in tree.body if isinstance(x, ast.ImportFrom) for alias in x.names]
     targets = [target for x in tree.body if isinstance(x, ast.Assign) for target in x.targets]
     assigned = [target.id for target in targets if isinstance(target, ast.Name)]
@@ -269,7 +275,7 @@ def test_files_are_small():
 def test_modules_and_public_names_have_docstrings():
     """Every module, and every public function and class in it, has a docstring."""
     for path in FILES:
-        tree = nodes_of(path.read_text())[0]
+        tree = tree_of(path.read_text())
         assert ast.get_docstring(tree), module_name(path)
         for node in tree.body:
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
