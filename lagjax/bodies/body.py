@@ -124,6 +124,12 @@ class Body:
         def unit_quaternion(t, q, params):
             return (jnp.sum(self.pose(q).quaternion ** 2) - 1) / 2
 
+        def restored(q: PyTree) -> PyTree:
+            pose = self.pose(q)
+            return {**q, self.name: pose._replace(quaternion=pose.quaternion / jnp.sqrt(jnp.sum(pose.quaternion**2)))}
+
+        # How `lj.consistent_state` looks for a state if none was found otherwise.
+        setattr(unit_quaternion, "restored", restored)
         return Holonomic(unit_quaternion)
 
     def pose(self, q: PyTree) -> Pose:

@@ -25,7 +25,7 @@ from lagjax.bodies.body import Ground, Marker, ground, valued
 from lagjax.bodies.joints import check_two
 from lagjax.bodies.shapes import disk, looks, sphere
 from lagjax.numerics import dense, newton
-from lagjax.system import Holonomic, Nonholonomic
+from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
 # The most steps of Newton's to the point of contact; from the one below the centre it takes some five.
 MOST = 20
@@ -62,6 +62,7 @@ class Surface:
                 f"a lj.Surface takes a function f(r, params), not {type(self.f).__name__}.\n"
                 "Fix: lj.Surface(lambda r, params: r[2] - r[0] ** 2)."
             )
+        check_arguments(Call("f", self.f, ("r", "params"), " of lj.Surface"), "x, y and z as three arguments")
         if isinstance(self.on, Ground):
             object.__setattr__(self, "on", self.on.at())
         if not isinstance(self.on, Marker):

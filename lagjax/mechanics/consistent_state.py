@@ -17,6 +17,7 @@ Source: Nocedal & Wright, *Numerical Optimization*, §18.1 (Newton-KKT) and §11
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -34,7 +35,7 @@ from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.projection import departures, within
 from lagjax.mechanics.saddle_point import displacement_map
 from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, largest, last_step, newton
-from lagjax.system import Model, State, System, constraints, coordinates, prepare
+from lagjax.system import Holonomic, Model, State, System, constraints, coordinates, prepare
 
 TO_REACH = 40
 STAGES, PER_STAGE = 16, 3
@@ -96,8 +97,40 @@ def consistent_state(
     if is_traced((q, v)):
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), (q, v))
     if not reached:
+        exact = with_exact(system)
+        if exact is not system:
+            return consistent_state(
+                exact, t, q, v, params, hold, hold_position=hold_position, hold_velocity=hold_velocity
+            )
         raise ValueError(_unreachable(model, s, q, v, free, free_velocity))
     return q, v
+
+
+def with_exact(system: System) -> System:
+    """The system whose other constraints are evaluated where those that say how hold exactly; itself if none say so.
+
+    The function of a constraint may have an attribute `restored`, q -> q. So a loop that cannot close says by how much,
+    of bodies whose quaternions have length one, and not of stretched ones.
+    """
+    exact = {name: getattr(c.function, "restored", None) for name, c in system.constraints.items()}
+    if not any(exact.values()):
+        return system
+
+    def restored(q: PyTree) -> PyTree:
+        for restore in filter(None, exact.values()):
+            q = restore(q)
+        return q
+
+    def evaluated(c: Holonomic, where: Callable) -> Holonomic:
+        return Holonomic(lambda t, q, params: c.g(t, where(q), params))
+
+    return replace(
+        system,
+        constraints={
+            name: evaluated(c, restored if exact[name] is None else lambda q: q) if isinstance(c, Holonomic) else c
+            for name, c in system.constraints.items()
+        },
+    )
 
 
 def free_coordinates(q: PyTree, hold, argument: str = "hold") -> np.ndarray:

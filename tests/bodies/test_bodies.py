@@ -285,3 +285,20 @@ def test_an_arm_in_space():
     for link in links:
         np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-12)
         np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_loop_that_cannot_close():
+    """A rod of length 1 between places 1.5 apart misses them by 0.5, in lengths: it is not stretched."""
+    rod = lj.Body("rod", 2.0, (0.2, 0.2, 0.01))
+    left = lj.spherical(lj.ground.at((0.0, 0.0, 0.0)), rod.at((0.0, 0.0, -0.5)))
+    right = lj.spherical(lj.ground.at((1.5, 0.0, 0.0)), rod.at((0.0, 0.0, 0.5)))
+    system = lj.multibody([rod], {"left": left, "right": right})
+    pose = lj.Pose.at((0.7, 0.0, 0.1), (0.0, 1.0, 0.0), 1.4)
+    with pytest.raises(ValueError, match="no consistent state was found") as found:
+        lj.consistent_state(system, 0.0, {"rod": pose}, {"rod": pose.moving()}, None)
+    said = str(found.value).split("reached, constraint ")[1].split("\n")[0]
+    missed = [(part.split("'")[1], float(part.split("=")[1].rstrip(". "))) for part in said.split(", ")]
+    by = {side: np.sqrt(sum(x**2 for name, x in missed if name.startswith(side))) for side in ("left", "right")}
+    np.testing.assert_allclose(by["left"] + by["right"], 0.5, rtol=5e-3)
+    assert all(abs(x) < 1e-5 for name, x in missed if name == "rod is turned")

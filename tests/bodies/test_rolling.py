@@ -145,6 +145,8 @@ def test_what_is_no_surface():
     """Surfaces that are none are refused with the way to write one."""
     with pytest.raises(TypeError, match="takes a function f.r, params., not float.\nFix: lj.Surface"):
         lj.Surface(1.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="of lj.Surface"):
+        lj.Surface(lambda x, y, z: z)
     with pytest.raises(TypeError, match="is on a marker, and Body is none"):
         lj.Surface(lambda r, params: r[2], on=lj.Body("table", 1.0, (1.0, 1.0, 1.0)))
     ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
