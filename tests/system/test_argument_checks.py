@@ -44,7 +44,7 @@ DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "equilibria": (lambda system: lj.equilibria(system, PARAMS, starts=[1.0]), False),
     "continue_equilibria": (lambda system: lj.continue_equilibria(system, PARAMS, 1.0, along="g", to=3.0), False),
     "periodic_orbit": (lambda system: lj.periodic_orbit(system, (1.0, 0.0), 2.0, PARAMS), True),
-    "lyapunov_exponents": (lambda system: lj.lyapunov_exponents(system, 1.0, 0.0, PARAMS, ts=TS), False),
+    "lyapunov_exponents": (lambda system: lj.lyapunov_exponents(system, 1.0, 0.0, PARAMS, ts=TS), True),
     "work_precision": (lambda system: lj.work_precision(system, 1.0, 0.0, PARAMS, ts=TS), False),
     "horizons": (lambda system: lj.horizons(system, 1.0, 0.0, PARAMS, period=2.0), False),
     "fit": (lambda system: lj.fit(system, RECORD, PARAMS), True),

@@ -17,6 +17,9 @@ which the accelerations at some times, for a state off the motion, repeat:
 There are more equations than unknowns if a conserved quantity makes some of them redundant. The flow carries tangents
 with respect to μ and `log T` together with those with respect to the state.
 
+Of a motion with switches the flow is that of `switching_flow.py`: the branch ends where other switches occur in its
+cycles. A drive is then seen in the accelerations of the first phase, and c are the constraints of that phase.
+
 Along a branch two functions of the monodromy matrix N are monitored. With the rows Q of its trivial
 directions and P = 1 - QᵀQ,
 
@@ -37,13 +40,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.analysis.continuation.arclength import BranchPoint, Tracer
 from lagjax.analysis.orbits.flow import Changes, Flow
 from lagjax.analysis.orbits.monodromy import Reasons, directions, orthonormal
 from lagjax.analysis.orbits.shooting import TURN, OrbitRequest, integral_at
+from lagjax.analysis.orbits.switching_flow import SwitchingFlow
 from lagjax.analysis.params_by_name import Number
+from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled
 
 # Times, in periods, at which the accelerations of a driven system are compared.
@@ -86,7 +91,7 @@ class OrbitFrame(eqx.Module):
     - `free` (d, N), `reference` (N,): V and y_0, the fixed combinations of unknowns and the point they refer to.
     """
 
-    flow: Flow
+    flow: Flow | SwitchingFlow
     t: Float[Array, ""]
     scale: Float[Array, " 2n"]
     period: Float[Array, ""]
@@ -104,11 +109,11 @@ class OrbitFrame(eqx.Module):
     reasons: Reasons = eqx.field(static=True)
     parts: int = eqx.field(static=True)
 
-    def split(self, z) -> tuple[Flow, Float[Array, "K 2n"], Float[Array, ""]]:
+    def split(self, z) -> tuple[Flow | SwitchingFlow, Float[Array, "K 2n"], Float[Array, ""]]:
         """The flow at a point, the nodes and the period."""
         flow, value = self.flow, z[-1] * self.unit
         if self.along.number is not None:
-            flow = replace(flow, model=flow.model.of(self.along.number.put(flow.model.params, value)))
+            flow = flow.of(self.along.number.put(flow.model.params, value))
         nodes = z[:-2].reshape(self.parts, -1) * self.scale[None]
         return flow, nodes, self.period * jnp.exp(z[-2])
 
@@ -119,7 +124,7 @@ class Evaluated(NamedTuple):
     - `whole` (k, k): the monodromy matrix in tangent coordinates; `trivial` (r, k): orthonormal rows of its trivial
       directions; `there` (r,): which of these exist.
     - `guide`: the guide for the next point. `amplified`: the largest entry of a tangent frame. `apart`: how much a
-      driven system has changed after the period.
+      driven system has changed after the period. `ways` (S,): the switches in a period; None without phases.
     """
 
     value: Float[Array, " R"]
@@ -131,6 +136,7 @@ class Evaluated(NamedTuple):
     guide: Guide
     amplified: Float[Array, ""]
     apart: Float[Array, ""]
+    ways: Int[Array, " S"] | None
 
 
 @compiled
@@ -157,14 +163,25 @@ def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
     jacobian = jnp.concatenate([slopes, jax.jacfwd(others)(z)])
 
     good = jnp.all(passed.ended) & jnp.all(jnp.isfinite(jacobian))
-    rate = flow.rate(times[0], nodes[0]) * period / scale
+    if passed.returns is not None:
+        good = good & jnp.all(passed.returns)
+    rate = flow.rates(times, nodes, passed, span)[0]
+    whole, trivial, there = _monodromy(frame, flow, times[0], nodes[0], passed.frame[:, :, :size], rate * period)
+    rate = rate * period / scale
     length = jnp.linalg.norm(rate)
-    whole, trivial, there = _monodromy(frame, flow, times[0], nodes[0], passed.frame[:, :, :size], length)
     return Evaluated(
         jnp.where(good, value, jnp.nan), jacobian, jnp.max(jnp.abs(value)), whole, trivial, there,
         Guide(nodes[0] / scale, rate / jnp.where(length > 0, length, 1.0)),
-        jnp.max(jnp.abs(passed.frame)), _apart(frame, flow, period),
+        jnp.max(jnp.abs(passed.frame)), _apart(frame, flow.start, period), _ways(passed.switches),
     )  # fmt: skip
+
+
+def _ways(switches: Switches | None):
+    """Which switches occur, and into which modes of elements they lead."""
+    if switches is None:
+        return None
+    ways = switches.way[-1]
+    return ways if switches.modes is None else jnp.concatenate([ways[:, None], switches.modes[-1]], axis=1)
 
 
 def _times(frame, period):
@@ -215,7 +232,7 @@ def _others(frame: OrbitFrame, z, guide):
     along, asked, value = frame.along, frame.asked, z[-1] * frame.unit
     parts = []
     if flow.dimension < frame.scale.size:
-        off = jax.vmap(flow.residual)(_times(frame, period), nodes)
+        off = jax.vmap(flow.start.residual)(_times(frame, period), nodes)
         parts.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
     if asked.moves:
@@ -223,12 +240,12 @@ def _others(frame: OrbitFrame, z, guide):
     if along.kind == PERIOD:
         parts.append((period - value)[None] / frame.period)
     elif frame.drive is not None:
-        parts.append(drive_off(frame, flow, period)[None])
+        parts.append(drive_off(frame, flow.start, period)[None])
     elif not asked.free:
         parts.append(z[-2:-1])
     if asked.energy or along.kind == ENERGY:
         goal = value if along.kind == ENERGY else frame.integral
-        parts.append((integral_at(flow, frame.t, nodes[0]) - goal)[None] / frame.slope)
+        parts.append((integral_at(flow.start, frame.t, nodes[0]) - goal)[None] / frame.slope)
     parts += [(first[i] - frame.z[i] / frame.scale[i])[None] for i in asked.held]
     if along.kind == ENTRY:
         parts.append((first[along.entry] - value / frame.scale[along.entry])[None])
@@ -279,15 +296,21 @@ def _monodromy(frame, flow, t, z, frames, rate):
     basis, whole = flow.tangent_space(t, z, frame.scale), jnp.eye(z.size, dtype=z.dtype)
     for part in frames:
         whole = part @ whole
-    rows = directions(flow, frame.reasons, t, z, flow.rate(t, z), frame.scale, basis)
-    trivial, there = orthonormal(frame.reasons, rows, jnp.maximum(TURN, 1e-3 * rate))
+    rows = directions(flow, frame.reasons, t, z, rate, frame.scale, basis)
+    length = jnp.linalg.norm(rate / frame.scale)
+    trivial, there = orthonormal(frame.reasons, rows, jnp.maximum(TURN, 1e-3 * length))
     return basis.T @ whole @ basis, trivial, there
 
 
 @compiled
 def path_at(frame: OrbitFrame, z):
-    """Times from the start (P,) and the states at them (P, 2n), computed with a few fixed steps for plots."""
+    """Times from the start (P,) and the states at them (P, 2n), computed with a few fixed steps for plots.
+
+    Of a motion with switches by `integrate`, with NaN in spare rows.
+    """
     flow, nodes, period = frame.split(z)
+    if isinstance(flow, SwitchingFlow):
+        return flow.path(frame.t, nodes[0], period, POINTS)
     each, span = -(-POINTS // frame.parts), period / frame.parts
     states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(_times(frame, period), nodes)
     states = jnp.concatenate([states[:, :-1].reshape(-1, frame.scale.size), states[-1, -1:]])
@@ -315,7 +338,7 @@ def drive_by_parameter(frame: OrbitFrame, z):
 
     def off(z):
         flow, _, period = frame.split(z)
-        return drive_off(frame, flow, period)
+        return drive_off(frame, flow.start, period)
 
     by_all = jax.grad(off)(z)
     return -by_all[-1] / by_all[-2]
@@ -360,10 +383,21 @@ class OrbitTracer(Tracer):
         self.unit = float(frame.unit)
         self.amplified = 1.0
         self.cached: tuple[bytes, Evaluated] | None = None
+        # The switches in the cycle of the last point.
+        self.ways: np.ndarray | None = None
 
     @property
     def noise(self) -> float:
         return max(self.eps, float(self.frame.flow.rtol) * max(1.0, self.amplified))
+
+    def repeats(self, z, evaluation: Evaluated) -> bool:
+        """Whether a driven motion with switches that begins a period later is the same."""
+        if self.frame.reasons.autonomous or evaluation.ways is None:
+            return True
+        period = np.asarray(float(self.frame.period) * np.exp(z[-2]), self.dtype)
+        later = orbit_at(replace(self.frame, t=self.frame.t + period), z.astype(self.dtype), self.guide)
+        off = np.max(np.abs(np.asarray(later.value - evaluation.value)[: self.positions]))
+        return bool(off <= max(SAME, 1e3 * self.eps))
 
     def evaluated(self, z) -> Evaluated:
         """The equations evaluated at a point; the result for the last point is cached."""
@@ -380,12 +414,21 @@ class OrbitTracer(Tracer):
         return evaluation.value, evaluation.jacobian, float(evaluation.largest)
 
     def moved_to(self, point):
-        self.guide = self.evaluated(point.z).guide
+        evaluation = self.evaluated(point.z)
+        self.guide, self.ways = evaluation.guide, evaluation.ways
 
     def described(self, z, jacobian, tangent) -> BranchPoint | str:
         evaluation = self.evaluated(z)
         if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
+        if self.ways is not None and not np.array_equal(self.ways, evaluation.ways):
+            near = f"{self.frame.along.name} = {z[-1] * self.unit:.6g}"
+            return (
+                f"other switches, near {near}: the start comes to a switch (another state of the cycle as the start of "
+                "lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
+            )
+        if not self.repeats(z, evaluation):
+            return "the period of the drive changes, which only accelerations of the first phase show"
         multipliers, left = self._multipliers(evaluation)
         plus, minus = (self._product(evaluation, shift) for shift in (-1.0, 1.0))
         times, states = path_at(self.frame, z.astype(self.dtype))
@@ -443,6 +486,8 @@ class OrbitTracer(Tracer):
 
 def extent(times, states):
     """The smallest and largest value of each coordinate on a path, with cubic interpolation between its points."""
+    known = np.isfinite(times)
+    times, states = times[known], states[known]
     x, u = np.split(states, 2, axis=1)
     h = np.diff(times)[:, None]
     x0, x1, m0, m1 = x[:-1], x[1:], h * u[:-1], h * u[1:]

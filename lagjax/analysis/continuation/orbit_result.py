@@ -89,7 +89,7 @@ class OrbitBranch(eqx.Module):
         arrays, static = hashable_partition((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
         return replace(
             self.orbit, q=pick(self.q), v=pick(self.v), period=self.period[i], nodes=self.nodes[i], arrays=arrays,
-            static=static,
+            static=static, switches=None,
         )  # fmt: skip
 
     def of_kind(self, kind: str) -> list[CriticalOrbit]:

@@ -24,13 +24,14 @@ from lagjax.analysis.continuation.orbit_equations import (
     sizes_at,
 )
 from lagjax.analysis.continuation.orbit_result import CriticalOrbit, OrbitBranch
-from lagjax.analysis.orbits.flow import flow_of
-from lagjax.analysis.orbits.monodromy import OrbitProblem, problem_of, tolerance_of
+from lagjax.analysis.orbits.monodromy import OrbitProblem, tolerance_of
 from lagjax.analysis.orbits.result import PeriodicOrbit
 from lagjax.analysis.orbits.shooting import OrbitRequest, guessed
+from lagjax.analysis.orbits.switching_flow import any_flow
+from lagjax.analysis.orbits.switching_problem import any_problem_of, user_system
 from lagjax.analysis.params_by_name import no_such_number, numbers_in
 from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
-from lagjax.system import State, checked, coordinates, model_of
+from lagjax.system import State, checked, coordinates
 
 HALVINGS = 40
 # A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
@@ -157,7 +158,8 @@ def continue_orbits(
 
     **Arguments:**
 
-    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins.
+    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins; it may have switches. Then the branch ends
+      where other switches occur in its cycles, as where a motion grazes, and `status` says so.
     - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. For a system that
       does not depend on time also `"period"`, or a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
       it is conserved, `"energy"` (the Jacobi integral). Along a number in the parameters the orbits hold what `orbit`
@@ -177,9 +179,11 @@ def continue_orbits(
     Bifurcation Chaos 1 (1991) 745.
     """
     _check(orbit)
-    # Integers in the parameters become floats, so that a branch may follow them too.
-    system, s = checked(orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params))
-    problem = problem_of(system, s)
+    system, s = orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params)
+    if not system.in_phases and system.elements is None:
+        # Integers in the parameters become floats, so that a branch may follow them too.
+        system, s = checked(system, s)
+    problem = any_problem_of(system, s)
     place, asked = _along(along, orbit, problem)
     frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
     first, last = float(z[-1] * frame.unit), float(to)
@@ -256,12 +260,12 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     """The units, the held quantities, and the point at which the branch begins."""
     s, system = problem.state, problem.system
     params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params)
-    flow = flow_of(model_of(system, s.t, s.q, s.v, params), rtol, problem.rows)
+    flow = any_flow(system, coordinates.state(s.t, s.q, s.v, params), rtol, problem.rows)
     nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
     flat = coordinates.vector
     nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
     scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
-    integral, slope, sizes, drive = sizes_at(flow, s.t, nodes[0], period, scale)
+    integral, slope, sizes, drive = sizes_at(flow.start, s.t, nodes[0], period, scale)
     first = {ENERGY: integral, PERIOD: period, ENTRY: nodes[0][place.entry]}.get(place.kind)
     first = place.number.get(s.params) if place.number is not None else first
     first, last = float(first), float(to)
@@ -417,5 +421,5 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
 
 def _with_floats(orbit, problem) -> PeriodicOrbit:
     """The orbit with its parameters as floats, as the branch has them."""
-    arrays, static = hashable_partition((problem.system, coordinates.state(*problem.state).params))
+    arrays, static = hashable_partition((user_system(problem), coordinates.state(*problem.state).params))
     return replace(orbit, arrays=arrays, static=static)

@@ -54,8 +54,8 @@ class Passage(NamedTuple):
     """The end of a state z (2n,) and of a frame of tangents (2n, k) after a time.
 
     `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested. The
-    other fields are those of a motion with switches (`switching_flow.py`): the `rate` at its end, and whether it
-    `returns` to the phase of its start.
+    other fields are those of a motion with switches (`switching_flow.py`): the `rate` at its end, whether it `returns`
+    to the phase of its start, and the `phase` in which it ends.
     """
 
     z: Float[Array, " 2n"]
@@ -66,6 +66,7 @@ class Passage(NamedTuple):
     rate: Float[Array, " 2n"] | None = None
     switches: Switches | None = None
     returns: Bool[Array, ""] | None = None
+    phase: Int[Array, ""] | None = None
 
 
 class Changes(NamedTuple):
@@ -88,9 +89,18 @@ class Flow(eqx.Module):
     in_a_loop: bool = eqx.field(static=True)
 
     @property
+    def start(self) -> "Flow":
+        """The flow near the start, which that of a motion in phases has too."""
+        return self
+
+    @property
     def size(self) -> int:
         """The number of coordinates."""
         return self.model.n
+
+    def of(self, params: PyTree) -> "Flow":
+        """The same with other parameters."""
+        return replace(self, model=self.model.of(params))
 
     @property
     def determined(self) -> np.ndarray:
@@ -314,7 +324,7 @@ def _with_changes(flow, part, y, t0, span, scale, changes):
     floats, rest = eqx.partition(flow.model.params, eqx.is_inexact_array)
 
     def rate(z, floats, t0, span):
-        now = replace(flow, model=flow.model.of(eqx.combine(floats, rest)))
+        now = flow.of(eqx.combine(floats, rest))
         return span * now.rate(t0 + span * part, z * scale) / scale
 
     motion, push = jax.linearize(rate, y["z"], floats, t0, span)

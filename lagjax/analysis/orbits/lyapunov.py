@@ -7,6 +7,9 @@ R, divided by the elapsed time, are the rates at which tangents, areas, volumes 
 The sum of all exponents is the mean of tr P J (`flow.py`). Without damping it is zero and exponents come in pairs ±λ; a
 damping force -c v on unit masses makes each pair sum to -c.
 
+Where a motion with switches sticks, or is struck without restitution, neighbouring motions meet: a direction is lost, R
+has a zero, and an exponent is -∞.
+
 A motion of finite length T gives only an estimate of an exponent. The spread of the means over ten parts of the motion
 measures its uncertainty. Growth that is not exponential, such as the distance between regular motions of different
 periods, which grows like t, cannot be distinguished from an exponent of about log(t)/t. The uncertainty therefore
@@ -22,17 +25,19 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from lagjax.analysis.orbits.flow import flow_of
-from lagjax.analysis.orbits.monodromy import problem_of, refuse_singular
+from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow
+from lagjax.analysis.orbits.switching_problem import any_problem_of, refuse_unfollowed
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_traced, numpy_of
-from lagjax.system import Model, State, System, by_name, model_of
+from lagjax.system import Hybrid, State, System, by_name, coordinates
 
 # Looser than for a cycle: averages over a motion that forgets its start do not depend on all its digits.
 TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
 # The fraction of a motion in which the frame settles, the number of parts of the rest from which the spread is
 # computed, and the smallest number of times.
 SETTLING, BLOCKS, FEWEST = 0.25, 10, 24
+# With switches, a tangent that shrinks by more than so many round-offs from one time to the next is lost.
+LOST_BELOW = 1e3
 # The uncertainty in standard deviations of the mean.
 DEVIATIONS = 2.0
 # The logarithm of the growth that may have happened once without being exponential.
@@ -42,12 +47,13 @@ SINGLE_GROWTH = np.log(10.0)
 class LyapunovExponents(eqx.Module):
     """The largest Lyapunov exponents of a motion, and how uncertain they are. It prints and plots itself.
 
-    - `exponents` (count,), `1/[t]`, in falling order to within their uncertainty.
+    - `exponents` (count,), `1/[t]`, in falling order to within their uncertainty; -inf for a direction in which
+      neighbours meet, as where something sticks.
     - `uncertainty` (count,), `1/[t]`: the root sum of squares of twice the standard deviation of the mean, the change
       if only the later half is used, and the effect of one growth by a factor of ten.
     - `t` (T,): the times, `[t]`. `growth` (T-1, count): the logarithm of the growth from each time to the next.
     - `volume` (T-1,): the logarithm of the growth of the volume by Liouville's formula if all exponents were requested,
-      else 0.
+      else 0; NaN for a motion with switches.
     - `settled`: the time from which growth is counted.
     - `ended`: whether the motion could be followed to its end; if not, the exponents are NaN.
 
@@ -100,9 +106,11 @@ class LyapunovExponents(eqx.Module):
             lanes, parting = " x ".join(map(str, np.shape(self.settled))), int(np.sum(np.asarray(self.sensitive)))
             return f"Lyapunov exponents of {lanes} lanes; neighbours part in {parting} of them"
         pairs = zip(np.asarray(self.exponents), np.asarray(self.uncertainty))
-        rows = [("exponents", ", ".join(f"{x:.4g} ± {u:.1g}" for x, u in pairs))]
+        rows = [("exponents", ", ".join(f"{x:.4g} ± {u:.1g}" if x > -np.inf else "-inf" for x, u in pairs))]
         rows.append(("of growth", f"from t = {float(self.settled):.6g} to {float(self.t[-1]):.6g}"))
-        if self.all_of_them:
+        if not np.all(np.asarray(self.exponents) > -np.inf):
+            rows.append(("-inf", "neighbours meet, as where something sticks, or is struck without restitution"))
+        elif self.all_of_them and np.isfinite(float(self.liouville)):
             total = float(jnp.sum(self.exponents))
             rows.append(("sum", f"{total:.6g}; by Liouville's formula {float(self.liouville):.6g}"))
         parts = "neighbours part exponentially; chaos, if the motion stays bounded"
@@ -113,7 +121,7 @@ class LyapunovExponents(eqx.Module):
 
 @by_name("lj.lyapunov_exponents(system, q, v, params, ts=ts)", "ts")
 def lyapunov_exponents(
-    system: System,
+    system: System | Hybrid,
     q: PyTree[ArrayLike],
     v: PyTree[ArrayLike],
     params: PyTree = None,
@@ -121,6 +129,7 @@ def lyapunov_exponents(
     ts: ArrayLike,
     count: int = 1,
     rtol: ArrayLike | None = None,
+    phase: str | int | None = None,
 ) -> LyapunovExponents:
     """Return the largest Lyapunov exponents of a motion, with their uncertainty.
 
@@ -133,12 +142,14 @@ def lyapunov_exponents(
 
     **Arguments:**
 
-    - `system`, `q`, `v`, `params`: as in `lj.integrate`. The state is moved to the nearest one that satisfies the
-      constraints.
+    - `system`, `q`, `v`, `params`: as in `lj.integrate`; the system may have elements, or be a `Hybrid`. The state is
+      moved to the nearest one that satisfies the constraints.
     - `ts` (T,): increasing times, `[t]`, at which the tangents are made orthonormal again, close enough that they do
       not grow by more than about 1e6 in between. In the first quarter of them the directions settle.
-    - `count`: how many exponents; at most twice the number of coordinates, minus what constraints take away.
+    - `count`: how many exponents; at most twice the number of coordinates, minus what constraints take away, and with
+      states counted once.
     - `rtol`: the tolerance of the steps; 1e-9 by default in float64, 1e-5 in float32.
+    - `phase`: the phase of a `Hybrid` at the start, by name or number; by default the first one.
 
     **Returns:** a `LyapunovExponents`.
 
@@ -149,20 +160,19 @@ def lyapunov_exponents(
     """
     ts = numpy_of(ts).asarray(ts)
     _check(ts)
-    problem = problem_of(system, State(ts[0], q, v, params))
-    s = problem.state
-    model = model_of(problem.system, *s)
-    most = flow_of(model, 1.0, problem.rows).dimension
+    problem = any_problem_of(system, State(ts[0], q, v, params), phase)
+    s = coordinates.state(*problem.state)
+    most = any_flow(problem.system, s, 1.0, problem.rows).dimension
     if not (isinstance(count, int) and 1 <= count <= most):
         raise ValueError(
             f"count must be between 1 and {most}, not {count!r}: the state space has {most} directions.\n"
             f"Fix: count={most} for all of them."
         )
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
-    estimates = _followed(model, s, ts.astype(s.t.dtype), rtol, problem.rows, count)
+    estimates = _followed(problem.system, s, ts.astype(s.t.dtype), rtol, problem.rows, count)
     exponents = LyapunovExponents(*estimates, count == most)
     if not is_traced(exponents) and not bool(exponents.ended):
-        refuse_singular(problem)
+        refuse_unfollowed(problem, float(ts[-1] - ts[0]))
     return exponents
 
 
@@ -178,10 +188,10 @@ def _check(ts):
 
 
 @compiled
-def _followed(model: Model, s, ts, rtol, rows, count):
-    flow, t = flow_of(model, rtol, rows), s.t
+def _followed(system, s, ts, rtol, rows, count):
+    flow, t = any_flow(system, s, rtol, rows), s.t
     z = flow.vector(s.q, s.v)
-    scale = _scale(flow, t, z)
+    scale = _scale(flow.start, t, z)
     z = flow.onto_constraints(t, z, scale)
     basis = flow.tangent_space(t, z, scale)
     # Generic directions, the same at each call.
@@ -189,8 +199,12 @@ def _followed(model: Model, s, ts, rtol, rows, count):
     frame, _ = _orthonormal(basis @ chosen)
 
     def onward(state, times):
-        z, frame, ended = state
+        z, frame, ended, phase = state
         t, t1 = times
+        if isinstance(flow, SwitchingFlow):
+            passed = flow.passage(t, z, t1 - t, frame, scale, phase=phase)
+            frame, growth = _orthonormal(passed.frame, LOST_BELOW * jnp.finfo(z.dtype).eps)
+            return (passed.z, frame, ended & passed.ended, passed.phase), (growth, passed.growth)
         passed = flow.passage(t, z, t1 - t, frame, scale, volume=count == basis.shape[1])
         z = flow.onto_constraints(t1, passed.z, scale)
         frame = passed.frame
@@ -198,19 +212,22 @@ def _followed(model: Model, s, ts, rtol, rows, count):
             basis_there = flow.tangent_space(t1, z, scale)
             frame = basis_there @ (basis_there.T @ frame)
         frame, growth = _orthonormal(frame)
-        return (z, frame, ended & passed.ended), (growth, passed.growth)
+        return (z, frame, ended & passed.ended, phase), (growth, passed.growth)
 
-    (_, _, ended), (growth, volume) = lax.scan(onward, (z, frame, jnp.asarray(True)), (ts[:-1], ts[1:]))
+    # The phase is known only in the motion.
+    phase = jnp.asarray(flow.system.first, jnp.int32) if isinstance(flow, SwitchingFlow) else None
+    (_, _, ended, _), (growth, volume) = lax.scan(onward, (z, frame, jnp.asarray(True), phase), (ts[:-1], ts[1:]))
     exponents, uncertainty = _estimates(ts, growth)
-    ended = ended & jnp.all(jnp.isfinite(growth))
+    ended = ended & ~jnp.any(jnp.isnan(growth) | (growth == jnp.inf))
     exponents, uncertainty = (jnp.where(ended, x, jnp.nan) for x in (exponents, uncertainty))
     return exponents, uncertainty, ts, growth, volume, ts[_first_counted(len(ts))], ended
 
 
-def _orthonormal(frame):
-    """Q of Y = Q R, and the logarithms of the diagonal entries of R."""
+def _orthonormal(frame, lost_below=0.0):
+    """Q of Y = Q R, and the logarithms of the diagonal entries of R; -inf for one that is lost."""
     q, r = jnp.linalg.qr(frame)
-    return q, jnp.log(jnp.abs(jnp.diagonal(r)))
+    size = jnp.abs(jnp.diagonal(r))
+    return q, jnp.log(jnp.where(size <= lost_below * jnp.maximum(1.0, jnp.max(size)), 0.0, size))
 
 
 def _first_counted(count):
@@ -220,6 +237,8 @@ def _first_counted(count):
 
 def _estimates(ts, growth):
     first = _first_counted(len(ts))
+    lost = jnp.any(growth[first:] == -jnp.inf, axis=0)
+    growth = jnp.where(growth == -jnp.inf, 0.0, growth)
 
     def mean(a: int, b: int):
         return jnp.sum(growth[a:b], axis=0) / (ts[b] - ts[a])
@@ -230,7 +249,8 @@ def _estimates(ts, growth):
     middle, last = edges[BLOCKS // 2], len(ts) - 1
     later = mean(middle, last) - mean(first, last)
     single = SINGLE_GROWTH / (ts[last] - ts[first])
-    return mean(first, last), jnp.sqrt(spread**2 + later**2 + single**2)
+    uncertainty = jnp.sqrt(spread**2 + later**2 + single**2)
+    return jnp.where(lost, -jnp.inf, mean(first, last)), jnp.where(lost, 0.0, uncertainty)
 
 
 def _scale(flow, t, z):
