@@ -390,14 +390,17 @@ class OrbitTracer(Tracer):
     def noise(self) -> float:
         return max(self.eps, float(self.frame.flow.rtol) * max(1.0, self.amplified))
 
-    def repeats(self, z, evaluation: Evaluated) -> bool:
-        """Whether a driven motion with switches that begins a period later is the same."""
+    def repeats(self, z) -> tuple[bool, bool]:
+        """Whether a driven motion with switches that begins a period later is the same, and its change with μ too."""
+        evaluation = self.evaluated(z)
         if self.frame.reasons.autonomous or evaluation.ways is None:
-            return True
+            return True, True
         period = np.asarray(float(self.frame.period) * np.exp(z[-2]), self.dtype)
         later = orbit_at(replace(self.frame, t=self.frame.t + period), z.astype(self.dtype), self.guide)
-        off = np.max(np.abs(np.asarray(later.value - evaluation.value)[: self.positions]))
-        return bool(off <= max(SAME, 1e3 * self.eps))
+        rows, same = slice(self.positions), max(SAME, 1e3 * self.eps)
+        value, change = (np.asarray(x) for x in (later.value - evaluation.value, later.jacobian - evaluation.jacobian))
+        largest = max(1.0, np.max(np.abs(evaluation.jacobian[rows, -1])))
+        return bool(np.max(np.abs(value[rows])) <= same), bool(np.max(np.abs(change[rows, -1])) <= same * largest)
 
     def evaluated(self, z) -> Evaluated:
         """The equations evaluated at a point; the result for the last point is cached."""
@@ -427,7 +430,7 @@ class OrbitTracer(Tracer):
                 f"other switches, near {near}: the start comes to a switch (another state of the cycle as the start of "
                 "lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
             )
-        if not self.repeats(z, evaluation):
+        if not self.repeats(z)[0]:
             return "the period of the drive changes, which only accelerations of the first phase show"
         multipliers, left = self._multipliers(evaluation)
         plus, minus = (self._product(evaluation, shift) for shift in (-1.0, 1.0))

@@ -173,7 +173,8 @@ def continue_orbits(
 
     - `TypeError` for an `orbit` that is not a periodic orbit, and inside `jax.jit`, `vmap` or `grad`, because the
       number of points depends on values.
-    - `ValueError` for an orbit that did not converge, and for an `along` that names nothing or a held quantity.
+    - `ValueError` for an orbit that did not converge, for an `along` that names nothing or a held quantity, and where
+      it changes the period of a drive that only guards, or other phases than the first, contain.
 
     Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
     Bifurcation Chaos 1 (1991) 745.
@@ -295,6 +296,13 @@ def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list
     guide = Guide(z[:size], np.zeros(size, z.dtype))
     tracer = OrbitTracer(frame, low, high, guide, True)
     tracer.guide = tracer.evaluated(z).guide
+    if frame.drive is None and frame.along.kind == NUMBER and not tracer.repeats(z)[1]:
+        raise ValueError(
+            f"along={frame.along.name!r}: the period of the drive changes with it, and is seen only in guards, resets "
+            "or other phases than the first.\nUsual cause: a moving wall, whose frequency is the parameter.\n"
+            "Fix: time in units of the period, with a drive such as cos(t) and the frequency in L; or "
+            "lj.periodic_orbit for each value."
+        )
     free = _free_directions(tracer, z)
     if len(free):
         # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
