@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax.bodies.body import Body, Ground, Marker, ground
+from lagjax.bodies.body import Body, Ground, Marker, check_takes_params, ground
 from lagjax.bodies.joints import Joined, above, apart, aside, cross, tilt, turn
 from lagjax.system import Holonomic
 
@@ -121,6 +121,7 @@ def check_armature(entries: Sequence[Entry], armature: Mapping) -> dict[str, Any
             listed = f"one of {', '.join(map(repr, shapes))}" if shapes else "leave it out"
             raise ValueError(f"armature '{name}' belongs to no joint with a coordinate.\nFix: {listed}.")
         if callable(given):
+            check_takes_params("armature", f"'{name}'", given)
             continue
         numbers, shape = np.asarray(given), shapes[name]
         if numbers.shape not in ((), shape) or not np.all(numbers >= 0):

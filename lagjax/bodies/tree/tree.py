@@ -78,6 +78,8 @@ class Tree:
     **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,
     two things of one name, armature of no joint, and for a body without mass that moves and carries none.
 
+    `tree.bodies` and `tree.joints` are what it was made of.
+
     Source: Featherstone, *Rigid Body Dynamics Algorithms*, ch. 4 (trees), ch. 7 (the recursion), §9.6 (rotors).
     """
 
