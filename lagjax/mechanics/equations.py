@@ -9,6 +9,8 @@ fast, and gives NaN where it fails.
 A caller has an `Equations` and does not choose between them.
 """
 
+from functools import partial
+
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
@@ -17,10 +19,10 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, length, once
+from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, length, once, one_function
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
-from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular
+from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular, largest_of_rows, slightly_off
 from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
 from lagjax.mechanics.scalar_form import in_numbers
 from lagjax.mechanics.sparse_saddle_point import Banded, plan
@@ -90,6 +92,13 @@ class Equations(eqx.Module):
             return {}
         return self.rates(t, q, v)[1] if self.are_taken_for_regular else self.accelerations(t, q, v)[1]
 
+    def multipliers_along(self, t: Float[Array, " T"], q: PyTree, v: PyTree) -> dict[str, Array]:
+        """The multipliers by name at many states."""
+        if self.are_taken_for_regular and jax.default_backend() == "cpu":
+            # One state after the other: for all together XLA compiles hundreds of kernels.
+            return one_function(_in_turn, self, t, q, v)
+        return jax.vmap(self.multipliers)(t, q, v)
+
     def solution_or_nan(self, t: Array, q: PyTree, v: PyTree) -> tuple[PyTree[Array], dict[str, Array]]:
         """Accelerations and multipliers, NaN where they are not valid."""
         if self.written is None:
@@ -102,17 +111,36 @@ class Equations(eqx.Module):
             eqxi.unvmap_all(all_finite(a)), lambda: fast, lambda: _solution_or_nan(self.form, self.model, t, q, v)
         )
 
-    def verdict(self, t: Array, q: PyTree, v: PyTree) -> Verdict:
-        """Solve the equations at one state, and say whether the solution is valid."""
+    def verdict(self, t: Array, q: PyTree, v: PyTree, given: tuple | None = None) -> Verdict:
+        """Solve the equations at one state, and say whether the solution is valid.
+
+        `given`: the state before it was returned to the constraints, if its residuals are wanted too.
+        """
         if not self.are_taken_for_regular:
             return _verdict(self.form, self.model, t, q, v)
         # The different ways of not being regular are not told apart here.
-        a, multipliers = self.rates(t, q, v)
-        x, u = self.model.vectors(q, v)
-        known = a, multipliers, self.model.lagrangian(t, x, u)
-        finite = jnp.all(jnp.isfinite(coordinates.flatten(known)[0]))
-        regular, mass = is_regular(self.model, t, x, u)
-        return Verdict(a, multipliers, finite, ~regular, jnp.asarray(False), mass)
+        model, (x, u) = self.model, self.model.vectors(q, v)
+        if model.m:
+            # In a loop over these states, so that the equations are compiled once.
+            before = model.vectors(*(given or (q, v)))
+            states = jnp.stack([jnp.stack([x, u]), jnp.stack([slightly_off(x), slightly_off(u)]), jnp.stack(before)])
+            results, known = lax.map(partial(self._known_at, t), states)
+            (a, stacked), here = jtu.tree_map(lambda x: x[0], (results, known))
+            nearby, of_given = known.jacobian[1], (known.residuals[2], known.jacobian[2])
+        else:
+            (a, stacked), here = self._known_at(t, jnp.stack([x, u]))
+            nearby, of_given = here.jacobian, None
+        multipliers = model.split(stacked)
+        finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, here.lagrangian))[0]))
+        regular = is_regular(model, here.mass, here.jacobian, nearby) & is_determined(model, t, x, u)
+        return Verdict(
+            a, multipliers, finite, ~regular, jnp.asarray(False), largest_of_rows(here.mass), given and of_given
+        )
+
+    def _known_at(self, t: Array, state: Array) -> list:
+        assert self.written is not None
+        q, v = map(self.model.tree, state)
+        return self.written.equations.with_more_at(self.prepared[0], t, q, v)
 
     def fast(self, t: Array, q: PyTree, v: PyTree):
         """The accelerations, and the multipliers in one vector, by the written-out equations."""
@@ -213,6 +241,10 @@ def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):
     state = t, *model.vectors(q, v)
     a, multipliers = form.solution_or_nan(model, *state)
     return model.tree(completed(model, *state, a)), model.split(multipliers)
+
+
+def _in_turn(equations: Equations, t: Float[Array, " T"], q: PyTree, v: PyTree) -> dict[str, Array]:
+    return lax.map(lambda state: equations.multipliers(*state), (t, q, v))
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:

@@ -128,9 +128,17 @@ def level_size(size: Array):
     return jnp.max(size.reshape(2, -1), axis=1)
 
 
-def within(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array) -> Bool[Array, ""]:
-    """Whether a displacement of `atol + rtol |y|` accounts for every residual, of positions and velocities."""
-    residual, slope, size = residuals_and_slopes(equations, t, q, v)
+def within(
+    equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array, known: tuple | None = None
+) -> Bool[Array, ""]:
+    """Whether a displacement of `atol + rtol |y|` accounts for every residual, of positions and velocities.
+
+    `known`: the residuals and A at this state, if they have been computed.
+    """
+    if known is None:
+        residual, slope, size = residuals_and_slopes(equations, t, q, v)
+    else:
+        residual, slope, size = known[0], *_slopes(equations.model, jnp.sum(jnp.abs(known[1]), axis=1), q, v)
     return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
 
 
@@ -144,11 +152,15 @@ def residuals_and_slopes(equations: Equations, t: Array, q: PyTree, v: PyTree):
     """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     model, (x, u) = equations.model, equations.model.vectors(q, v)
     position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
-    slope = equations.row_sizes(t, q, v)
+    return jnp.concatenate([position, velocity]), *_slopes(model, equations.row_sizes(t, q, v), q, v)
+
+
+def _slopes(model: Model, slope: Array, q: PyTree, v: PyTree):
+    x, u = model.vectors(q, v)
     # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
     of_q = slope[model.holonomic]
     columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
-    return jnp.concatenate([position, velocity]), jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
+    return jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
 
 
 def departures(model: Model, s: coordinates.State, rtol: Array, atol: Array) -> str:

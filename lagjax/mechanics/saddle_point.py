@@ -51,7 +51,8 @@ VANISHES_BELOW = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 class Verdict(NamedTuple):
     """A solution of the equations at one state, as vectors or by name, and whether it is valid.
 
-    `mass`: the largest entry of each row of M.
+    `mass`: the largest entry of each row of M. `given`: residuals and A at the state before it was returned to the
+    constraints, where they are known.
     """
 
     a: PyTree[Array]
@@ -60,6 +61,7 @@ class Verdict(NamedTuple):
     singular: Bool[Array, ""]
     contradictory: Bool[Array, ""]
     mass: Float[Array, " n"]
+    given: tuple[Float[Array, " k"], Float[Array, "m n"]] | None = None
 
 
 def slightly_off(y: Array):
@@ -139,7 +141,7 @@ class Dense(NamedTuple):
         singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
         finite, contradictory = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
         singular = singular | ~found.unique
-        return Verdict(found.a, found.multipliers, finite, singular, contradictory, _largest_of_rows(found.linear.mass))
+        return Verdict(found.a, found.multipliers, finite, singular, contradictory, largest_of_rows(found.linear.mass))
 
     def solution_or_nan(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""
@@ -251,22 +253,20 @@ def combinations(jacobian: Float[Array, "m n"], independent: Bool[Array, " m"]) 
     return jnp.where(independent[:, None], unit, scaled)
 
 
-def is_regular(*state) -> tuple[Bool[Array, ""], Float[Array, " n"]]:
-    """Whether the equations at one state are regular, and the largest entry of each row of M.
+def is_regular(model: Model, mass: Array, jacobian: Array, nearby: Array) -> Bool[Array, ""]:
+    """Whether no constraint depends on others and no acceleration is undetermined, by M and A at one state.
 
-    They are regular if no constraint depends on others and nothing is undetermined.
+    `nearby`: A at a state that is `slightly_off`.
     """
-    linear, rows = mass_and_forcing(*state), _without_vanishing(*state)
-    mass, jacobian = linear.mass, rows.jacobian
-    independent = chosen(state[0], jacobian)
-    unique = linear.response is None or _solved(linear, jacobian, rows.gamma, independent).unique
+    jacobian = _where_it_counts(jacobian, nearby)
+    independent = chosen(model, jacobian)
     matrix = _scaled_matrix(mass, jacobian, independent)
-    known = independent if state[0].off is None else independent | state[0].off
-    regular = jnp.all(known) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
-    return regular & unique & is_determined(*state), _largest_of_rows(mass)
+    known = independent if model.off is None else independent | model.off
+    return jnp.all(known) & (dense.reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(mass.dtype)])
 
 
-def _largest_of_rows(mass: Array):
+def largest_of_rows(mass: Array) -> Float[Array, " n"]:
+    """The largest entry of each row."""
     return jnp.max(jnp.abs(mass), axis=1)
 
 
@@ -322,12 +322,16 @@ def _without_vanishing(model: Model, t: Array, x: Array, u: Array):
     if not rows.gamma.size:
         return rows
     nearby = constraints.jacobian(model, t, *map(slightly_off, (x, u)))
+    return rows._replace(jacobian=_where_it_counts(rows.jacobian, nearby))
+
+
+def _where_it_counts(jacobian: Array, nearby: Array):
+    """A with its rows set to zero that are round-off, being far larger at a nearby state."""
 
     def size(rows: Array) -> Array:
         return jnp.max(jnp.abs(rows), axis=1)
 
-    vanishes = vanishing(size(rows.jacobian), size(nearby))
-    return rows._replace(jacobian=jnp.where(vanishes[:, None], 0.0, rows.jacobian))
+    return jnp.where(vanishing(size(jacobian), size(nearby))[:, None], 0.0, jacobian)
 
 
 def _contradictory(linear, rows: Array, independent: Array, a, multipliers: Array, x: Array, u: Array):

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools import TooLong, decided, is_array, is_plain
 from lagjax.mechanics.first_order import completed, resolved, without_mass
@@ -44,8 +44,17 @@ LONG = 3000
 SMALL_CORRECTION = 1e-7
 
 
+class Known(NamedTuple):
+    """What is known of a state besides: L, M, A and the residuals of positions and velocities."""
+
+    lagrangian: Float[Array, ""]
+    mass: Float[Array, "n n"]
+    jacobian: Float[Array, "m n"]
+    residuals: Float[Array, " k"]
+
+
 class WrittenOut(NamedTuple):
-    """`equations(model, t, q, v)` -> (a, multipliers stacked); `project(same)` -> (q, v).
+    """`equations(model, t, q, v)` -> (a, multipliers stacked), with more: `Known`; `project(same)` -> (q, v).
 
     `may_fail` says whether either may give NaN where the robust way does not.
     """
@@ -75,7 +84,7 @@ def write_out(model: Model) -> WrittenOut | None:
     """Write out the equations of a small system in single numbers. None if L makes them too long."""
     diagonal = model.m == 0 and is_diagonal(model)
     try:
-        equations = Numbers(partial(_equations, diagonal), model, most=WRITTEN)
+        equations = Numbers(partial(_equations, diagonal), model, most=WRITTEN, has_more=True)
     except TooLong:
         return None
     if equations.length > LONG:
@@ -87,13 +96,20 @@ def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     linear = mass_and_forcing(model, t, x, u)
     if model.n == 1 and not model.m:
-        return model.tree(completed(model, t, x, u, linear.forcing / linear.mass[0])), jnp.zeros(0, x.dtype)
+        a, known = linear.forcing / linear.mass[0], _known(model, t, x, u, linear.mass, jnp.zeros((0, 1), x.dtype))
+        return (model.tree(completed(model, t, x, u, a)), jnp.zeros(0, x.dtype)), known
     rows = constraints.acceleration_rows(model, t, x, u)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal, model.off)
     a, multipliers, unique = with_reactions(solver.solve, linear.forcing, rows.gamma, linear.response)
     a = completed(model, t, x, u, a)
     valid = solver.valid if linear.response is None else solver.valid & unique
-    return model.tree(a if diagonal else jnp.where(decided(valid), a, jnp.nan)), multipliers
+    a = a if diagonal else jnp.where(decided(valid), a, jnp.nan)
+    return (model.tree(a), multipliers), _known(model, t, x, u, linear.mass, rows.jacobian)
+
+
+def _known(model: Model, t: Array, x: Array, u: Array, mass: Array, jacobian: Array) -> Known:
+    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
+    return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, jnp.concatenate([position, velocity]))
 
 
 def _projected(model: Model, t: Array, q: PyTree, v: PyTree):

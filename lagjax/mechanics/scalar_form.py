@@ -6,6 +6,7 @@ of the system and its state, writes it out, and splits it into a part that depen
 
 import math
 from collections.abc import Callable
+from itertools import islice
 
 import equinox as eqx
 import jax
@@ -14,7 +15,18 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import WATCHED, calls_host, length, needed, one_by_one, poisoned, staged, varies, written_out
+from lagjax.jaxtools import (
+    WATCHED,
+    calls_host,
+    length,
+    needed,
+    one_by_one,
+    outputs_of,
+    poisoned,
+    staged,
+    varies,
+    written_out,
+)
 from lagjax.system import Form, Model, coordinates, takes_of, unchecked
 
 # The most operations that are written out, before it is known which are needed. Writing a hundred thousand, as for an L
@@ -57,17 +69,19 @@ class Numbers:
 
     What depends on the model alone is computed by `prepare`, once; `at` does the rest. `calls_host` says whether a
     user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
+
+    A function that `has_more` returns its result and what else it knows, which only `with_more_at` returns.
     """
 
-    def __init__(self, function: Callable, model: Model, most=math.inf):
+    def __init__(self, function: Callable, model: Model, most=math.inf, has_more: bool = False):
         arrays, static = eqx.partition((model, *model.form.example), varies)
         self.shapes = []
 
         def of_leaves(*leaves):
             args = eqx.combine(jtu.tree_unflatten(jtu.tree_structure(arrays), leaves), static)
-            result, shape = jtu.tree_flatten(function(*args))
-            self.shapes.append(shape)
-            return result
+            found = function(*args)
+            self.shapes += map(jtu.tree_structure, found if has_more else (found,))
+            return jtu.tree_leaves(found)
 
         like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jtu.tree_leaves(arrays)]
         program = jax.make_jaxpr(of_leaves)(*like)
@@ -80,12 +94,18 @@ class Numbers:
         of_problem, of_state = _leaves_of(arrays, (0,)), _leaves_of(arrays, (1, 2, 3))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
-        self._early, self._late = jax.jit(one_by_one(early)), jax.jit(one_by_one(late))
+        count = self.shapes[0].num_leaves
+
+        def result_alone(*given):
+            return late(*given)[:count]
+
+        self._early, self._late = jax.jit(one_by_one(early)), jax.jit(one_by_one(result_alone))
+        self._late_with_more = jax.jit(one_by_one(late))
 
     @property
     def length(self) -> int:
-        """How many operations it consists of."""
-        return length(self.program.jaxpr)
+        """How many operations its result consists of."""
+        return length(outputs_of(self.program, range(self.shapes[0].num_leaves)).jaxpr)
 
     def prepare(self, model: Model) -> tuple | None:
         """What does not depend on the state; None if there is nothing, since equinox mishandles `()`."""
@@ -94,6 +114,11 @@ class Numbers:
     def at(self, prepared, t: Array, q: PyTree, v: PyTree):
         """The function's result at a state."""
         return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
+
+    def with_more_at(self, prepared, t: Array, q: PyTree, v: PyTree) -> list:
+        """The function's result and what else it returns, at a state."""
+        found = iter(self._late_with_more(prepared or (), *jtu.tree_leaves((t, q, v))))
+        return [jtu.tree_unflatten(shape, islice(found, shape.num_leaves)) for shape in self.shapes]
 
     def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""

@@ -150,10 +150,10 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     if settings.drift == "project":
         q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
-    a, _, finite, singular, contradictory, mass = stop_gradient(equations.verdict(t, q, v))
+    a, _, finite, singular, contradictory, mass, known = stop_gradient(equations.verdict(t, q, v, given[1:3]))
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
-        off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol)
+        off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol, known)
         if settings.drift == "project" and not equations.are_taken_for_regular:
             off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
     first_order = equations.model.form.first_order
@@ -325,7 +325,7 @@ def _outputs(equations: Equations, start: Start, solution: Solution, ts: Array, 
     # One compiled evaluation for the outputs and the end together.
     t, (q, v) = jax.tree.map(lambda x, last: jnp.concatenate([x, last]), (ts, states), solution.end)
     sound = jax.vmap(all_finite)((q, v))[:-1]
-    return Outputs(Snapshot(t, q, v, jax.vmap(equations.multipliers)(t, q, v)), reached, sound)
+    return Outputs(Snapshot(t, q, v, equations.multipliers_along(t, q, v)), reached, sound)
 
 
 def _result(equations: Equations, start: Start, solution: Solution, outputs, guards, settings: Settings):
