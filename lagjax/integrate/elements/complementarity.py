@@ -46,6 +46,14 @@ def directions(x: Float[Array, " k"], partners: np.ndarray) -> Float[Array, " k"
     return x / jnp.where(size > 0, size, 1.0)
 
 
+def pseudo_inverse(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """The inverse in the sense of least squares."""
+    if matrix.shape[0] == 1:
+        # In a batch a singular value decomposition takes as long as a step of the motion.
+        return jnp.where(matrix != 0, 1 / jnp.where(matrix != 0, matrix, 1.0), 0.0)
+    return jnp.linalg.pinv(matrix, rtol=DEPENDENT[matrix.dtype])
+
+
 class ContactProblem(NamedTuple):
     """The problem of k_N normal forces and k_T tangential ones, stacked: k = k_N + k_T.
 
@@ -109,11 +117,12 @@ def solved(problem: ContactProblem) -> Forces:
         return forces - problem.projected(forces)
 
     def inverse(forces: Array) -> Array:
-        slope = jax.jacfwd(lambda forces: residual(still, forces))(forces)
-        return jnp.linalg.pinv(slope, rtol=DEPENDENT[forces.dtype])
+        return pseudo_inverse(jax.jacfwd(lambda forces: residual(still, forces))(forces))
 
-    def sweep(_, forces: Array) -> Array:
-        return lax.fori_loop(0, forces.size, lambda i, x: x.at[i].set(still.projected(x)[i]), forces)
+    def sweep(state: tuple) -> tuple:
+        forces, _, count = state
+        new = lax.fori_loop(0, forces.size, lambda i, x: x.at[i].set(still.projected(x)[i]), forces)
+        return new, jnp.any(new != forces), count + 1
 
     def error(forces: Array) -> Array:
         size = jnp.maximum(jnp.max(jnp.abs(forces)), jnp.max(jnp.abs(still.step * still.free)))
@@ -124,7 +133,8 @@ def solved(problem: ContactProblem) -> Forces:
         slope = inverse(forces)
         return forces - slope @ residual(still, forces), error(forces), slope, count + 1
 
-    near = lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still.free))
+    first = jnp.zeros_like(still.free), jnp.asarray(True), jnp.asarray(0)
+    near, *_ = lax.while_loop(lambda s: s[1] & (s[2] < SWEEPS), sweep, first)
     start = near, jnp.full_like(near[0], jnp.inf), jnp.zeros_like(still.matrix), jnp.asarray(0)
     small = SMALL[near.dtype]
     # The last step starts at a solution: its matrix is that of the solution's own case.

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, directions, lengths, solved
+from lagjax.integrate.elements.complementarity import ContactProblem, directions, lengths, pseudo_inverse, solved
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
 from lagjax.integrate.trajectory.parts import Snapshot
@@ -384,7 +384,7 @@ class Meeting(eqx.Module):
         on = jnp.isfinite(wanted)
         left = jnp.where(on, self._velocities(at) - jnp.where(on, wanted, 0.0), 0.0)
         matrix = stop_gradient(jnp.where(on[:, None] & on[None], rows.matrix, 0.0))
-        return -jnp.linalg.pinv(matrix, rtol=DEPENDENT[left.dtype]) @ left
+        return -pseudo_inverse(matrix) @ left
 
 
 def _round_offs(count: float, x: Array) -> Array:

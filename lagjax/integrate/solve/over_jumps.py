@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -178,7 +179,10 @@ def solved_over_jumps(
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     if isinstance(adjoint, diffrax.ForwardMode):
         # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
-        way = lax.while_loop(lambda way: way.continues & (way.count <= MOST_JUMPS), next_leg, first)
+        # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
+        way = lax.while_loop(
+            lambda way: eqxi.unvmap_any(way.continues & (way.count <= MOST_JUMPS)), next_leg, first
+        )
     else:
         way, _ = lax.scan(partial(if_any, next_leg), first, None, length=turns)
     return {

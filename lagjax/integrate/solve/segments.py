@@ -169,13 +169,17 @@ def solved_in_legs(
             leg = partial(
                 _leg, hybrid, i, here, params=params, ts=ts, phase=phases[i], settings=settings, adjoint=adjoint
             )
-            way = lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
+            # The loop asks already whether any lane is in the only phase.
+            way = leg(way) if len(hybrid.systems) == 1 else lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
         return way
 
     if isinstance(adjoint, diffrax.ForwardMode):
         # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
         most = hybrid.most_switches
-        way = lax.while_loop(lambda way: way.continues & (way.switches.count <= most), next_legs, first)
+        # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
+        way = lax.while_loop(
+            lambda way: eqxi.unvmap_any(way.continues & (way.switches.count <= most)), next_legs, first
+        )
     else:
         # Each turn takes every lane at least one leg further.
         way, _ = lax.scan(partial(if_any, next_legs), first, None, length=hybrid.most_switches + 1)
@@ -278,7 +282,8 @@ def _leg(
             _ending, phase, result, end, times_of, in_phase, instant, way, params, resolution(ts), settings.rtol
         )  # fmt: skip
         result, end, onward = ending.result, ending.end, ending.onward
-        after, target, switches = apart(_switched, system, ending, params, phase, way, instant)
+        after, target, new = apart(_switched, system, ending, params, phase, way.sizes_so_far, instant)
+        switches = _recorded(way.switches, onward, new, together=len(hybrid.systems) == 1)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
         # A motion in the wrong phase is wrong from that phase's start on, its first output included.
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
@@ -312,7 +317,8 @@ def _leg(
         scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
         settled=way.settled & found["settled"], result=result, modes=where(onward, after.modes, way.modes),
     )  # fmt: skip
-    return where(in_phase, further, way)
+    # Outputs and switches are those of before in the other lanes.
+    return where(in_phase, further, way)._replace(rows=further.rows, switches=further.switches)
 
 
 class PhaseEnding(NamedTuple):
@@ -371,7 +377,7 @@ def _filled(rows: OutputRows, known: Array, found, i: int, modes: Array | None) 
         return jax.tree.map(lambda x, y: jnp.where(like(known, x), y.astype(x.dtype), x), all, new)
 
     multipliers = {name: put(x, found["multipliers"].get(name, x)) for name, x in rows.multipliers.items()}
-    of_modes = None if modes is None else jnp.where(known[:, None], modes, rows.modes)
+    of_modes = None if modes is None else put(rows.modes, modes)
     phase = jnp.where(known, i, rows.phase)
     return OutputRows(put(rows.q, found["q"]), put(rows.v, found["v"]), multipliers, phase, of_modes)
 
@@ -386,35 +392,43 @@ class After(NamedTuple):
     found: Bool[Array, ""] | None = None
 
 
-def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, way: PhaseWay, instant: Array):
-    """Return the state after the phase's first switch, the next phase, and the record with that switch."""
-    onward, first, end, _ = ending
+def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array):
+    """Return the state after the phase's first switch, the next phase, and the fields of that switch."""
+    _, first, end, _ = ending
     if phase.meeting is None:
         number = jnp.asarray(phase.switches, jnp.int32)[first]
         states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
         after = jax.tree.map(lambda *x: _one_of(first, x), *states)
     else:
-        sizes = jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v))
+        sizes = jnp.maximum(sizes_so_far, sizes_of(end.q, end.v))
         q, met, number = phase.meeting(end, params, sizes, instant)
         first = jnp.zeros_like(first)
         after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
-    s = way.switches
-    place = onward & (jnp.arange(s.t.shape[0]) == s.count)
+    to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
+    new = {"t": end.t, "way": number, "to": to, "q": end.q, "v": end.v, "q_after": after.q, "v_after": after.v}
+    new |= {"impulse": impulse, "modes": None if after.modes is None else after.modes.modes}
+    return after, to, new
+
+
+def _recorded(switches: Switches, onward: Array, new: dict[str, Any], together: bool) -> Switches:
+    """The record with a switch more, where the motion goes `onward`.
+
+    In a batch lanes that go on have the same number of switches, if they are `together`: then one row is written.
+    """
+    room = switches.t.shape[0]
+    last = eqxi.unvmap_max(jnp.where(onward, switches.count, 0))
+    place = onward & (jnp.arange(room) == switches.count)
 
     def put(all, new):
-        return jax.tree.map(lambda x, y: jnp.where(like(place, x), y[None].astype(x.dtype), x), all, new)
+        new = new.astype(all.dtype)
+        if together:
+            return all.at[last].set(jnp.where(onward, new, all[last]))
+        return jnp.where(like(place, all), new[None], all)
 
-    to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
-    record = Switches(
-        t=put(s.t, end.t), way=put(s.way, number), to=put(s.to, to), q=put(s.q, end.q), v=put(s.v, end.v),
-        q_after=put(s.q_after, after.q), v_after=put(s.v_after, after.v), impulse=put(s.impulse, impulse),
-        count=s.count + onward, uncertain=s.uncertain, names=s.names, ways=s.ways,
-        modes=None if after.modes is None else put(s.modes, after.modes.modes),
-        kinds=s.kinds,
-    )  # fmt: skip
-    return after, to, record
+    fields = {name: jax.tree.map(put, getattr(switches, name), x) for name, x in new.items()}
+    return replace(switches, count=switches.count + onward, **fields)
 
 
 def sizes_of(q: PyTree, v: PyTree):
