@@ -180,9 +180,7 @@ def solved_over_jumps(
     if isinstance(adjoint, diffrax.ForwardMode):
         # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
         # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
-        way = lax.while_loop(
-            lambda way: eqxi.unvmap_any(way.continues & (way.count <= MOST_JUMPS)), next_leg, first
-        )
+        way = lax.while_loop(lambda way: eqxi.unvmap_any(way.continues & (way.count <= MOST_JUMPS)), next_leg, first)
     else:
         way, _ = lax.scan(partial(if_any, next_leg), first, None, length=turns)
     return {
