@@ -214,29 +214,41 @@ def compared(name: str, of: Example, wanted):
 
 
 def lanes(wanted):
-    """1,000 blocks that stop, beside 1,000 without friction."""
-    what = f"{LANES} lanes of the block on a spring: with dry friction / without"
-    if not wanted(what):
+    """1,000 blocks that stop, beside 1,000 without friction, and 1,000 with a damper."""
+    what = f"{LANES} lanes of the block on a spring: with dry friction / "
+    if not wanted(f"{what}without, with a damper"):
         return
+    until, c = 4.0, 0.7
 
     def lagrangian(t, q, v, p):
         return 0.5 * v**2 - 0.5 * K * q**2
 
-    rough = lj.System(lagrangian, elements={"floor": lj.Friction(lambda t, q, v, p: v, MU, normal=G)})
-
     def batch(system):
-        ts, settings = jnp.array([0.0, 4.0]), {"estimate_error": False, "throw": False}
-        return jax.jit(jax.vmap(lambda q: lj.integrate(system, q, 0.0, ts=ts, **settings).q[-1]))
+        ts, settings = jnp.array([0.0, until]), {"estimate_error": False, "throw": False}
 
+        def last(q):
+            found = lj.integrate(system, q, 0.0, ts=ts, **settings)
+            return found.q[-1], found.stats["num_steps"]
+
+        return jax.jit(jax.vmap(last))
+
+    rough = lj.System(lagrangian, elements={"floor": lj.Friction(lambda t, q, v, p: v, MU, normal=G)})
+    damped = lj.System(lagrangian, dissipation=lambda t, q, v, p: 0.5 * c * v**2)
     starts = jnp.linspace(0.4, 0.6, LANES)
-    with_friction, without = batch(rough), batch(lj.System(lagrangian))
-    times = in_turn(lambda: with_friction(starts), lambda: without(starts), repeats=7)
+    programs = [batch(system) for system in (rough, lj.System(lagrangian), damped)]
+    times = in_turn(*[lambda program=program: program(starts) for program in programs], repeats=7)
     # Each half swing ends nearer by 2 μ g / K, until the spring holds less than friction can.
-    lost = MU * G / K
-    swings = np.ceil((np.asarray(starts) / lost - 1) / 2)
-    rests = (-1.0) ** swings * (np.asarray(starts) - swings * 2 * lost)
-    off = float(np.max(np.abs(np.asarray(with_friction(starts)) - rests)))
-    yield row(what, times.ratio()[0], 2, seconds=times.medians[0], without_s=times.medians[1], error=off)
+    lost, q0 = MU * G / K, np.asarray(starts)
+    swings = np.ceil((q0 / lost - 1) / 2)
+    omega = np.sqrt(K - c**2 / 4)
+    of_damper = np.exp(-c * until / 2) * (np.cos(omega * until) + c / (2 * omega) * np.sin(omega * until))
+    exact = (-1.0) ** swings * (q0 - swings * 2 * lost), q0 * np.cos(np.sqrt(K) * until), q0 * of_damper
+    found = [program(starts) for program in programs]
+    off = [float(np.max(np.abs(np.asarray(q) - wanted))) for (q, _), wanted in zip(found, exact)]
+    steps = [int(jnp.max(count)) for _, count in found]
+    for i, other in ((1, "without"), (2, "with a damper")):
+        yield row(what + other, times.ratio(0, i)[0], 2, seconds=times.medians[0], error=off[0], steps=steps[0],
+                  other_s=times.medians[i], other_error=off[i], other_steps=steps[i])  # fmt: skip
 
 
 START = """

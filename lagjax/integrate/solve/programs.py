@@ -132,7 +132,9 @@ class _Programs:
 def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
     *motion, settings = static.combine(arrays)
-    settings = replace(settings, robust=robust, unroll_up_to=UNROLL_AT_ONCE_UP_TO)
+    # With guards to be watched a program is long anyway, and compiles a third faster without copies.
+    unroll_up_to = 0 if motion[0].in_phases else UNROLL_AT_ONCE_UP_TO
+    settings = replace(settings, robust=robust, unroll_up_to=unroll_up_to)
     found, settled = one_by_one(_trajectory)(*motion, settings)
     rows = found.rows()
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
@@ -171,8 +173,7 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
         too_many = None
         if in_time is not None:
             jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
-        # With guards to be watched a program is long anyway, and compiles a third faster without copies.
-        unroll_up_to = 0 if differentiated or jumps or system.in_phases else settings.unroll_up_to
+        unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(
             settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust, differentiated=differentiated
