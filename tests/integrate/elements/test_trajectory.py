@@ -182,6 +182,30 @@ def test_a_lane_of_a_batch(tmp_path):
 
 
 @pytest.mark.exhaustive
+def test_switches_of_lanes():
+    """Each lane of a batch has its own switches: a block on a spring stops every half swing, nearer by 2 μ g / k, and
+    rests where the spring is weaker. Twin: the stops of another lane."""
+    k, lost = 100.0, 0.3 * G / 100.0
+    table = lj.Friction(lambda t, q, v, p: v, 0.3, normal=G)
+    system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * k * q**2, elements={"table": table})
+
+    def released(q0):
+        return lj.integrate(system, q0, 0.0, ts=jnp.array([0.0, 2.0]), rtol=1e-10, estimate_error=False)
+
+    starts = np.array([1.0, 2.0, 3.0, 5.0]) * 2 * lost
+    lanes = jax.vmap(released)(jnp.asarray(starts))
+    assert isinstance(lanes, lj.HybridTrajectory)
+    found, counts, stops = lanes.switches, [1, 2, 3, 5], np.arange(1, 6)
+    expected = [(-1.0) ** stops * (q0 - 2 * stops * lost) for q0 in starts]
+    assert found.count.tolist() == counts
+    for lane, count in enumerate(counts):
+        np.testing.assert_allclose(found.t[lane, :count], np.pi / 10 * stops[:count], atol=1e-9)
+        np.testing.assert_allclose(found.q[lane, :count], expected[lane][:count], atol=1e-9)
+        assert np.all(np.isnan(found.t[lane, count:])) and found.modes[lane, count - 1].tolist() == [2]
+    assert abs(float(found.q[3, 2]) - expected[2][2]) > 1e-3
+
+
+@pytest.mark.exhaustive
 def test_in_a_sweep(tmp_path):
     """Each point has its own modes, also in the store; one whose restitution is NaN fails and says so."""
     bounces = lj.Contact(lambda t, q, p: q, restitution=lambda p: p["e"])
