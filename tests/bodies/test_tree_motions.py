@@ -1,4 +1,4 @@
-"""Motions of trees with contacts, friction, states, sampled control and phases, against the same L by hand."""
+"""Trees with friction in joints, places that slide and driven joints, against the same L by hand."""
 
 from dataclasses import replace
 
@@ -32,30 +32,14 @@ def by_hand(t, q, v, params):
     return turning / 24 + params["m"] * (moving / 2 + G * (1.5 * jnp.cos(a) + jnp.cos(b) / 2))
 
 
-def tip(t, q, params):
-    """Where the tip is, by the tree."""
-    return TIP.position(TREE.poses(q, params), params)
-
-
 def slides(t, q, v, params):
     """How fast the tip moves along x, by the tree."""
     return TIP.velocity(TREE.poses(q, params), TREE.rates(q, v, params), params)[0]
 
 
-def tip_by_hand(t, q, params):
-    """How high the tip is."""
-    return -jnp.cos(q["a"]) - jnp.cos(q["a"] + q["b"])
-
-
 def slides_by_hand(t, q, v, params):
     """How fast the tip moves along x."""
     return -jnp.cos(q["a"]) * v["a"] - jnp.cos(q["a"] + q["b"]) * (v["a"] + v["b"])
-
-
-def floor(height, sliding):
-    """A rough floor below the tip."""
-    gap = lambda t, q, params: height(t, q, params) + 1.6
-    return lj.Contact(gap, restitution=0.4, friction=0.3, sliding=sliding)
 
 
 def apart(one, other):
@@ -84,26 +68,18 @@ def test_forces_on_a_tree_have_no_jumps():
         assert (jumps_found(model, start) is None) == smooth
 
 
-ELEMENTS = {
-    "friction": [lj.Friction(lambda t, q, v, params: v["b"], 0.5, normal=1.0)] * 2,
-    "tip": [floor(lambda *state: tip(*state)[2], slides), floor(tip_by_hand, slides_by_hand)],
-}
-
-
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", list(ELEMENTS))
-def test_contacts_and_friction(kind):
-    """Friction in a joint, or a tip that strikes a rough floor, as with L by hand; a wrong recursion is refused."""
-    of_tree, of_hand = ELEMENTS[kind]
-    tree = TREE.system([lj.weight(RODS)], elements={kind: of_tree})
-    hand, ts = lj.System(by_hand, elements={kind: of_hand}), jnp.linspace(0.0, 1.5, 7)
+def test_friction_in_a_joint():
+    """Dry friction in a joint of a tree, as with L by hand; a wrong recursion is refused."""
+    joint = {"joint": lj.Friction(lambda t, q, v, params: v["b"], 0.5, normal=1.0)}
+    tree, hand = TREE.system([lj.weight(RODS)], elements=joint), lj.System(by_hand, elements=joint)
+    ts = jnp.linspace(0.0, 1.5, 7)
     ours, theirs = (lj.integrate(x, Q, V, PARAMS, ts=ts, rtol=1e-10, estimate_error=False) for x in (tree, hand))
     assert isinstance(ours, lj.HybridTrajectory) and isinstance(theirs, lj.HybridTrajectory)
     assert len(ours.switches) == len(theirs.switches) >= 1
     np.testing.assert_array_equal(ours.modes, theirs.modes)
     assert apart(ours, theirs) < 1e-8
-    np.testing.assert_allclose(ours.multipliers[kind], theirs.multipliers[kind], atol=1e-7)
-    if kind == "friction":
-        wrong = replace(tree, forward_dynamics=lambda t, q, v, force, params: force)
-        with pytest.raises(ValueError, match="do not solve the equations of L"):
-            lj.integrate(wrong, Q, V, PARAMS, ts=ts)
+    np.testing.assert_allclose(ours.multipliers["joint"], theirs.multipliers["joint"], atol=1e-7)
+    wrong = replace(tree, forward_dynamics=lambda t, q, v, force, params: force)
+    with pytest.raises(ValueError, match="do not solve the equations of L"):
+        lj.integrate(wrong, Q, V, PARAMS, ts=ts)
