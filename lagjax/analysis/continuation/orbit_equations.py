@@ -418,7 +418,8 @@ class OrbitTracer(Tracer):
 
     def moved_to(self, point):
         evaluation = self.evaluated(point.z)
-        self.guide, self.ways = evaluation.guide, evaluation.ways
+        self.guide = evaluation.guide
+        self.ways = None if evaluation.ways is None else np.asarray(evaluation.ways)
 
     def described(self, z, jacobian, tangent) -> BranchPoint | str:
         evaluation = self.evaluated(z)
