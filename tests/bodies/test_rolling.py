@@ -82,29 +82,6 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
         np.testing.assert_allclose(a["ball"].position, expected, atol=1e-12)
 
 
-@pytest.mark.exhaustive
-def test_a_ball_goes_up_and_down_in_a_cylinder():
-    """Its height is harmonic, with √(2/7) of the frequency with which it goes round; also the derivative by z'."""
-    system, turning, about_radius = rolling_ball(), 6.0, -3.0
-    rate = turning * np.sqrt(SHARE / (1 + SHARE))
-    ts = jnp.linspace(0.0, 2 * np.pi / rate, 7)
-
-    def height(upwards):
-        q, v = in_the_cylinder(turning, 0.0, about_radius)
-        moving = v["ball"]
-        across = jnp.array([-np.sin(0.7), np.cos(0.7), 0.0])
-        more = q["ball"].moving(upwards * jnp.array([0.0, 0.0, 1.0]), upwards / SMALL * across)
-        v = {"ball": jax.tree.map(jnp.add, moving, more)}
-        traj = lj.integrate(system, q, v, IN_CYLINDER, ts=ts, rtol=1e-11, atol=1e-11)
-        return traj.q["ball"].position[:, 2]
-
-    found, slope = jax.jvp(height, (jnp.asarray(0.5),), (jnp.asarray(1.0),))
-    fall = -(G + SHARE * SMALL * turning * about_radius) / (1 + SHARE)
-    expected = 0.5 / rate * np.sin(rate * ts) + fall / rate**2 * (1 - np.cos(rate * ts))
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    np.testing.assert_allclose(slope, np.sin(rate * ts) / rate, atol=1e-8)
-
-
 @pytest.mark.slow
 def test_the_point_of_contact():
     """On an ellipsoid balls and wheels touch where f is least on them: g = 0 there, and grows as the distance."""
