@@ -21,6 +21,7 @@ import inspect
 import itertools
 import os
 from pathlib import Path
+from typing import Any
 
 # The workers share the cores: additional threads of OpenBLAS can stall a small factorisation for seconds.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -47,7 +48,7 @@ SIZE, MOST_PAGES = Path("/proc/self/statm"), 4 * 2**30 // os.sysconf("SC_PAGE_SI
 allowed = [MOST_PAGES]
 # The maps are counted once in ten tests: the list of 30,000 takes the kernel 10 ms.
 tests = itertools.count()
-backend_compile = getattr(compiler, "backend_compile_and_load", None)
+backend_compile: Any = getattr(compiler, "backend_compile_and_load", None)
 
 
 def compile_without_fusion_emitters(backend, module, devices, options, callbacks):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies.rolling import tangents
+from lagjax.bodies.wheels import tangents
 
 G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
 MASS = 1.3
@@ -80,6 +80,21 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
         a, _ = lj.accelerations(system, 0.0, q, v, params)
         expected = G * np.sin(angle) / (1 + SHARE) * along - speed**2 / path * place / path
         np.testing.assert_allclose(a["ball"].position, expected, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_motion_in_a_cylinder():
+    """Height and the spin about the radius exchange, at the rate Ω √(k/(1 + k)): the ball comes back up."""
+    system, turning = rolling_ball(), 3.0
+    q, v = in_the_cylinder(turning, 0.5, 2.0)
+    ts = jnp.linspace(0.0, 2.0, 9)
+    traj = lj.integrate(system, q, v, IN_CYLINDER, ts=ts, rtol=1e-10)
+    rate = turning * np.sqrt(SHARE / (1 + SHARE))
+    first = -(G + SHARE * SMALL * turning * 2.0) / (1 + SHARE)
+    height = first / rate**2 * (1 - np.cos(rate * np.asarray(ts))) + 0.5 / rate * np.sin(rate * np.asarray(ts))
+    np.testing.assert_allclose(traj.q["ball"].position[:, 2], height, atol=1e-8)
+    # Twin: a ball that slides without friction falls.
+    assert np.max(np.abs(height - 0.5 * np.asarray(ts) + G * np.asarray(ts) ** 2 / 2)) > 1.0
 
 
 @pytest.mark.slow

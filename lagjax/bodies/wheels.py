@@ -143,10 +143,10 @@ def _contact(wheel: Marker, floor: Any, radius: Any, ways: Callable) -> dict[str
         if is_plane:
             return -size * _unit(d), up
 
-        def arm(x: Array) -> Array:
+        def arm_at(x: Array) -> Array:
             return size * _unit(x @ turns - d)
 
-        arm = arm(_least(lambda x: height(centre + arm(x), q, params), len(turns), d.dtype))
+        arm = arm_at(_least(lambda x: height(centre + arm_at(x), q, params), len(turns), d.dtype))
         return arm, _unit(jax.grad(height)(centre + arm, q, params))
 
     def touches(t, q, params):
