@@ -121,9 +121,9 @@ def _plan(structure, leaves: tuple) -> SparsePlan | None:
     return SparsePlan(members, place, banded.sparse(coupled > 0), banded.sparse(of_rows), band)
 
 
-# A program multiplies with M and A some twenty times. By a function of up to this many operations that is faster (a
-# chain of 256 particles: 36 microseconds, 69 by entries); a longer one would make programs too long (an arm of four
-# jointed bodies: 92,000 operations, 26,000 by entries) and is slower (twelve particles, 20 sines in a link: 82 and 28).
+# A program multiplies with M and A some twenty times. It calls functions of up to this many operations, as those of
+# chains of particles, and multiplies by the entries of others, which would make it too long: 92,000 operations for an
+# arm of four jointed bodies, 26,000 by entries.
 SHORT = 60
 # The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
