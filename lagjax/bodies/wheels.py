@@ -5,7 +5,8 @@ The point of contact is where f is least on the rim, or on the sphere. It lies f
     e = (e0 + x T)/|e0 + x T|,        ∂f/∂x = 0,
 
 where e0 leads down the gradient at the centre, and T are one direction (rim) or two (sphere) at right angles to e0.
-On a plane x = 0. Elsewhere x is found by Newton's method, with the derivatives of the implicit function.
+On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by Newton's method, with
+the derivatives of the implicit function.
 
 Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4; Routh, *Advanced Rigid Dynamics*, §§ 214-224 (spheres on
 surfaces).
@@ -29,6 +30,8 @@ from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
 # The most steps of Newton's to the point of contact; from the one below the centre it takes some five.
 MOST = 20
+# By how much the slope of a distance may differ from one.
+NOT_ONE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -45,16 +48,24 @@ class Surface:
 
     **Arguments:** `f`, a function of (r, params) with r (3,) a point; twice differentiable, of any unit, its gradient
     not zero near the surface nor at the centre of what rolls. `on`: the marker in whose frame r is, on a body that may
-    move, or `lj.ground`.
+    move, or `lj.ground`. `is_distance`: whether f is the distance to the surface, |∇f| = 1. A ball then touches
+    straight below its centre, and nothing is searched, which compiles in a fraction of the time.
+
+    >>> pipe = lj.Surface(lambda r, params: 5.0 - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
+    >>> contact = lj.rolling_sphere(ball.at(), pipe, radius=1.0)
+    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((0.0, 3.5, 0.0))}, None))
+    0.5
 
     What rolls must be less curved inward than the surface, so that it touches in one point: a ball in a bowl is smaller
     than the bowl.
 
-    **Raises:** `TypeError` for an `f` that is not a function, and for an `on` that is no marker.
+    **Raises:** `TypeError` for an `f` that is not a function, and for an `on` that is no marker. Where `is_distance`
+    and |∇f| is not one, "touches" is NaN.
     """
 
     f: Callable[[Float[Array, "3"], Any], Any]
     on: Any = ground
+    is_distance: bool = False
 
     def __post_init__(self):
         if not callable(self.f):
@@ -119,13 +130,21 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    contact = _contact(ball, floor, radius, lambda n, a: (n, tangents(n, np.eye(3, dtype=n.dtype))))
+    straight = isinstance(floor, Surface) and floor.is_distance
+
+    def ways(n: Array, a: Array):
+        return n, None if straight else tangents(n, np.eye(3, dtype=n.dtype))
+
+    contact = _contact(ball, floor, radius, ways)
     looks(contact["touches"].function, sphere(ball, radius))
     return contact
 
 
 def _contact(wheel: Marker, floor: Any, radius: Any, ways: Callable) -> dict[str, Holonomic | Nonholonomic]:
-    """`ways(n, a)`: the way up from the point of contact on a plane, and the directions in which it may move else."""
+    """`ways(n, a)`: the way up from the point of contact on a plane, and the directions in which it may move else.
+
+    There are no such directions (None) where it lies straight below on a surface too.
+    """
     is_plane = not isinstance(floor, Surface)
     at = floor if is_plane else floor.on
     check_two(wheel, at)
@@ -140,7 +159,7 @@ def _contact(wheel: Marker, floor: Any, radius: Any, ways: Callable) -> dict[str
         centre, size = wheel.position(q, params), valued(radius, params)
         up = at.axis(q) if is_plane else _unit(jax.grad(height)(centre, q, params))
         d, turns = ways(up, wheel.axis(q))
-        if is_plane:
+        if is_plane or turns is None:
             return -size * _unit(d), up
 
         def arm_at(x: Array) -> Array:
@@ -155,7 +174,10 @@ def _contact(wheel: Marker, floor: Any, radius: Any, ways: Callable) -> dict[str
         if is_plane:
             return height(lowest, q, params)
         value, slope = jax.value_and_grad(height)(lowest, q, params)
-        return value / jnp.dot(slope, normal)
+        length = jnp.dot(slope, normal)
+        if floor.is_distance:
+            return jnp.where(jnp.abs(lax.stop_gradient(length) - 1) < NOT_ONE, value, jnp.nan)
+        return value / length
 
     def rolls(t, q, v, params):
         arm, normal = meeting(q, params)

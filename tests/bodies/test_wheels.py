@@ -85,7 +85,9 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
 @pytest.mark.exhaustive
 def test_motion_in_a_cylinder():
     """Height and the spin about the radius exchange, at the rate Ω √(k/(1 + k)): the ball comes back up."""
-    system, turning = rolling_ball(), 3.0
+    ball, turning = lj.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3), 3.0
+    pipe = lj.Surface(lambda r, params: jnp.sqrt(params["c"]) - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
+    system = lj.multibody([ball], {"wall": lj.rolling_sphere(ball.at(), pipe, SMALL)}, [lj.weight([ball])])
     q, v = in_the_cylinder(turning, 0.5, 2.0)
     ts = jnp.linspace(0.0, 2.0, 9)
     traj = lj.integrate(system, q, v, IN_CYLINDER, ts=ts, rtol=1e-10)
@@ -131,6 +133,23 @@ def test_tangents():
         both = np.asarray(tangents(jnp.asarray(normal), jnp.eye(3)))
         np.testing.assert_allclose(both @ both.T, np.eye(2), atol=1e-14)
         np.testing.assert_allclose(both @ normal, 0.0, atol=1e-14)
+
+
+def test_distances():
+    """Straight below its centre a ball touches as the search finds it; what is no distance has no gap."""
+    ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
+    q = {"ball": lj.Pose.at((1.0, -0.8, 0.3))}
+
+    def gap(f, is_distance):
+        contact = lj.rolling_sphere(ball.at(), lj.Surface(f, is_distance=is_distance), SMALL)
+        return contact["touches"].g(0.0, q, None)
+
+    def pipe(r, params):
+        return LARGE - jnp.sqrt(r[0] ** 2 + r[1] ** 2)
+
+    expected = LARGE - SMALL - np.hypot(1.0, 0.8)
+    np.testing.assert_allclose([gap(pipe, True), gap(pipe, False)], expected, rtol=1e-14)
+    assert np.isnan(gap(lambda r, params: LARGE**2 - r[0] ** 2 - r[1] ** 2, True))
 
 
 def test_what_is_no_surface():
