@@ -141,8 +141,9 @@ def test_distances():
     q = {"ball": lj.Pose.at((1.0, -0.8, 0.3))}
 
     def gap(f, is_distance):
-        contact = lj.rolling_sphere(ball.at(), lj.Surface(f, is_distance=is_distance), SMALL)
-        return contact["touches"].g(0.0, q, None)
+        touches = lj.rolling_sphere(ball.at(), lj.Surface(f, is_distance=is_distance), SMALL)["touches"]
+        assert isinstance(touches, lj.Holonomic)
+        return touches.g(0.0, q, None)
 
     def pipe(r, params):
         return LARGE - jnp.sqrt(r[0] ** 2 + r[1] ** 2)
