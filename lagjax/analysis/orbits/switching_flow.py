@@ -120,7 +120,7 @@ class SwitchingFlow(eqx.Module):
             pushed[:, -1], course.switches, returns, course.phase,
         )  # fmt: skip
 
-    def path(self, t0, z, span, count, substeps=0) -> "tuple[Float[Array, ' P'], Float[Array, 'P 2n']]":
+    def path(self, t0, z, span, count) -> "tuple[Float[Array, ' P'], Float[Array, 'P 2n']]":
         """Times from the start and states, at equal intervals and on both sides of each switch; NaN in spare rows."""
         motion = self.motion(t0 + span * jnp.linspace(0.0, 1.0, count + 1, dtype=z.dtype), z)
         found = motion.switches
