@@ -226,6 +226,18 @@ def draw_woodpecker():
     return fig
 
 
+def draw_open_joint():
+    """A crank and a rod in a rough drawing, with frames."""
+    y = (0.0, 1.0, 0.0)
+    crank, rod = lj.Body("crank", 1.0, (0.1, 0.1, 0.01)), lj.Body("rod", 1.0, (0.3, 0.3, 0.01))
+    joints = {
+        "axle": lj.revolute(lj.ground.at(axis=y), crank.at((0.0, 0.0, -0.5), y)),
+        "pin": lj.revolute(crank.at((0.0, 0.0, 0.5), y), rod.at((0.0, 0.0, -1.0), y)),
+    }
+    rough = {"crank": lj.Pose.at((0.0, 0.0, 0.5)), "rod": lj.Pose.at((1.0, 0.0, 1.3), axis=y, angle=np.pi / 2)}
+    return lj.draw(lj.multibody([crank, rod], joints), rough, frames=True).figure()
+
+
 def draw_spinning_top():
     """A top on its tip, let go with its axis at rest: it nods between two angles and precesses."""
     top = lj.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
@@ -256,7 +268,7 @@ def picture(name):
     """The figure of a scene or mechanism."""
     if name in SCENES:
         return SCENES[name].picture()
-    if name in ("woodpecker", "spinning_top"):
+    if name in ("woodpecker", "spinning_top", "open_joint"):
         return globals()[f"draw_{name}"]()
     fig, axes = plots.figure(1, 2, size=(4.6, 3.4))
     globals()[f"draw_{name}"](*axes[0])
@@ -273,6 +285,6 @@ def save(fig, file):
 
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
-    for name in sys.argv[1:] or [*SCENES, "woodpecker", *MECHANISMS, "spinning_top"]:
+    for name in sys.argv[1:] or [*SCENES, "woodpecker", *MECHANISMS, "spinning_top", "open_joint"]:
         save(picture(name), FOLDER / f"{name}.png")
         print(name, (FOLDER / f"{name}.png").stat().st_size, flush=True)

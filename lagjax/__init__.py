@@ -33,6 +33,8 @@ from lagjax.system import (
 # isort: split
 # One state: quantities from the Lagrangian and the constraints.
 from lagjax.analysis import Explanation, explain
+from lagjax.display import Still
+from lagjax.integrate import draw
 from lagjax.mechanics import (
     accelerations,
     consistent_state,
@@ -297,6 +299,8 @@ __all__ = [
     "constraint_residual",
     "constraint_force",
     "consistent_state",
+    "draw",
+    "Still",
     "explain",
     "Explanation",
     "HybridExplanation",

@@ -14,7 +14,7 @@ from lagjax.bodies.joints import (
 )
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
-from lagjax.bodies.shapes import box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
+from lagjax.bodies.shapes import axis, box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
 from lagjax.bodies.wheels import Surface, rolling, rolling_sphere
 
@@ -49,6 +49,7 @@ __all__ = [
     "torsion",
     "trail",
     "universal",
+    "axis",
     "usual_shapes",
     "weight",
 ]

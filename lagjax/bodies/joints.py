@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, check_markers
-from lagjax.bodies.shapes import line
+from lagjax.bodies.shapes import axis, gap, line
 from lagjax.display import Shape
 from lagjax.system import Holonomic, Nonholonomic
 
@@ -200,9 +200,11 @@ class Joined:
 
     @property
     def drawing(self) -> tuple[Shape, ...]:
-        """What it looks like: a dot where it is, and lines to the bodies' centres."""
+        """What it looks like: a dot where it is, lines to the bodies' centres, its axes, and its gap."""
         ends = (x for x in (self.a, self.b) if not isinstance(x.body, Ground))
-        return line(self.a), *(line(x.body, x) for x in ends)
+        axes = [axis(self.a), axis(self.b)] if {tilt, aside, cross} & {*self.rows} else []
+        open_by = [gap(self.a, self.b)] if apart in self.rows else []
+        return line(self.a), *(line(x.body, x) for x in ends), *axes, *open_by
 
 
 def _joined(a: Marker, b: Marker, *rows: Callable) -> Holonomic:

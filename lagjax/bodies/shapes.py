@@ -5,8 +5,10 @@ of space. Lengths, sizes and points may be functions of params.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,6 +20,8 @@ from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Shape, su
 Place = Body | Ground | Marker | ArrayLike
 # The least thickness of a body's box beside its length.
 THIN = 0.04
+# The colours of what a joint leaves open, and of surfaces to roll on.
+OPEN, GROUND = "#E6007E", "#B8B8B8"
 
 
 def box(place: Place, size: Any, color: str | None = None) -> Shape:
@@ -128,6 +132,25 @@ def trail(place: Place, color: str | None = None) -> Shape:
     return Shape("trail", (_anchor(place),), color=color)
 
 
+def gap(a: Place, b: Place) -> Shape:
+    """A magenta line between two places that a joint holds together; where it does, nothing is seen of it."""
+    return Shape("gap", (_anchor(a), _anchor(b)), color=OPEN)
+
+
+def axis(place: Marker) -> Shape:
+    """The axis of a joint, which pictures show where they are asked for frames."""
+    return Shape("axis", (_anchor(place),))
+
+
+def level(place: Marker, f: Callable) -> Shape:
+    """The surface f = 0 about all else that is drawn, seen from where f > 0; `f(r, params)` in a marker's frame."""
+    return Shape("level", (_anchor(place),), color=GROUND, level=partial(_values, f))
+
+
+def _values(f: Callable, points: np.ndarray, params: PyTree) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda r: jnp.asarray(f(r, params), float))(jnp.asarray(points)))
+
+
 def looks(function: Callable, *shapes: Shape) -> None:
     """Say what a joint or a load looks like, if nothing is given: at the function of its constraint or potential."""
     setattr(function, "drawing", shapes)
@@ -139,7 +162,8 @@ def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], p
     A box of mass m has I_1 = m (b² + c²)/12 and so on, so that a² = 6 (I_2 + I_3 - I_1)/m. A wheel that rolls is a disk
     instead.
     """
-    found = [shape for function in functions for shape in getattr(function, "drawing", ())]
+    # Several wheels have one surface.
+    found = list(dict.fromkeys(shape for function in functions for shape in getattr(function, "drawing", ())))
     solid = {shape.owner for shape in found if shape.kind == "solid"}
     return (*(_equal_box(body, params) for body in bodies if body.name not in solid), *found)
 

@@ -14,6 +14,7 @@ surfaces).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -24,7 +25,8 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, ground, valued
 from lagjax.bodies.joints import check_two
-from lagjax.bodies.shapes import disk, looks, sphere
+from lagjax.bodies.shapes import disk, level, looks, sphere
+from lagjax.display import Shape
 from lagjax.numerics import dense, newton
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
@@ -82,6 +84,11 @@ class Surface:
                 "Fix: lj.Surface(f, on=table.at())."
             )
 
+    @cached_property
+    def drawing(self) -> tuple[Shape]:
+        """What it looks like, for lists of shapes: the part of it about everything else."""
+        return (level(self.on, self.f),)
+
 
 def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holonomic | Nonholonomic]:
     """Let the rim of a thin wheel roll without slipping: one equation for positions, two for velocities.
@@ -115,7 +122,7 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
         return jnp.cross(a, along), along[None]
 
     contact = _contact(wheel, floor, radius, ways)
-    looks(contact["touches"].function, disk(wheel, radius))
+    looks(contact["touches"].function, disk(wheel, radius), *getattr(floor, "drawing", ()))
     return contact
 
 
@@ -136,7 +143,7 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
         return n, None if straight else tangents(n, np.eye(3, dtype=n.dtype))
 
     contact = _contact(ball, floor, radius, ways)
-    looks(contact["touches"].function, sphere(ball, radius))
+    looks(contact["touches"].function, sphere(ball, radius), *getattr(floor, "drawing", ()))
     return contact
 
 

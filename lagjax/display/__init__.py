@@ -16,7 +16,9 @@ from lagjax.display.in_space import (
     stills_in_space,
     surface,
 )
+from lagjax.display.in_space.surfaces import Faces, fewer, triangles
 from lagjax.display.plots import COLOURS, DrawnAxes
 from lagjax.display.printable import by_line, is_plain, printable
 from lagjax.display.progress import meter, waiting
+from lagjax.display.still import Still
 from lagjax.display.web_page.page import Page, encoded, fragment, in_bytes

@@ -72,8 +72,8 @@ def film_scripts(spec: dict[str, Any]) -> tuple[str, ...]:
 def film(t: np.ndarray, points: dict[str, np.ndarray] | InSpace, rate: float, trail: int) -> tuple[str, dict[str, Any]]:
     """A film as HTML with its first frame, and the data from which `film_scripts` play it.
 
-    **Arguments:** `t` (F,); `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a motion; or
-    (N, F, k, 3); or an `InSpace` with lanes; `rate`, `trail` as in `Animation`.
+    **Arguments:** `t` (F,), two times or more; `points` by name, (N, F, k, 2) for N lanes, NaN in a lane without a
+    motion; or (N, F, k, 3); or an `InSpace` with lanes; `rate`, `trail` as in `Animation`.
     """
     if not isinstance(points, InSpace) and next(iter(points.values())).shape[-1] == 3:
         points = InSpace((), {}, points)
@@ -86,17 +86,30 @@ def film(t: np.ndarray, points: dict[str, np.ndarray] | InSpace, rate: float, tr
     about = "Motion" + "".join(f" of {name}" for name in [", ".join(filter(None, parts))] if name)
     spec = {"rate": rate, "trail": trail, "start": float(t[0]), "step": step, "digits": digits, "frames": len(t)}
     spec |= {"about": about, "parts": [{"points": x.shape[2], "xy": encoded(x, "i2")} for x in parts.values()]}
-    dot = '<span><span style="color:{}" aria-hidden="true">&#9679;</span> {}</span>'
-    named = [dot.format(_colour(i), html.escape(str(part))) for i, part in enumerate(parts) if len(parts) > 1]
     start = f"t = {float(t[0]):.{digits}f}"
     body = (
-        f'<div data-film=""><div class="parts">{"".join(named)}</div>\n'
+        f'<div data-film=""><div class="parts">{_legend(parts)}</div>\n'
         f"{_picture(parts, low, size, scale, html.escape(f'{about}, {start}'))}\n"
         '<div class="row" style="max-width:520px"><button type="button" aria-label="play">&#9654;</button>'
         f'<input type="range" aria-label="time" min="0" max="{len(t) - 1}" value="0"><output>{start}</output>'
         "</div></div>"
     )
     return body, spec
+
+
+def still_in_plane(points: dict[str, np.ndarray]) -> str:
+    """One instant of points in the plane, (1, k, 2) by name, as HTML."""
+    lanes = {name: x[None] for name, x in points.items()}
+    low, size, scale = _field(lanes)
+    parts = {name: _in_tenths_of_pixels(x, low, size, scale) for name, x in lanes.items()}
+    named = ", ".join(filter(None, parts))
+    words = html.escape("Picture" + (f" of {named}" if named else ""))
+    return f'<div class="parts">{_legend(parts)}</div>\n{_picture(parts, low, size, scale, words)}'
+
+
+def _legend(parts):
+    dot = '<span><span style="color:{}" aria-hidden="true">&#9679;</span> {}</span>'
+    return "".join(dot.format(_colour(i), html.escape(str(x))) for i, x in enumerate(parts) if len(parts) > 1)
 
 
 def _field(points):

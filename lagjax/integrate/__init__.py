@@ -25,7 +25,8 @@ from lagjax.integrate.trajectory.drawing import curves
 from lagjax.integrate.trajectory.error_report import angle_mask
 from lagjax.integrate.trajectory.films import film_of_lanes
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
+from lagjax.integrate.trajectory.one_state import draw, still
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, in_words, is_among, message
 from lagjax.integrate.trajectory.save import described, parts
-from lagjax.integrate.trajectory.subject import drawn
+from lagjax.integrate.trajectory.subject import drawn, subject_of
 from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Snapshot, Trajectory

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix
-from lagjax.models.parts import RobotJoint
+from lagjax.models.parts import Placement, RobotJoint
 
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 # Axes that are meant to be parallel, at right angles, or to meet.
@@ -31,6 +31,19 @@ def drawn(joint: RobotJoint, centre: np.ndarray) -> PyTree:
         where = joint.placement
         return Pose(jnp.asarray(where.point(centre), float), jnp.asarray(quaternion_of(where.axes), float))
     return {"planar": jnp.zeros(3), "spherical": jnp.array(UNTURNED)}.get(joint.kind, jnp.zeros(()))
+
+
+def moved(joint: RobotJoint, s: PyTree, centre: np.ndarray) -> Placement:
+    """Where the child's frame is at a position of its joint, in its frame in the drawing; floating, in space."""
+    s = jax.tree.map(np.asarray, s)
+    if joint.kind == "prismatic":
+        return Placement(joint.axis * s, np.eye(3))
+    if joint.kind == "revolute":
+        return Placement(np.zeros(3), Rotation.from_rotvec(joint.axis * s).as_matrix())
+    if joint.kind == "planar":
+        return Placement(s[:2] @ frame_of(joint.axis)[:2], Rotation.from_rotvec(joint.axis * s[2]).as_matrix())
+    axes = Rotation.from_quat(s if joint.kind == "spherical" else s.quaternion, scalar_first=True).as_matrix()
+    return Placement(np.zeros(3) if joint.kind == "spherical" else s.position - axes @ centre, axes)
 
 
 def frame_of(axis: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What the shapes of a file look like, for `traj.animate` and `traj.draw`."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -9,16 +9,28 @@ from lagjax.display import CUBE, CYLINDER, SPHERE, Anchor, Shape
 from lagjax.models.parts import LinkShape
 
 
-def looks_of(shapes: Iterable[LinkShape], bodies: Iterable[Body]) -> tuple[Shape, ...]:
-    """How bodies are drawn: by their shapes in the file, or as boxes with their inertia.
+def looks_of(shapes: Iterable[LinkShape], bodies: Collection[Body]) -> tuple[Shape, ...]:
+    """How bodies are drawn: by their shapes in the file; those that have none there as boxes with their inertia.
 
-    Shapes for the eye are taken, those for contacts where a body has no others; neither meshes nor planes.
+    Shapes for the eye are taken, those for contacts where a body has no others that are drawn; meshes that were read,
+    no planes. A body with shapes that are not drawn gets no box: inertias of files are often made up, and a large box
+    would hide the rest.
     """
     shapes = tuple(shapes)
-    seen = {x.body for x in shapes if x.role != "collision"}
+    seen = {x.body for x in shapes if x.role != "collision" and _parts(x)}
     own = tuple(part for x in shapes if x.role != "collision" or x.body not in seen for part in _parts(x))
-    drawn = {shape.owner for shape in own}
-    return *usual_shapes((body for body in bodies if body.name not in drawn), (), None), *own
+    without = {body.name for body in bodies} - {x.body for x in shapes}
+    return *usual_shapes((body for body in bodies if body.name in without), (), None), *own
+
+
+def not_drawn(shapes: Iterable[LinkShape]) -> dict[str, list[str]]:
+    """By kind, which links have shapes for the eye that no picture shows, and the names of their meshes."""
+    found: dict[str, list[str]] = {}
+    for x in shapes:
+        if x.role != "collision" and not _parts(x):
+            whose = f"'{x.link}'" + f" ({x.mesh})" * bool(x.mesh)
+            found.setdefault({"mesh": "meshes", "plane": "planes"}.get(x.kind, x.kind), []).append(whose)
+    return found
 
 
 def _parts(x: LinkShape) -> tuple[Shape, ...]:
@@ -31,6 +43,8 @@ def _parts(x: LinkShape) -> tuple[Shape, ...]:
 
     if x.kind in ("box", "ellipsoid"):
         return (solid(CUBE if x.kind == "box" else SPHERE, x.size),)
+    if x.faces is not None:
+        return (solid(x.faces, x.size),)
     if x.kind == "sphere":
         return (solid(SPHERE, (x.size[0],) * 3),)
     if x.kind not in ("cylinder", "capsule"):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lagjax.display import Faces, triangles
 from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink, merged
 from lagjax.models.robot_model import RobotModel
 from lagjax.models.source import file_of
@@ -176,13 +177,19 @@ class _Reading:
     def _shape(self, i: int) -> LinkShape:
         m, collides = self.m, bool(self.m.geom_contype[i] or self.m.geom_conaffinity[i])
         kind = self.mujoco.mjtGeom(m.geom_type[i]).name.removeprefix("mjGEOM_").lower()
-        mesh = m.mesh(m.geom_dataid[i]).name if kind == "mesh" else ""
+        mesh, faces = self._mesh(m.geom_dataid[i]) if kind == "mesh" else ("", None)
         if collides and not self._disabled("CONTACT"):
             self.not_taken.append(NotTaken("contacts", m.geom(i).name or f"geom {i}", self.lines.get(("geom", i), "")))
         axes, role = _matrix(m.geom_quat[i]), "both" if collides else "visual"
         size = np.ones(3) if kind == "mesh" else m.geom_size[i] * np.array(WHOLE.get(kind, (1.0, 1.0, 1.0)))
         size = tuple(size[: COUNT.get(kind, 3)].tolist())
-        return LinkShape("", self.bodies[m.geom_bodyid[i]], kind, size, m.geom_pos[i].copy(), axes, mesh, role)
+        return LinkShape("", self.bodies[m.geom_bodyid[i]], kind, size, m.geom_pos[i].copy(), axes, mesh, role, faces)
+
+    def _mesh(self, k: int) -> tuple[str, Faces]:
+        m = self.m
+        vertices = m.mesh_vert[m.mesh_vertadr[k] :][: m.mesh_vertnum[k]]
+        faces = m.mesh_face[m.mesh_faceadr[k] :][: m.mesh_facenum[k]]
+        return m.mesh(k).name, triangles(vertices.astype(float), faces.astype(int))
 
     def _beside(self):
         """List what else is not taken."""

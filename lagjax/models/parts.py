@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax.display import Faces
+
 # By how much of their sum principal moments may miss the triangle inequality, as in `lj.Body`.
 ROUNDED = 1e-9
 
@@ -92,7 +94,8 @@ class LinkShape(NamedTuple):
     - `kind` and `size`: "box" (three edges), "cylinder" and "capsule" (radius, length without caps), "sphere" (radius),
       "ellipsoid" (three radii), "mesh" (scale along its axes), "plane" and others as in the file.
     - `origin` and `axes`: its frame, from the body's centre of mass along the body's axes.
-    - `mesh`: the name of the mesh's file, as it stands there; `role`: "visual", "collision" or "both".
+    - `mesh`: the name of the mesh's file, as it stands there (in MJCF, of the mesh); `role`: "visual", "collision" or
+      "both". `faces`: the mesh itself, where it was read, in its frame.
     """
 
     body: str
@@ -103,6 +106,7 @@ class LinkShape(NamedTuple):
     axes: np.ndarray
     mesh: str
     role: str
+    faces: Faces | None = None
 
 
 class NotTaken(NamedTuple):

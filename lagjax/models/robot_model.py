@@ -17,6 +17,7 @@ from lagjax.bodies import (
     Marker,
     Pose,
     Tree,
+    axis,
     cylindrical,
     fixed,
     ground,
@@ -30,15 +31,18 @@ from lagjax.bodies import (
     universal,
     weight,
 )
-from lagjax.display import Drawing, Shape
+from lagjax.display import Drawing, Shape, Still
+from lagjax.integrate import still, subject_of
 from lagjax.models.joint_positions import (
     BodyJoint,
     all_positions,
     connected,
     drawn,
+    moved,
+    quaternion_of,
     rate_squared,
 )
-from lagjax.models.looks import looks_of
+from lagjax.models.looks import looks_of, not_drawn
 from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink, unmoved
 from lagjax.system import Holonomic, System
 
@@ -201,6 +205,23 @@ class RobotModel:
         setattr(system.lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
         return system
 
+    def draw(self, positions: Mapping | None = None, *, frames: bool = False,
+             view: tuple[float, float] = (-60.0, 22.0)) -> Still:  # fmt: skip
+        """Draw the mechanism where its joints have these positions; those that are not named are as drawn in the file.
+
+        `frames` and `view` are those of `lj.draw`. What the file draws and the picture does not, `print(model)` lists.
+        """
+        q, _ = self.joint_state(positions)
+        placed: dict[str | None, Placement] = {None: unmoved()}
+        for name, joint in self.joints.items():
+            at = moved(joint, q[name], self.links[joint.child].centre)
+            placed[joint.child] = (
+                at if joint.kind == "floating" else placed[joint.parent].then(joint.placement).then(at)
+            )
+        poses = {name: Pose(placed[name].point(self.links[name].centre), quaternion_of(placed[name].axes))
+                 for name in self.bodies}  # fmt: skip
+        return still(subject_of(Drawing(self._looks), None, None), 0.0, poses, frames, view)
+
     def tree(self) -> Tree:
         """Return the `lj.Tree` of its links, with the rotors of joints; without what else acts, and without loops.
 
@@ -236,6 +257,12 @@ class RobotModel:
                 if head is None or head in self.bodies:
                     marker = self._marker(head, frame, UPWARD)
                     found += [line(marker)] if head is None else [line(marker), line(marker.body, marker)]
+            ends = (joint.child, unmoved()), (joint.parent, joint.placement)
+            held = next(((head, frame) for head, frame in ends if head in self.bodies), None)
+            if joint.axis.any() and held is not None:
+                found.append(axis(self._marker(*held, joint.axis)))
+        for loop in self._loops().values():
+            found += getattr(loop.function, "drawing", ())
         return tuple(found)
 
     def _loops(self) -> dict[str, Holonomic]:
@@ -330,14 +357,17 @@ class RobotModel:
         fixed_to = {name: head for name, (head, _) in self.frames.items() if head not in (name, None)}
         if fixed_to:
             lines.append("  merged: " + ", ".join(f"{name} into {head}" for name, head in fixed_to.items()))
+        for what, whose in not_drawn(self.shapes).items():
+            lines.append(f"  not drawn: {what} of {_listed(whose)}")
         for what in dict.fromkeys(x.what for x in self.not_taken):
             whose = [x for x in self.not_taken if x.what == what]
-            listed = ", ".join(
-                (f"'{x.name}' " * bool(x.name) + f"({x.line})" * bool(x.line)).strip() for x in whose[:LISTED]
-            )
-            more = f" and {len(whose) - LISTED} more" if len(whose) > LISTED else ""
-            lines.append(f"  not taken: {what} {'of ' * any(x.name for x in whose)}{listed}{more}".rstrip())
+            listed = _listed([(f"'{x.name}' " * bool(x.name) + f"({x.line})" * bool(x.line)).strip() for x in whose])
+            lines.append(f"  not taken: {what} {'of ' * any(x.name for x in whose)}{listed}".rstrip())
         return "\n".join(lines)
+
+
+def _listed(whose: list[str]) -> str:
+    return ", ".join(whose[:LISTED]) + (f" and {len(whose) - LISTED} more" if len(whose) > LISTED else "")
 
 
 def _count(x, what: str) -> str:

@@ -6,11 +6,13 @@ order, R = Rz(y) Ry(p) Rx(r). Numbers are in the file's units, which are meant t
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lagjax.models.meshes import mesh_of
 from lagjax.models.parts import (
     LinkShape,
     NotTaken,
@@ -165,7 +167,8 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
             "products of inertia with the other sign, or numbers made up or rounded.\n"
             "Fix: in the file, moments about the centre of mass, as the drawing program gives them."
         )  # fmt: skip
-    shapes = [shape for x in robot.all("link") for shape in _shapes(x)]
+    folder = None if path is None else path.resolve().parent
+    shapes = [shape for x in robot.all("link") for shape in _shapes(x, folder)]
     return RobotModel.of(robot.attributes.get("name", "robot"), tree, shapes, (), gravity, not_taken)
 
 
@@ -333,7 +336,7 @@ def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: 
     return ordered
 
 
-def _shapes(x: XMLElement) -> Iterator[LinkShape]:
+def _shapes(x: XMLElement, folder: Path | None) -> Iterator[LinkShape]:
     for role in ("visual", "collision"):
         for part in x.all(role):
             for geometry in part.needed("geometry").inside:
@@ -345,4 +348,5 @@ def _shapes(x: XMLElement) -> Iterator[LinkShape]:
                 else:
                     raise _unknown(geometry, part)
                 frame, mesh = _placement(part.one("origin")), geometry.attributes.get("filename", "")
-                yield LinkShape("", x.text("name"), geometry.tag, tuple(size.tolist()), *frame, mesh, role)
+                faces = mesh_of(mesh, folder) if geometry.tag == "mesh" else None
+                yield LinkShape("", x.text("name"), geometry.tag, tuple(size.tolist()), *frame, mesh, role, faces)

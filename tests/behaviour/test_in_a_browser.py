@@ -13,7 +13,7 @@ from matplotlib import image
 
 import lagjax as lj
 from benchmarks.speed.browser import Browser, installed
-from lagjax.display import CUBE, SPHERE, TUBE, Anchor, InSpace, Shape
+from lagjax.display import CUBE, SPHERE, TUBE, Anchor, InSpace, Shape, Still
 from lagjax.display.animation import Animation, film, film_scripts
 from lagjax.display.web_page import fragment, whole
 
@@ -300,6 +300,37 @@ def test_the_canvas_shows_what_the_first_frame_does(browser, tmp_path):
     near, sign = differ(text), "2 * (x * y + w * z)"
     assert near < 0.002 and text.count(sign) == 1
     assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(sign, "2 * (x * y - w * z)")) > 3 * near
+
+
+def test_a_still(browser, tmp_path):
+    """A state has no controls, turns by keys, and shows marks inside of a box, as the SVG that Python paints.
+
+    Twin: with marks in their place, not in front, it does not.
+    """
+    _, motion = tumbling()
+    frame = motion.at(slice(40, 41))
+    text = Still(frame.finished(frames=True), (-60.0, 22.0))._repr_html_()
+    svg, size = re.search(r"<svg.*?</svg>", text, re.DOTALL), {"width": 560, "height": 520}
+    assert svg is not None and "<button" not in text
+    by_python = pixels(opened(browser, tmp_path, f"<body style='margin:0'>{svg[0]}", **size), tmp_path)
+
+    def differ(text: str, *keys: str):
+        page = opened(browser, tmp_path, whole("Still", text), **size)
+        assert page.run("document.querySelector('canvas').ariaLabel").startswith(
+            "Picture in space of box, ball, wire. "
+        )
+        page.run("document.body.replaceChildren(document.querySelector('canvas')); document.body.style.margin = 0")
+        page.run("document.querySelector('canvas').focus({focusVisible: false})")
+        for key in keys:
+            page.press(key)
+        page.run("document.querySelector('canvas').blur()")
+        page.run("new Promise(done => setTimeout(done, 50))")
+        assert page.complaints() == []
+        return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250]))
+
+    near, ahead = differ(text), '["mark", "gap"].includes(shape.kind)'
+    assert near < 0.002 and text.count(ahead) == 1
+    assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(ahead, "false")) > 1.5 * near
 
 
 def test_a_film_in_space_turns_and_zooms(browser, tmp_path):

@@ -42,7 +42,7 @@ def test_joints_springs_and_params():
     joint = lj.spherical(A.at((0.0, 0.0, 1.0)), B.at((1.0, 0.0, 0.0)))
     spring = lj.spring(lj.ground.at(), B.at(), stiffness=1.0)
     frame = drawn(lj.multibody([A, B], {"joint": joint}, [spring]), {"m": 12.0}, a=POSE, b=POSE)
-    assert [shape.kind for shape in frame.shapes] == ["solid", "solid", "dot", "line", "line", "line"]
+    assert [shape.kind for shape in frame.shapes] == ["solid", "solid", "dot", "line", "line", "gap", "line"]
     np.testing.assert_allclose(frame.shapes[1].size, [0.04, 0.04, 1.0], rtol=1e-12)
     np.testing.assert_allclose(
         frame.place(frame.shapes[2].anchors[0])[0], A.point({"a": POSE}, (0.0, 0.0, 1.0)), atol=1e-12

@@ -1,6 +1,7 @@
 """A model is drawn by the shapes of its file, where its links are; bodies without any as boxes."""
 
 import numpy as np
+import pytest
 
 import lagjax as lj
 from lagjax.display import CUBE, CYLINDER, SPHERE, InSpace
@@ -68,3 +69,65 @@ def test_kinds_of_shapes():
     # Its z axis is x in space.
     np.testing.assert_allclose([x.anchors[0].point for x in found[1:3]], [[0.6, 2.0, 3.0], [1.4, 2.0, 3.0]])
     assert found[3].size == (1.0, 2.0, 3.0) and found[0].size == (0.1, 0.1, 0.8)
+
+
+MOVING = """<robot name="all">
+  <link name="base">{mass}</link>
+  <link name="turns">{mass}</link><link name="slides">{mass}</link><link name="floats">{mass}</link>
+  <joint name="r" type="continuous"><parent link="base"/><child link="turns"/><origin xyz="1 0 0" rpy="0.3 0.2 0.1"/>
+    <axis xyz="0.6 0 0.8"/></joint>
+  <joint name="p" type="prismatic"><parent link="turns"/><child link="slides"/><origin xyz="0 0.5 0" rpy="0 1 0"/>
+    <axis xyz="0 0.6 0.8"/><limit lower="-3" upper="3"/></joint>
+  <joint name="f" type="planar"><parent link="slides"/><child link="floats"/><origin xyz="0.1 0.5 0"/>
+    <axis xyz="0.6 0.8 0"/></joint>
+</robot>""".format(
+    mass='<inertial><origin xyz="0.1 0.2 0.3"/><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+)
+
+
+def drawn_poses(model, positions):
+    """The poses of bodies in a picture of a model."""
+    points = model.draw(positions).points
+    assert isinstance(points, InSpace)
+    return {name: pose[0] for name, pose in points.poses.items()}
+
+
+def test_positions_of_joints_are_drawn():
+    """Each kind of joint moves what it carries as the tree's recursion does, a free base too; by NumPy alone.
+
+    Twin: at other positions it does not.
+    """
+    positions = {"r": 0.7, "p": -0.4, "f": np.array([0.3, -0.2, 0.5])}
+    positions["base"] = lj.Pose.at((1.0, 2.0, 3.0), axis=(1.0, 2.0, 2.0), angle=0.8)
+    model = lj.read_urdf(MOVING, base="free")
+    known, _ = model.state(positions)
+    here, elsewhere = (drawn_poses(model, x) for x in (positions, positions | {"r": 0.6}))
+    for name, pose in known.items():
+        np.testing.assert_allclose(here[name][:3], pose.position, atol=1e-12)
+        sign = np.sign(here[name][3:] @ np.asarray(pose.quaternion))
+        np.testing.assert_allclose(sign * here[name][3:], pose.quaternion, atol=1e-12)
+    assert np.abs(elsewhere["floats"][:3] - known["floats"].position).max() > 0.01
+
+
+def test_meshes_of_mjcf():
+    """A tetrahedron is drawn where MuJoCo has its corners, in space; the plane it stands on is said not to be."""
+    mujoco = pytest.importorskip("mujoco")
+    corners = "0 0 0  1 0 0  0 2 0  0 0 3"
+    text = f"""<mujoco model="one"><asset><mesh name="corner" vertex="{corners}"/></asset><worldbody>
+      <geom name="floor" type="plane" size="1 1 1"/>
+      <body name="part" pos="1 2 3" euler="30 0 50"><joint name="hinge" axis="0 1 0" pos="0.1 0.2 0.3"/>
+        <geom type="mesh" mesh="corner" pos="0.5 0 0" euler="0 20 0"/></body></worldbody></mujoco>"""
+    model = lj.read_mjcf(text)
+    assert "not drawn: planes of 'world'" in str(model) and "meshes" not in str(model)
+    points = model.draw({"hinge": 0.7}).points
+    assert isinstance(points, InSpace)
+    (mesh,) = (shape for shape in points.shapes if shape.surface is not None)
+    m = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(m)
+    data.qpos[0] = 0.7
+    mujoco.mj_forward(m, data)
+    place, axes = data.geom_xpos[1], data.geom_xmat[1].reshape(3, 3)
+    known = place + m.mesh_vert @ axes.T
+    # MuJoCo's corners have single precision.
+    np.testing.assert_allclose(points.corners(mesh)[0][0], known, atol=1e-6)
+    assert np.ptp(known, axis=0).max() > 2 and len(mesh.surface.faces) == 4

@@ -27,6 +27,7 @@ OF_STATES = (
 # Each with whether it also takes a motion in phases.
 DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "explain": (of_states("explain"), True),
+    "draw": (lambda system: lj.draw(system, 1.0, PARAMS), True),
     "integrate": (lambda system: lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS), True),
     "step": (lambda system: lj.step(system, 0.0, 1.0, 0.0, PARAMS, 0.1), False),
     "rollout": (lambda system: lj.rollout(system, 1.0, 0.0, PARAMS, 10, 0.1), False),

@@ -162,7 +162,8 @@ class Tree:
             return dynamics.lagrangian(t, q, v, params)
 
         rows = [[x] if isinstance(x, Holonomic) else x for x in self.joints.values()]
-        looks_like = [*(joint.function for row in rows for joint in row), *(load.potential for load in loads)]
+        joined = [*(joint for row in rows for joint in row), *named(closures or {}).values()]
+        looks_like = [*(joint.function for joint in joined), *(load.potential for load in loads)]
         setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), self.poses))
         return System(
             total,

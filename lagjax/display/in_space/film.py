@@ -25,13 +25,16 @@ LOOK = {
 }  # fmt: skip
 
 
-def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tuple[str, dict[str, Any]]:
-    """A film as HTML with its first frame, and the data from which `space.js` plays it.
+def film_in_space(
+    t: np.ndarray, motion: InSpace, rate: float, trail: int, eye: tuple[float, float] = (AZIMUTH, ELEVATION)
+) -> tuple[str, dict[str, Any]]:
+    """A film as HTML with its first frame, and the data from which `space.js` plays it; of one frame, a still.
 
     **Arguments:** `t` (F,); `motion`: poses (N, F, 7) and points (N, F, k, 3) for N lanes, NaN in a lane without a
-    motion; `rate`, `trail` as in `Animation`.
+    motion; `rate`, `trail` as in `Animation`; `eye`: azimuth and elevation from where it is seen first, in degrees.
     """
-    view, grid = view_of(*motion.extent(), AZIMUTH, ELEVATION)
+    view, grid = view_of(*motion.extent(), *eye)
+    is_still = len(t) == 1
 
     def lines(x: np.ndarray):
         return list(zip(x.tolist(), labelled(x, grid.step)))
@@ -39,7 +42,7 @@ def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tu
     step = float(t[1] - t[0]) if len(t) > 1 else 1.0
     digits = max(0, math.ceil(-math.log10(abs(step))))
     bodies, names = list(motion.poses), [name for name in [*motion.poses, *motion.points] if name]
-    about = "Motion in space" + (f" of {', '.join(names)}" if names else "")
+    about = f"{'Picture' if is_still else 'Motion'} in space" + (f" of {', '.join(names)}" if names else "")
     surfaces = list({id(shape.surface): shape.surface for shape in motion.shapes if shape.surface is not None}.values())
     colours = {name: _rgb(COLOURS[i % len(COLOURS)]) for i, name in enumerate(motion.points, start=len(bodies))}
     spec = {
@@ -62,10 +65,13 @@ def film_in_space(t: np.ndarray, motion: InSpace, rate: float, trail: int) -> tu
         if 1 < len(bodies) + len(motion.points) <= MOST_NAMES
     ]
     start = f"t = {float(t[0]):.{digits}f}"
+    picture = _svg(motion, view, grid, html.escape(about if is_still else f"{about}, {start}"))
+    film = f'<div data-film=""><div class="parts">{"".join(named)}</div>\n{picture}'
+    if is_still:
+        return f"{film}</div>", spec
     body = (
-        f'<div data-film=""><div class="parts">{"".join(named)}</div>\n'
-        f"{_svg(motion, view, grid, html.escape(f'{about}, {start}'))}\n"
-        f'<div class="row" style="max-width:{WIDTH:.0f}px"><button type="button" aria-label="play">&#9654;</button>'
+        f'{film}\n<div class="row" style="max-width:{WIDTH:.0f}px">'
+        '<button type="button" aria-label="play">&#9654;</button>'
         f'<input type="range" aria-label="time" min="0" max="{len(t) - 1}" value="0"><output>{start}</output>'
         "</div></div>"
     )

@@ -53,7 +53,9 @@ def marks(frame: InSpace, view: View, paler: float = 0.0) -> list[Mark]:
             found += _faces(frame.corners(shape)[0], shape.surface, color, view)
         elif shape.kind != "trail":
             places = np.stack([frame.place(anchor) for anchor in shape.anchors])
-            found += _line(places, color, view, shape.kind == "dot")
+            ahead = view.distance if shape.kind in ("mark", "gap") else 0.0
+            drawn = _line(places, color, view, shape.kind == "dot")
+            found += [mark._replace(nearness=mark.nearness + ahead) for mark in drawn]
     for i, points in enumerate(frame.points.values(), start=len(bodies)):
         found += _line(points, _rgb(COLOURS[i % len(COLOURS)]), view, len(points) <= MARKED_UP_TO)
     return [mark._replace(color=_mixed(mark.color, paler)) for mark in found]

@@ -7,7 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax.display.in_space.level_set import level_set
 from lagjax.display.in_space.shapes import Anchor, Shape
+
+# The box in which a surface f = 0 is drawn is larger than what else there is, by this share of its longest side.
+BEYOND = 0.3
+# The lengths of bodies' axes, and of halves of joints' axes, as shares of the picture's diagonal; their colours.
+FRAME, AXIS = 0.1, 0.08
+# The places that a joint should hold together are apart from this share of the diagonal on.
+APART = 1e-6
+RED, GREEN, BLUE, BLACK = "#D00000", "#008A00", "#0040FF", "#000000"
 
 
 class InSpace(NamedTuple):
@@ -25,6 +34,45 @@ class InSpace(NamedTuple):
         """Some of the frames."""
         poses, points = ({name: x[frame] for name, x in of.items()} for of in (self.poses, self.points))
         return InSpace(self.shapes, poses, points)
+
+    def finished(self, frames: bool = False) -> "InSpace":
+        """As it is painted: with faces for surfaces f = 0, the gaps that are open, and frames and axes if asked for."""
+        solid = self._replace(shapes=tuple(x for x in self.shapes if x.kind not in ("axis", "level")))
+        low, high = solid.extent()
+        size = float(np.linalg.norm(high - low))
+        found = [solid._faces_of(x) if x.kind == "level" else x for x in self.shapes
+                 if x.kind != "axis" and not (x.kind == "gap" and self.apart(x) <= APART * size)]  # fmt: skip
+        if frames:
+            for name in self.poses:
+                found += [_mark(Anchor(name, np.zeros(3)), FRAME * size * e, color)
+                          for e, color in zip(np.eye(3), (RED, GREEN, BLUE))]  # fmt: skip
+            for anchor in (x.anchors[0] for x in self.shapes if x.kind == "axis"):
+                along = AXIS * size * np.asarray(anchor.axes[2])
+                found.append(_mark(anchor._replace(point=anchor.point - along), 2 * along, BLACK))
+        return self._replace(shapes=tuple(found))
+
+    def apart(self, shape: Shape) -> float:
+        """How far the two places of a shape are from each other, at most."""
+        start, end = (self.place(anchor) for anchor in shape.anchors)
+        return float(np.max(np.linalg.norm(end - start, axis=-1)))
+
+    def _faces_of(self, shape: Shape) -> Shape:
+        """The part of a surface f = 0 about everything else, as that is seen from its body."""
+        anchor, all_frames = shape.anchors[0], [*self.points.values()]
+        all_frames += [x for other in self.shapes for x in self.corners(other)]
+        axes = np.asarray(anchor.axes)
+        found = []
+        for x in all_frames:
+            if anchor.body is not None:
+                pose = self.poses[anchor.body]
+                x = (x - pose[..., None, :3]) @ rotations(pose[..., 3:])
+            found.append(((x - anchor.point) @ axes.T).reshape(-1, 3))
+        x = np.concatenate(found)
+        x = x[np.isfinite(x).all(axis=1)]
+        low, high = x.min(axis=0), x.max(axis=0)
+        more = BEYOND * np.max(high - low)
+        assert shape.level is not None
+        return Shape("solid", shape.anchors, level_set(shape.level, low - more, high + more), np.ones(3), shape.color)
 
     def tracked(self) -> dict[str, np.ndarray]:
         """Points (..., F, k, 3) by name that tell where everything is: three axes of each body, as long as it is."""
@@ -91,6 +139,10 @@ def along(d: np.ndarray) -> np.ndarray:
     first = near - np.sum(near * last, axis=-1, keepdims=True) * last
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(last, first), last], axis=-2)
+
+
+def _mark(start: Anchor, way: np.ndarray, color: str) -> Shape:
+    return Shape("mark", (start, start._replace(point=start.point + way)), color=color)
 
 
 def _reach(shape: Shape, body: str):

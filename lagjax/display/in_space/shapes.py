@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +30,11 @@ class Shape:
     `lj.line` and `lj.trail` make them.
 
     - `kind`: "solid" at one anchor; "rod", a solid from one to another; "line" through two or more; "dot" or "trail" at
-      one.
+      one; "level", the surface on which `level` vanishes, in one's frame. "mark", a line in front of everything. Of
+      joints: "gap", a mark between two places that should be one, and "axis", drawn where frames are.
     - `surface`: that of a solid or rod, of unit size; `size` (3,), or a function of params: its scale along the
       anchor's axes. `color`: "#rrggbb", or None for the colour of its body.
+    - `level`: `level(points, params)`, (n, 3) -> (n,).
 
     >>> import lagjax as lj
     >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
@@ -44,6 +47,7 @@ class Shape:
     surface: Faces | None = None
     size: Any = (1.0, 1.0, 1.0)
     color: str | None = None
+    level: Callable | None = None
 
     def __post_init__(self):
         if self.color is not None and not (isinstance(self.color, str) and COLOUR.fullmatch(self.color)):
@@ -62,7 +66,8 @@ class Shape:
         size = _three(self.size, params, "the size")
         if not np.all(size >= 0):
             raise ValueError(f"the size of a shape is negative: {size.tolist()}.\nFix: lengths from zero on.")
-        return Shape(self.kind, anchors, self.surface, size, self.color)
+        level = None if self.level is None else partial(self.level, params=params)
+        return Shape(self.kind, anchors, self.surface, size, self.color, level)
 
     @property
     def owner(self) -> str | None:

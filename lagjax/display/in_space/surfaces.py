@@ -14,6 +14,8 @@ from jax.typing import ArrayLike
 PIECES, SIDES, BELTS = 3, 20, 10
 # Sectors that are light and dark by turns, so that turning is seen.
 SECTORS = 4
+# Faces up to which a mesh is drawn as it is; cells of the grid along its longest side by which larger ones get fewer.
+MOST, CELLS_OF_MESH = 2000, 24
 
 
 class Faces(NamedTuple):
@@ -51,6 +53,31 @@ def surface(vertices: ArrayLike, faces: Sequence[Sequence[int]]) -> Faces:
     fans = [_fan(face) if len(face) > 4 else np.resize(np.append(face, face[-1]), 4)[None] for face in corners]
     found = np.concatenate(fans) if fans else np.zeros((0, 4), int)
     return Faces(points, found, np.zeros(len(found)), closed=False)
+
+
+def triangles(vertices: np.ndarray, faces: np.ndarray) -> Faces:
+    """A closed surface of triangles (m, 3), anticlockwise from outside; of many, one of fewer."""
+    return fewer(Faces(vertices, np.concatenate([faces, faces[:, -1:]], axis=1), np.zeros(len(faces)), closed=True))
+
+
+def fewer(of: Faces) -> Faces:
+    """The surface itself up to `MOST` faces; of more, one whose vertices are the means of those in cells of a grid.
+
+    Source: Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes" (1993), §3.
+    """
+    if len(of.faces) <= MOST:
+        return of
+    low = of.vertices.min(axis=0)
+    cells = np.floor((of.vertices - low) * (CELLS_OF_MESH / np.ptp(of.vertices, axis=0).max())).astype(int)
+    _, member, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    member = member.reshape(-1)
+    means = np.stack([np.bincount(member, x) / count for x in of.vertices.T], axis=1)
+    faces = member[of.faces]
+    # What became a line or a point is left out, of equal faces all but one.
+    corners = np.sort(faces, axis=1)
+    flat = (np.diff(corners, axis=1) > 0).sum(axis=1) < 2
+    kept = np.setdiff1d(np.unique(corners, axis=0, return_index=True)[1], np.flatnonzero(flat))
+    return Faces(means, faces[kept], of.light[kept], of.closed)
 
 
 def _fan(face: np.ndarray):

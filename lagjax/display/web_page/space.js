@@ -1,4 +1,4 @@
-// A film of bodies, points and lines in space, painted on a canvas, the farthest face first, as `in_space/painting.py`
+// A film, or a still, of bodies, points and lines in space, painted on a canvas, the farthest face first, as `in_space/painting.py`
 // paints the first frame. Drag to turn, wheel or pinch to zoom (about the pointer), shift and drag or two fingers to move,
 // double-click for the first view; on the keyboard arrows, + and -, and Home.
 const film = (root, spec) => {
@@ -69,13 +69,13 @@ const film = (root, spec) => {
     const stroke = (ends, style, width) => { path(ends); pen.strokeStyle = style; pen.lineWidth = width; pen.stroke(); };
 
     const marks = [];
-    const line = (points, style, width) => {
+    const line = (points, style, width, ahead = 0) => {
       for (let i = 0; i + 1 < points.length; i++) {
         const d = less(points[i + 1], points[i]), count = Math.ceil(Math.sqrt(dot(d, d)) / (look.piece * view.distance));
         const n = Math.min(Math.max(count, 1), look.pieces);
         for (let k = 0; k < n; k++) {
           const ends = [project(plus(points[i], k / n, d)), project(plus(points[i], (k + 1) / n, d))];
-          marks.push([(ends[0][2] + ends[1][2]) / 2, () => stroke(ends, style, width)]);
+          marks.push([(ends[0][2] + ends[1][2]) / 2 + ahead, () => stroke(ends, style, width)]);
         }
       }
     };
@@ -111,7 +111,7 @@ const film = (root, spec) => {
       else if (shape.kind === "trail") line(behind.map(i => place(anchors[0], i)), colour(shape.color, look.trail, 1), look.thin);
       else {
         const points = anchors.map(anchor => place(anchor, frame)), style = colour(shape.color, 0, 1);
-        line(points, style, look.line);
+        line(points, style, look.line, ["mark", "gap"].includes(shape.kind) ? view.distance : 0);
         if (shape.kind === "dot") dots(points, style);
       }
     });
@@ -129,7 +129,7 @@ const film = (root, spec) => {
     marks.forEach(mark => mark[1]());
     if (!above) floor();
     const empty = parts.length && !spec.bodies && !Number.isFinite(parts[0].xyz[lane * spec.frames * parts[0].points * 3]);
-    canvas.setAttribute("aria-label", `${spec.about}, ${empty ? "no motion to draw" : words}. Arrow keys turn it, + and - zoom.`);
+    canvas.setAttribute("aria-label", `${spec.about}${empty ? ", no motion to draw" : words && ", " + words}. Arrow keys turn it, + and - zoom.`);
 
     function floor() {
       const {x, y, z, floor: low} = grid, [x0, x1, y0, y1] = [x[0], x.at(-1), y[0], y.at(-1)].map(line => line[0]), grey = "#d1d1d1";
@@ -151,7 +151,8 @@ const film = (root, spec) => {
       text("z", [top[0], top[1] - 14]);
     }
   };
-  const show = player(root, spec, draw), again = () => draw(now, said);
+  // A still has no controls.
+  const show = spec.frames > 1 ? player(root, spec, draw) : () => draw(0, ""), again = () => draw(now, said);
 
   const turn = (across, down) => {
     seen.azimuth -= across;

@@ -34,7 +34,7 @@ def film(traj, what: Any, seconds: float | None, rate: float, trail: float, ende
     at, kept = _frames(t[0], t[-1], seconds, rate, trail)
     frames = subject.frames(at, hermite(t, q, v, at))
     _check_dense(subject, t, q, v, frames)
-    return Animation(at, frames, rate, kept)
+    return Animation(at, frames.finished() if isinstance(frames, InSpace) else frames, rate, kept)
 
 
 def figure(traj, what: Any, times: ArrayLike, view: tuple[float, float], ended_by_event: bool):
@@ -58,7 +58,8 @@ def figure(traj, what: Any, times: ArrayLike, view: tuple[float, float], ended_b
     if isinstance(motion, dict) and next(iter(motion.values())).shape[-1] == 2:
         return plots.stills(motion, chosen)
     motion, chosen = (x if isinstance(x, InSpace) else InSpace((), {}, x) for x in (motion, chosen))
-    return stills_in_space(motion, chosen, *view)
+    motion = motion.finished()
+    return stills_in_space(motion, chosen._replace(shapes=motion.shapes), *view)
 
 
 def film_of_lanes(

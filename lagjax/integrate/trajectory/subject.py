@@ -81,8 +81,8 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
         if what is None:
             raise ValueError(
                 "nothing says how this system is drawn.\n"
-                "Fix: traj.animate(lambda t, q, params: (q[0], q[1])), a function that gives points, or shapes, "
-                "traj.animate([lj.box(body, (1.0, 0.2, 0.2))])."
+                "Fix: give a function that gives points, lambda t, q, params: (q[0], q[1]), or shapes, "
+                "[lj.box(body, (1.0, 0.2, 0.2))]."
             )
     # Where its bodies are is known of a system whatever is drawn of it.
     poses = (what if isinstance(what, Drawing) else known_drawing(system) or Drawing(())).poses
@@ -93,7 +93,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
         raise TypeError(
             f"what is drawn must be a function positions(t, q, params) or shapes, not {type(parts).__name__}"
             f"{' of ' + type(parts[0]).__name__ if isinstance(parts, Sequence) and len(parts) else ''}.\n"
-            "Usual cause: bodies in place of their shapes.\nFix: traj.animate([lj.box(body, (1.0, 0.2, 0.2))])."
+            "Usual cause: bodies in place of their shapes.\nFix: [lj.box(body, (1.0, 0.2, 0.2))]."
         )
     functions = tuple(x for x in parts if not isinstance(x, Shape))
     for function in functions:
@@ -102,7 +102,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
     if not functions and all(shape.owner is None for shape in shapes):
         raise ValueError(
             "nothing of what is drawn moves: all shapes are fixed in space.\n"
-            "Fix: give the bodies, too, traj.animate([lj.sphere(body, 0.1), lj.line(lj.ground, body)])."
+            "Fix: give the bodies, too, [lj.sphere(body, 0.1), lj.line(lj.ground, body)]."
         )
     return Subject(functions, shapes, poses, params)
 
