@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.bodies.body import Body, PoseOnTree, check_bodies
+from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
@@ -167,7 +167,7 @@ class Tree:
         looks_like = [*(joint.function for joint in joined), *(load.potential for load in loads)]
 
         def drawn(q, params):
-            return {name: (pose.position, pose.quaternion) for name, pose in self.poses(q, params).items()}
+            return {name: Pose(pose.position, pose.quaternion) for name, pose in self.poses(q, params).items()}
 
         setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), drawn))
         return System(
