@@ -81,10 +81,11 @@ def _parts(options, folder) -> Iterator[JobPart]:
         return
     pool = ProcessPoolExecutor(at_a_time, get_context("spawn"))
     try:
-        running = [pool.submit(_part, *task) for task in tasks]
-        for task, future in zip(tasks, running):
-            _progress(f"{task[0]}: {sum(f.done() for f in running)} of {len(tasks)} done")
-            part = future.result()
+        # The stability report takes long and is printed last: it starts first, so that no core waits for it.
+        running = {task: pool.submit(_part, *task) for task in sorted(tasks, key=lambda task: task[0] != STABILITY)}
+        for task in tasks:
+            _progress(f"{task[0]}: {sum(f.done() for f in running.values())} of {len(tasks)} done")
+            part = running[task].result()
             _progress("")
             yield part
     finally:

@@ -49,20 +49,23 @@ allowed = [MOST_PAGES]
 # The maps are counted once in ten tests: the list of 30,000 takes the kernel 10 ms.
 tests = itertools.count()
 backend_compile: Any = getattr(compiler, "backend_compile_and_load", None)
+# The older loop emitter takes two thirds of the time of XLA; one module of LLVM's instead of up to 32, which share
+# helper functions and a pool of threads, another eighth less of the processors', all of which the workers use anyhow.
+COMPILED_FASTER = [("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)]
 
 
-def compile_without_fusion_emitters(backend, module, devices, options, callbacks):
-    """Compile with XLA's older loop emitter, in two thirds of the time, where few optimisations are asked for."""
+def compile_faster(backend, module, devices, options, callbacks):
+    """Compile with `COMPILED_FASTER` where few optimisations are asked for."""
     if jax.config.read("jax_disable_most_optimizations"):
         # By JAX's own function: `XLA_FLAGS` would change the optimised tests too, which run in the same process.
-        options.env_option_overrides = [*options.env_option_overrides, ("xla_cpu_use_fusion_emitters", False)]
+        options.env_option_overrides = [*options.env_option_overrides, *COMPILED_FASTER]
     return backend_compile(backend, module, devices, options, callbacks)
 
 
 # Private to JAX: where it is another function, or LAGJAX_TESTS_PLAIN=1, tests compile as they did before.
 takes_options = callable(backend_compile) and list(inspect.signature(backend_compile).parameters)[3:4] == ["options"]
 if takes_options and "LAGJAX_TESTS_PLAIN" not in os.environ:
-    compiler.backend_compile_and_load = compile_without_fusion_emitters
+    compiler.backend_compile_and_load = compile_faster
 
 
 def as_users_get_it(item):
@@ -77,14 +80,17 @@ def pytest_addoption(parser):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Exhaustive tests are slow ones, run on request; the optimised tests come last: few programs compile twice."""
+    """Exhaustive tests are slow ones, run on request; the types, which take longest, come first: none waits for them.
+
+    The optimised tests come last: few programs compile twice.
+    """
     exhaustive = [item for item in items if item.get_closest_marker("exhaustive")]
     for item in exhaustive:
         item.add_marker("slow")
     if not config.getoption("--all-sizes"):
         config.hook.pytest_deselected(items=exhaustive)
         items[:] = [item for item in items if not item.get_closest_marker("exhaustive")]
-    items.sort(key=as_users_get_it)
+    items.sort(key=lambda item: (item.path.name != "test_types.py", as_users_get_it(item)))
 
 
 @pytest.hookimpl(tryfirst=True)

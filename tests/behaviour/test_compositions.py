@@ -112,7 +112,6 @@ def cases():
             yield pytest.param(*case, marks=pytest.mark.slow if case in SLOW else pytest.mark.exhaustive)
 
 
-@pytest.mark.optimised
 @pytest.mark.parametrize("motion, composition", list(cases()))
 def test_compositions(motion, composition):
     """Each combination agrees with forward mode along the same directions."""

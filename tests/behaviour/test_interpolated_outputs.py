@@ -104,7 +104,11 @@ def test_on_the_constraints():
     assert np.max(np.abs(traj.q[:, 0] - np.sin(angle))) < 2e-3
     # 2 λ = -(cos(angle) + rate²) pulls the mass inwards; g = 1.
     assert np.max(np.abs(2 * traj.multipliers["rod"] + np.cos(angle) + rate**2)) < 1e-2
-    loss = lambda p: jnp.sum(of(p, **between).q[:, 0]) + jnp.sum(of(p, **between).multipliers["rod"])
+
+    def loss(p):
+        traj = of(p, **between)
+        return jnp.sum(traj.q[:, 0]) + jnp.sum(traj.multipliers["rod"])
+
     along = jnp.arange(40.0) / 40
     pushed = jax.jvp(loss, (SHARES,), (along,))[1]
     assert float(jax.grad(loss)(SHARES) @ along) == pytest.approx(float(pushed), rel=1e-9)

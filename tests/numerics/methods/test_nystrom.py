@@ -160,35 +160,44 @@ NETWORKS = {
 }
 
 
+def chosen(name, dtype=np.float64, traced=None, **how):
+    """What is said of a motion whose method is chosen; `traced` is a tolerance that is not known."""
+    system, params, _ = NETWORKS[name]
+    q0, v0 = np.array([1.0, 0.0], dtype), np.array([0.0, 1.0], dtype)
+    x = jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array_like(x) else x, params)
+
+    def run(q0, v0, traced):
+        tolerance = {} if traced is None else {"rtol": traced}
+        return lj.integrate(system, q0, v0, x, ts=np.array([0.0, 0.1], dtype), throw=False, **tolerance, **how)
+
+    return jax.eval_shape(run, q0, v0, traced)
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 def test_of_networks(name):
-    """Tsit5 at loose tolerances, constraints or not; a traced tolerance counts as the default of the dtype."""
+    """Tsit5 at loose tolerances, constraints or not, where there is a network; `explain` says so."""
     system, params, tight = NETWORKS[name]
     loose = "Tsit5, outputs interpolated" if tight else "Nystrom12"
     tight = tight or "Nystrom12"
-
-    def chosen(dtype, rtol=None, traced=None, **how):
-        q0, v0 = np.array([1.0, 0.0], dtype), np.array([0.0, 1.0], dtype)
-        x = jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array_like(x) else x, params)
-        ts = np.array([0.0, 0.1], dtype)
-        run = lambda q0, v0, traced: lj.integrate(
-            system, q0, v0, x, ts=ts, rtol=rtol if traced is None else traced, throw=False, **how
-        )
-        return jax.eval_shape(run, q0, v0, traced)
-
-    for rtol, expected in ((None, tight), (9e-7, tight), (1e-6, loose), ((1e-3, 1e-7), tight), ((1e-3, 1e-5), loose)):
-        assert chosen(np.float64, rtol).static.method == expected
-    assert chosen(np.float32).static.method == loose
-    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.1)
-    assert chosen(np.float64, **fixed).static.method == tight
-    assert chosen(np.float32, outputs="exact").static.method == loose.partition(",")[0]
-    for dtype, expected in ((np.float64, tight), (np.float32, loose)):
-        assert chosen(dtype, traced=np.asarray(1e-5, dtype)).static.method == expected
+    found = chosen(name, rtol=1e-6)
+    assert found.static.method == loose and chosen(name).static.method == tight
     # Where the motion is continued, by the same method.
-    asked = chosen(np.float64, 1e-6).asked.method
-    assert type(asked).__name__ == ("NoneType" if loose == tight else "Tsit5")
+    assert type(found.asked.method).__name__ == ("NoneType" if loose == tight else "Tsit5")
     said = repr(lj.explain(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]), params))
     assert ("by Tsit5 at rtol of 1e-6 and above" in said) == (loose != tight) and f"stepped by {tight}" in said
+
+
+def test_which_tolerance_is_loose():
+    """The tighter one of several counts, and for a traced one the default of the dtype; interpolated if not fixed."""
+    loose, tight = "Tsit5, outputs interpolated", NETWORKS["matrices"][2]
+    for rtol, expected in ((9e-7, tight), ((1e-3, 1e-7), tight), ((1e-3, 1e-5), loose)):
+        assert chosen("matrices", rtol=rtol).static.method == expected
+    assert chosen("matrices", np.float32).static.method == loose
+    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.1)
+    assert chosen("matrices", **fixed).static.method == tight
+    assert chosen("matrices", np.float32, outputs="exact").static.method == "Tsit5"
+    for dtype, expected in ((np.float64, tight), (np.float32, loose)):
+        assert chosen("matrices", dtype, np.asarray(1e-5, dtype)).static.method == expected
 
 
 def test_refused_where_velocities_count():
