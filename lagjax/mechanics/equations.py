@@ -9,8 +9,6 @@ fast, and gives NaN where it fails.
 A caller has an `Equations` and does not choose between them.
 """
 
-from functools import partial
-
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
@@ -22,12 +20,15 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, length, once, one_function
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
-from lagjax.mechanics.saddle_point import Dense, Verdict, is_regular, largest_of_rows, slightly_off
-from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, write_out
+from lagjax.mechanics.saddle_point import Dense, Verdict, corrected, is_regular, largest_of_rows, slightly_off
+from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, is_tiny, write_out
 from lagjax.mechanics.scalar_form import in_numbers
 from lagjax.mechanics.sparse_saddle_point import Banded, plan
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.system import Form, Model, coordinates
+
+# Of Newton's method at a start, where positions and velocities move together, and each squares how far they are off.
+ITERATIONS = 4
 
 
 class Equations(eqx.Module):
@@ -111,31 +112,32 @@ class Equations(eqx.Module):
             eqxi.unvmap_all(all_finite(a)), lambda: fast, lambda: _solution_or_nan(self.form, self.model, t, q, v)
         )
 
-    def verdict(self, t: Array, q: PyTree, v: PyTree, given: tuple | None = None) -> Verdict:
-        """Solve the equations at one state, and say whether the solution is valid.
+    def verdict(self, t: Array, q: PyTree, v: PyTree) -> Verdict:
+        """Solve the equations at one state, and say whether the solution is valid."""
+        if self.are_taken_for_regular:
+            return self.begin(t, q, v, project=False)[1]
+        return _verdict(self.form, self.model, t, q, v)
 
-        `given`: the state before it was returned to the constraints, if its residuals are wanted too.
+    def begin(self, t: Array, q: PyTree, v: PyTree, project: bool) -> tuple[tuple[PyTree, PyTree], Verdict]:
+        """The state at a start, returned to the constraints if asked to `project`, and the verdict there.
+
+        For equations taken for regular: all in one loop, in which they are compiled once.
         """
-        if not self.are_taken_for_regular:
-            return _verdict(self.form, self.model, t, q, v)
-        # The different ways of not being regular are not told apart here.
-        model, (x, u) = self.model, self.model.vectors(q, v)
-        if model.m:
-            # In a loop over these states, so that the equations are compiled once.
-            before = model.vectors(*(given or (q, v)))
-            states = jnp.stack([jnp.stack([x, u]), jnp.stack([slightly_off(x), slightly_off(u)]), jnp.stack(before)])
-            results, known = lax.map(partial(self._known_at, t), states)
-            (a, stacked), here = jtu.tree_map(lambda x: x[0], (results, known))
-            nearby, of_given = known.jacobian[1], (known.residuals[2], known.jacobian[2])
-        else:
-            (a, stacked), here = self._known_at(t, jnp.stack([x, u]))
-            nearby, of_given = here.jacobian, None
-        multipliers = model.split(stacked)
+        x, u = self.model.vectors(q, v)
+        last = ITERATIONS if project and self.model.is_returned else 0
+        states, (results, known) = one_function(_from_given, self, t, jnp.stack([x, u]), last)
+        (a, stacked), here = jtu.tree_map(lambda rows: rows[last], (results, known))
+        model, multipliers, (x, u) = self.model, self.model.split(stacked), states[last]
         finite = jnp.all(jnp.isfinite(coordinates.flatten((a, multipliers, here.lagrangian))[0]))
-        regular = is_regular(model, here.mass, here.jacobian, nearby) & is_determined(model, t, x, u)
-        return Verdict(
-            a, multipliers, finite, ~regular, jnp.asarray(False), largest_of_rows(here.mass), given and of_given
-        )
+        if last:
+            finite &= jnp.all(jax.vmap(is_tiny)(states[last] - states[last - 1], states[last]))
+        regular = is_regular(model, here.mass, here.jacobian, known.jacobian[-1]) & is_determined(model, t, x, u)
+        # The different ways of not being regular are not told apart here.
+        verdict = Verdict(
+            a, multipliers, finite, ~regular, jnp.asarray(False), largest_of_rows(here.mass),
+            (known.residuals[0], known.jacobian[0]),
+        )  # fmt: skip
+        return (model.tree(x), model.tree(u)), verdict
 
     def _known_at(self, t: Array, state: Array) -> list:
         assert self.written is not None
@@ -241,6 +243,17 @@ def _solution_or_nan(form, model: Model, t: Array, q: PyTree, v: PyTree):
     state = t, *model.vectors(q, v)
     a, multipliers = form.solution_or_nan(model, *state)
     return model.tree(completed(model, *state, a)), model.split(multipliers)
+
+
+def _from_given(equations: Equations, t: Array, given: Float[Array, "2 n"], last: int):
+    """The states from a given one to the `last` of Newton's iterations, and one `slightly_off`; what is known there."""
+
+    def step(state: Float[Array, "2 n"], i: Array):
+        (results, known) = equations._known_at(t, state)
+        moved, off = corrected(equations.model, t, *state, known), tuple(map(slightly_off, state))
+        return jnp.where(i < last, jnp.stack(moved), jnp.stack(off)), (state, (results, known))
+
+    return lax.scan(step, given, jnp.arange(last + 2))[1]
 
 
 def _in_turn(equations: Equations, t: Float[Array, " T"], q: PyTree, v: PyTree) -> dict[str, Array]:

@@ -38,7 +38,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import compiled
-from lagjax.mechanics.first_order import completed, is_determined, with_first_order
+from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
 from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
 from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense, independent_rows, unit_rows
@@ -201,6 +201,20 @@ def displacement_map(mass: Array, jacobian: Array, independent: Array):
     n = mass.shape[0]
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
     return _spread(inverted[:n, n:], independent)
+
+
+def corrected(model: Model, t: Array, x: Array, u: Array, known):
+    """The state after one of Newton's iterations to all constraints, the shortest in the metric of M.
+
+    `known`: M, A and the residuals there.
+    """
+    if not model.m:
+        return x, resolved(model, t, x, u)
+    used = jnp.ones(model.m, bool) if model.off is None else ~model.off
+    displacement = displacement_map(known.mass, known.jacobian, used)
+    of_positions, of_velocities = jnp.split(known.residuals, [known.residuals.size - model.m])
+    x = x - displacement[:, model.holonomic] @ of_positions
+    return x, resolved(model, t, x, u - displacement @ of_velocities)
 
 
 def _pick(x: Array, independent: Array, n: int):

@@ -14,13 +14,14 @@ the results are NaN: a caller then takes the robust way.
 Source: Golub & Van Loan, *Matrix Computations*, §4.1.2 (L D Lᵀ), §4.2.7 (without pivoting where definite).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import TooLong, decided, is_array, is_plain
 from lagjax.mechanics.first_order import completed, resolved, without_mass
@@ -89,7 +90,8 @@ def write_out(model: Model) -> WrittenOut | None:
         return None
     if equations.length > LONG:
         return None
-    return WrittenOut(equations, Numbers(_projected, model) if model.is_returned else None, may_fail=not diagonal)
+    project = Numbers(partial(_projected, equations.more), model) if model.is_returned else None
+    return WrittenOut(equations, project, may_fail=not diagonal)
 
 
 def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
@@ -112,11 +114,12 @@ def _known(model: Model, t: Array, x: Array, u: Array, mass: Array, jacobian: Ar
     return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, jnp.concatenate([position, velocity]))
 
 
-def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
+def _projected(known_of: Callable, model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     if not model.m:
         return q, model.tree(resolved(model, t, x, u))
-    mass, jacobian = mass_and_forcing(model, t, x, u).mass, constraints.jacobian(model, t, x, u)
+    # M and A of the equations: differentiating L and the constraints once more would take as long as all the rest.
+    _, mass, jacobian, _ = known_of(model, t, q, v)
     # The residual vanishes at the solution, so that the derivative of the matrix does not count.
     solver = dense.Saddle(*map(lax.stop_gradient, (mass, jacobian)), off=model.off)
     no_force = jnp.zeros_like(x)
@@ -130,11 +133,13 @@ def _projected(model: Model, t: Array, q: PyTree, v: PyTree):
     for _ in range(2):
         last_u, _ = solver.solve(no_force, -constraints.velocity_residual(model, t, x, u), refine=False)
         u = u + last_u
-    near = solver.valid & _tiny(last_x, x) & _tiny(last_u, u)
+    near = solver.valid & is_tiny(last_x, x) & is_tiny(last_u, u)
     return model.tree(jnp.where(decided(near), x, jnp.nan)), model.tree(resolved(model, t, x, u))
 
 
-def _tiny(correction, y: Array) -> Array:
+def is_tiny(correction: Array, y: Array) -> Bool[Array, ""]:
+    """Whether Newton's method has arrived: another iteration would move the state by the square of this one."""
+
     def norm(z: Array) -> Array:
         return jnp.sum(jnp.abs(z))
 

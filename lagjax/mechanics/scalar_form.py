@@ -120,6 +120,10 @@ class Numbers:
         found = iter(self._late_with_more(prepared or (), *jtu.tree_leaves((t, q, v))))
         return [jtu.tree_unflatten(shape, islice(found, shape.num_leaves)) for shape in self.shapes]
 
+    def more(self, model: Model, t: Array, q: PyTree, v: PyTree):
+        """What else the function returns."""
+        return self.with_more_at(self.prepare(model), t, q, v)[1]
+
     def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""
         return self.at(self.prepare(model), t, q, v)

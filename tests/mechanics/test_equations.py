@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.jaxtools.jaxpr import equations as equations_in
 from lagjax.mechanics import equations, sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import Dense
@@ -78,6 +79,39 @@ def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     assert bool(finite) and not bool(nowhere)
     # Dependent equations share the force equally.
     np.testing.assert_allclose(*multipliers["rod"], rtol=1e-12)
+
+
+@not_plain
+def test_a_start_is_returned_and_judged_in_one_loop():
+    """A start is moved to the nearest point of the circle, and along its tangent; the equations are there once.
+
+    Twins: what is not to be projected stays, what is far off is not called finite, and two verdicts have two copies.
+    """
+    s = coordinates.state(0.0, {"x": 0.6, "y": -0.8}, {"x": 1.0, "y": 2.0}, PARAMS | {"l": 1.003})
+    regular = equations_of(model_of(rod_pendulum, *s), fast=True, fallback=False)
+
+    @jax.jit
+    def begun(factor):
+        x, y = jnp.asarray(s.q["x"]) * factor, jnp.asarray(s.q["y"]) * factor
+        return [regular.begin(s.t, (x, y), regular.inside(s.v), project) for project in (True, False)]
+
+    ((q, v), moved), (still, as_given) = begun(1.0)
+    np.testing.assert_allclose(q, [0.6 * 1.003, -0.8 * 1.003], rtol=1e-15)
+    np.testing.assert_allclose(v, [1.6, 1.2], rtol=1e-14)
+    assert moved.finite and as_given.finite and not moved.singular
+    np.testing.assert_allclose(moved.given[0], [1.0 - 1.003**2, -2.0], rtol=1e-12)
+    assert still == ((s.q["x"], s.q["y"]), (s.v["x"], s.v["y"]))
+    assert not begun(8.0)[0][1].finite
+
+    lagrangian = lambda t, q, v, p: rod_pendulum.lagrangian(t, q, v, p) + jnp.arctan2(q["y"], q["x"])
+    turned = equations_of(model_of(lj.System(lagrangian, rod_pendulum.constraints), *s), fast=True, fallback=False)
+
+    def arctangents(function):
+        program = jax.make_jaxpr(function)(s.t, turned.inside(s.q), turned.inside(s.v))
+        return sum(equation.primitive.name == "atan2" for equation in equations_in(program))
+
+    assert arctangents(lambda *state: turned.begin(*state, project=True)) == 1
+    assert arctangents(lambda *state: (turned.begin(*state, project=True), turned.verdict(*state))) == 2
 
 
 @not_plain

@@ -148,13 +148,18 @@ class Start(NamedTuple):
 def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Settings, sizes_so_far) -> Start:
     """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
-    if settings.drift == "project":
-        q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
-    a, _, finite, singular, contradictory, mass, known = stop_gradient(equations.verdict(t, q, v, given[1:3]))
+    project = settings.drift == "project"
+    if equations.are_taken_for_regular:
+        (q, v), verdict = equations.begun(t, q, v, project)
+    else:
+        if project:
+            q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
+        verdict = equations.verdict(t, q, v)
+    a, _, finite, singular, contradictory, mass, known = stop_gradient(verdict)
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol, known)
-        if settings.drift == "project" and not equations.are_taken_for_regular:
+        if project and not equations.are_taken_for_regular:
             off_constraints |= finite & ~singular & ~within(equations, t, q, v, *tolerances)
     first_order = equations.model.form.first_order
     without_mass = np.zeros(equations.model.n, bool) if first_order is None else first_order.mask(equations.model.n)
