@@ -51,6 +51,58 @@ class Pose(NamedTuple):
         spin = jnp.concatenate([jnp.zeros(1, dtype), jnp.asarray(spin, dtype)])
         return Pose(jnp.asarray(velocity, dtype), product(spin, self.quaternion) / 2)
 
+    @property
+    def matrix(self) -> Float[Array, "3 3"]:
+        """R, whose columns are the body's axes in space."""
+        return rotation_matrix(self.quaternion)
+
+    def spin(self, rates: Any) -> Float[Array, "3"]:
+        """The angular velocity along the axes of space, of a body here with these rates."""
+        return spin_in_space(self.quaternion, rates.quaternion)
+
+    def spin_in_body(self, rates: Any) -> Float[Array, "3"]:
+        """The angular velocity along the body's axes."""
+        return spin_in_body(self.quaternion, rates.quaternion)
+
+    def velocity(self, rates: Any, r: Array) -> Float[Array, "3"]:
+        """The velocity of a point of the body."""
+        return rates.position + jnp.cross(self.spin(rates), self.matrix @ r)
+
+
+class PoseOnTree(NamedTuple):
+    """A pose with its rotation matrix, from which the bodies of a `lj.Tree` take points and velocities.
+
+    As rates it holds those of all three. What is read of it is short: places of bodies of a tree are functions of all
+    joints on the way there, of which two derivatives are taken in a contact.
+
+    >>> pose = PoseOnTree(jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.eye(3))
+    >>> about_z = jnp.array([[0.0, -2.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    >>> turning = PoseOnTree(jnp.zeros(3), jnp.zeros(4), about_z)
+    >>> print(pose.spin(turning), pose.velocity(turning, jnp.array([1.0, 0.0, 0.0])))
+    [0. 0. 2.] [0. 2. 0.]
+    """
+
+    position: Float[Array, "3"]
+    quaternion: Float[Array, "4"]
+    matrix: Float[Array, "3 3"]
+
+    def spin(self, rates: "PoseOnTree") -> Float[Array, "3"]:
+        """The angular velocity along the axes of space: Ṙ Rᵀ is Ω×."""
+        return _turning(self.matrix @ rates.matrix.T)
+
+    def spin_in_body(self, rates: "PoseOnTree") -> Float[Array, "3"]:
+        """The angular velocity along the body's axes: Rᵀ Ṙ is Ω×."""
+        return _turning(rates.matrix.T @ self.matrix)
+
+    def velocity(self, rates: "PoseOnTree", r: Array) -> Float[Array, "3"]:
+        """The velocity of a point of the body."""
+        return rates.position + rates.matrix @ r
+
+
+def _turning(crossed: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Ω of (Ω×)ᵀ."""
+    return jnp.stack([crossed[1, 2] - crossed[2, 1], crossed[2, 0] - crossed[0, 2], crossed[0, 1] - crossed[1, 0]]) / 2
+
 
 def floats(q: PyTree) -> Any:
     """The dtype of the numbers in q; JAX's usual one for whole numbers and where there are none."""
@@ -146,20 +198,21 @@ class Body:
 
     def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """A vector in space that is fixed in the body."""
-        e = self.pose(q).quaternion
-        return rotation_matrix(e) @ jnp.asarray(r, e.dtype)
+        pose = self.pose(q)
+        return pose.matrix @ jnp.asarray(r, pose.quaternion.dtype)
 
     def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
         """The velocity in space of a point of the body."""
-        return self.rates(v).position + jnp.cross(self.spin(q, v), self.direction(q, r))
+        pose = self.pose(q)
+        return pose.velocity(self.rates(v), jnp.asarray(r, pose.quaternion.dtype))
 
     def spin(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
         """The angular velocity along the axes of space, `1/[t]`."""
-        return spin_in_space(self.pose(q).quaternion, self.rates(v).quaternion)
+        return self.pose(q).spin(self.rates(v))
 
     def spin_in_body(self, q: PyTree, v: PyTree) -> Float[Array, "3"]:
         """The angular velocity along the body's axes, `1/[t]`."""
-        return spin_in_body(self.pose(q).quaternion, self.rates(v).quaternion)
+        return self.pose(q).spin_in_body(self.rates(v))
 
     def angular_momentum(self, q: PyTree, v: PyTree, params: PyTree = None) -> Float[Array, "3"]:
         """The angular momentum about the centre of mass, in space."""

@@ -287,7 +287,7 @@ class RobotModel:
 
     def _poses(self, s: Mapping) -> dict[str, Pose]:
         poses = self._tree.poses(s)
-        return {name: poses[name] for name in self.bodies}
+        return {name: Pose(poses[name].position, poses[name].quaternion) for name in self.bodies}
 
     def _moving(self, s: Mapping, w: Mapping) -> tuple[dict[str, Pose], dict[str, Pose]]:
         return jax.jvp(self._poses, (s,), (w,))

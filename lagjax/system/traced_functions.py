@@ -29,6 +29,7 @@ from lagjax.jaxtools import (
     full_products,
     is_array,
     meaning_of,
+    needed,
     once,
     rules_of,
     with_own_constants,
@@ -73,6 +74,8 @@ class TracedProgram:
         arrays = _arrays(args)
         with full_products():
             closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
+            # What a function computes and does not use would be traced again with each of its derivatives.
+            closed = closed.replace(jaxpr=closed.jaxpr.replace(eqns=needed(closed.jaxpr)))
             rules = rules_of(of_arrays, closed, own, arrays)
         self.value, self._structure, self.jaxpr = returned[0], structures[0], closed.jaxpr
         # A user may write to a NumPy array afterwards.

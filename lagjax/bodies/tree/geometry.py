@@ -16,11 +16,31 @@ from lagjax.bodies.body import valued
 from lagjax.bodies.tree.links import Entry, Link, Slots, slots_of
 
 
+class FixedNumbers(NamedTuple):
+    """What no params change, as operands, since programs that hold arrays of their own are traced again when used.
+
+    - `turns`, `slides` (n, k): which freedoms turn, and which slide; `axes` (n, 3, k): theirs along those of parents,
+      zero where there is none.
+    - `turned`: E = E_0 + cos s E_1 + sin s E_2 for a coordinate s, each (n, 3, 3).
+    - `read`, `write`, `root`: for the passes over the links (`Slots`), and which hang on the ground.
+    """
+
+    turns: Float[Array, "n k"]
+    slides: Float[Array, "n k"]
+    axes: Float[Array, "n 3 k"]
+    turned: Float[Array, "3 n 3 3"]
+    read: Float[Array, "n slots"]
+    write: Float[Array, "n slots"]
+    root: Float[Array, " n"]
+
+
 class LinkNumbers(NamedTuple):
     """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links.
 
     `armature`: the inertia that the rate of each freedom has besides, of its rotor.
     """
+
+    fixed: FixedNumbers
 
     mass: Float[Array, " n"]
     inertia: Float[Array, "n 3 3"]
@@ -32,16 +52,15 @@ class LinkNumbers(NamedTuple):
 class Geometry:
     """The links of a tree as arrays.
 
-    `frame_a`, `frame_b` (n, 3, 3): the axes of joints as rows, along those of parents and of links. `turns` (n, k):
-    which freedoms turn, `slides` which slide; k is the largest number of freedoms of a joint between two bodies.
+    `frames`: what turns the axes of joints into those of parents, and of links into those of joints, each (n, 3, 3).
+    `turns` (n, k): which freedoms turn, `slides` which slide; k is the largest number of freedoms of a joint.
     """
 
     def __init__(self, links: Sequence[Link], entries: Sequence[Entry], armature: Mapping[str, ArrayLike | Callable]):
         self.links, self.entries, self.armature = links, entries, armature
         kinds = np.array([link.kind for link in links])
         self.n, self.k = len(links), 3 if "ball" in kinds else 1
-        self.frame_a = np.array([link.a.frame for link in links])
-        self.frame_b = np.array([link.b.frame for link in links])
+        self.frames = np.array([np.transpose(link.a.frame) for link in links]), np.array([x.b.frame for x in links])
         first = np.arange(self.k) == 0
         self.turns = (((kinds == "turn")[:, None] & first) | (kinds == "ball")[:, None]).astype(float)
         self.slides = ((kinds == "slide")[:, None] & first).astype(float)
@@ -49,6 +68,25 @@ class Geometry:
         self.root = np.array([link.parent < 0 for link in links], float)
         self.slots: Slots = slots_of([link.parent for link in links])
         self.body_at = {link.body.name: i for i, link in enumerate(links) if link.body is not None}
+
+    @cached_property
+    def axes(self) -> np.ndarray:
+        """The axes of freedoms along those of parents, (n, 3, k), zero where there is none."""
+        axes = self.frames[0] if self.k == 3 else self.frames[0][:, :, 2:]
+        if self.k == 3:
+            # The axis of a hinge or slide comes first.
+            axes = np.where(self.ball[:, None, None], axes, axes[:, :, ::-1])
+        return axes * (self.turns + self.slides)[:, None, :]
+
+    @cached_property
+    def turned(self) -> np.ndarray:
+        """How a coordinate turns each link (`FixedNumbers`): a hinge about the third axis."""
+        before, after = self.frames
+        still, cosine, sine = np.diag([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 0.0]), np.zeros((3, 3))
+        sine[1, 0], sine[0, 1] = 1.0, -1.0
+        hinges = (self.turns[:, :1] * ~self.ball[:, None])[:, :, None]
+        fixed = before @ (hinges * still + (1 - hinges) * np.eye(3)) @ after
+        return np.stack([fixed, hinges * (before @ cosine @ after), hinges * (before @ sine @ after)])
 
     @cached_property
     def numbers(self) -> np.ndarray:
@@ -93,7 +131,9 @@ class Geometry:
                 total = total + of_f * value[None]
             return total
 
+        fixed = self.turns, self.slides, self.axes, self.turned, *self.slots, self.root
         return LinkNumbers(
+            FixedNumbers(*(jnp.asarray(x, dtype) for x in fixed)),
             values([0.0 if body is None else body.mass for body in bodies]),
             values([(0.0, 0.0, 0.0) if body is None else body.inertia for body in bodies], inertia),
             values([link.a.place for link in self.links]),

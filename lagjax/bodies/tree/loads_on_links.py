@@ -3,9 +3,10 @@
 A load reads `q[body.name]` as the body's pose; here it reads the pose that the joint coordinates give, and any other
 name as the joint coordinate of that name. The derivatives of a potential by a body's pose are a force and, by
 
-    N = ½ vec(∂V/∂e e*) = ∂V/∂Ω,      since ė = ½ Ω e,
+    N = Σ R_i × ∂V/∂R_i = ∂V/∂Ω,      since Ṙ_i = Ω × R_i for the columns of R,
 
-a moment: so a potential costs its own derivative, not that of the way to the links.
+a moment: so a potential costs its own derivative, not that of the way to the links. By a quaternion it is
+½ vec(∂V/∂e e*), since ė = ½ Ω e.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -17,41 +18,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Pose, valued
+from lagjax.bodies.body import PoseOnTree, valued
 from lagjax.bodies.loads import Load, Weight
 from lagjax.bodies.rotation import conjugate, product, quaternion_of
 from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
-from lagjax.bodies.tree.motion import LinkMotion
+from lagjax.bodies.tree.motion import LinkMotion, cross
 
 
 class Placed(eqx.Module):
     """What loads and closures read as q or v: bodies by name as poses, all else as it is in the tree's own q or v."""
 
     geometry: Geometry = eqx.field(static=True)
-    poses: Pose
+    poses: PoseOnTree
     others: PyTree
 
     def __getitem__(self, name: str) -> Any:
         place = self.geometry.body_at.get(name)
-        return self.others[name] if place is None else Pose(self.poses.position[place], self.poses.quaternion[place])
+        return self.others[name] if place is None else jax.tree.map(lambda x: x[place], self.poses)
 
 
-def poses_of(motion: LinkMotion) -> Pose:
+def poses_of(centre: Float[Array, "n 3"], turn: Float[Array, "n 3 3"]) -> PoseOnTree:
     """The poses of all links, stacked."""
-    return Pose(motion.centre, jax.vmap(quaternion_of)(motion.turn))
+    return PoseOnTree(centre, _quaternions(turn), turn)
 
 
-def rates_of(motion: LinkMotion, poses: Pose) -> Pose:
-    """Their rates."""
-    spin = jnp.concatenate([jnp.zeros_like(motion.spin[:, :1]), motion.spin], axis=1)
-    return Pose(motion.velocity, jax.vmap(product)(spin, poses.quaternion) / 2)
+# Jitted, as it is traced wherever poses are read, and rarely used.
+_quaternions = jax.jit(jax.vmap(quaternion_of))
 
 
 def potential(geometry: Geometry, given: LinkNumbers, loads: Iterable[Load], motion: LinkMotion, state: tuple) -> Array:
     """V of all loads."""
     weights, others = _sorted(loads)
     total = -jnp.sum(_weights(geometry, given, weights, state[-1]) * motion.centre)
-    return total + _of_poses(geometry, others, poses_of(motion), state) if others else total
+    return total + _of_poses(geometry, others, poses_of(motion.centre, motion.turn), state) if others else total
 
 
 def wrenches(
@@ -62,9 +61,11 @@ def wrenches(
     force = _weights(geometry, given, weights, state[-1])
     moment = jnp.zeros_like(force)
     if others:
-        poses = poses_of(motion)
-        slope = jax.grad(lambda poses: _of_poses(geometry, others, poses, state))(poses)
-        force, moment = force - slope.position, moment - moments(poses.quaternion, slope.quaternion)
+        place = motion.centre, motion.turn
+        pull, slope = jax.grad(lambda place: _of_poses(geometry, others, poses_of(*place), state))(place)
+        # Their columns as rows.
+        columns, slopes = (jnp.swapaxes(x, 1, 2) for x in (motion.turn, slope))
+        force, moment = force - pull, moment - jnp.sum(cross(columns, slopes), axis=1)
     return jnp.concatenate([moment, force], axis=1)
 
 
@@ -74,7 +75,7 @@ def _sorted(loads: Iterable[Load]) -> tuple[list[Weight], list[Callable]]:
     return [x for x in given if isinstance(x, Weight)], [x for x in given if not isinstance(x, Weight)]
 
 
-def _of_poses(geometry: Geometry, potentials: Sequence[Callable], poses: Pose, state: tuple) -> Array:
+def _of_poses(geometry: Geometry, potentials: Sequence[Callable], poses: PoseOnTree, state: tuple) -> Array:
     t, q, v, params = state
     return jnp.asarray(sum(x(t, Placed(geometry, poses, q), v, params) for x in potentials))
 

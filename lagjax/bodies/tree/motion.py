@@ -13,9 +13,10 @@ and no constraint holds it:
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, §4.4 and Table 5.1.
 """
 
+from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,10 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Pose
 from lagjax.bodies.rotation import conjugate, product, rotation_matrix
-from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
+from lagjax.bodies.tree.geometry import FixedNumbers, Geometry, LinkNumbers
+
+# So few links are written out, one by one; more of them in a loop.
+FEW = 3
 
 
 class Coordinates(NamedTuple):
@@ -39,20 +43,22 @@ class Coordinates(NamedTuple):
 class Joints(NamedTuple):
     """The links as seen from their parents.
 
-    `turn` E, `offset` o and `arm` b' as above, `axes` (n, 3, k) those of the freedoms; `spin` and `slide` are ω_j and
-    v_j, all but `arm` along the parent's axes.
+    `turn` E, `offset` o and `arm` b' as above; `axes` (n, 3, k) those of the freedoms along the parent's, `turning` and
+    `sliding` (n, k) their rates. `spin` and `velocity` are those of free bodies, None without any.
     """
 
     turn: Float[Array, "n 3 3"]
     offset: Float[Array, "n 3"]
     arm: Float[Array, "n 3"]
     axes: Float[Array, "n 3 k"]
-    spin: Float[Array, "n 3"]
-    slide: Float[Array, "n 3"]
+    turning: Float[Array, "n k"]
+    sliding: Float[Array, "n k"]
+    spin: Float[Array, "n 3"] | None
+    velocity: Float[Array, "n 3"] | None
 
 
 class LinkMotion(NamedTuple):
-    """The links in space, along its axes: R, r and their rates, what `Joints` has, and the parent's spin, `before`."""
+    """The links in space, along its axes: R, r and their rates, o, R b', ω_j, v_j, and the axes of the freedoms."""
 
     turn: Float[Array, "n 3 3"]
     centre: Float[Array, "n 3"]
@@ -62,7 +68,6 @@ class LinkMotion(NamedTuple):
     arm: Float[Array, "n 3"]
     joint_spin: Float[Array, "n 3"]
     joint_slide: Float[Array, "n 3"]
-    before: Float[Array, "n 3"]
     axes: Float[Array, "n 3 k"]
 
 
@@ -74,6 +79,66 @@ def times(a: Array, b: Array) -> Array:
 def applied(a: Array, x: Array) -> Array:
     """a @ x for a vector x, written out."""
     return reduce(add, (a[..., :, i] * x[..., None, i] for i in range(a.shape[-1])))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a × b, in fewer operations than `jnp.cross`."""
+    return _onward(a * _onward(b) - _onward(a) * b)
+
+
+def _onward(x: Array) -> Array:
+    """(y, z, x)."""
+    first, others = lax.split(x, (1, 2), axis=x.ndim - 1)
+    return lax.concatenate([others, first], x.ndim - 1)
+
+
+def outward(geometry: Geometry, fixed: FixedNumbers, link_of: Callable, ground: Array, given: PyTree) -> PyTree:
+    """Link after link, each after its parent: `link_of(parent, given)` -> (link, what else there is of it), stacked.
+
+    `parent` is what was returned for that, or `ground`; where links are few, None for the ground.
+    """
+    if geometry.n <= FEW:
+        links, beside = [], []
+        for i, link in enumerate(geometry.links):
+            parent = None if link.parent < 0 else links[link.parent]
+            found, rest = link_of(parent, jax.tree.map(lambda x: x[i], given))
+            links.append(found)
+            beside.append(rest)
+        return jax.tree.map(lambda *x: jnp.stack(x), *zip(links, beside))
+
+    def turn(slots: Array, x: tuple) -> tuple[Array, tuple]:
+        given, read, write, root = x
+        found = link_of(root * ground + taken(slots, read), given)
+        return left(slots, write, found[0]), found
+
+    start = jnp.zeros((fixed.read.shape[1], *ground.shape), ground.dtype)
+    return lax.scan(turn, start, (given, fixed.read, fixed.write, fixed.root))[1]
+
+
+def inward(geometry: Geometry, fixed: FixedNumbers, link_of: Callable, nothing: Array, given: PyTree) -> PyTree:
+    """Link after link, each before its parent: `link_of(children, given, at_ground)` -> (what it passes, the rest).
+
+    `children` is the sum of what those pass. Returned is the rest, stacked. Where links are few, nothing passes to the
+    ground, and None comes from no children.
+    """
+    if geometry.n <= FEW:
+        passed, rest = {}, []
+        for i, link in reversed(list(enumerate(geometry.links))):
+            of_link = jax.tree.map(lambda x: x[i], given)
+            onto, found = link_of(passed.pop(i, None), of_link, link.parent < 0)
+            rest.insert(0, found)
+            if link.parent >= 0:
+                passed[link.parent] = passed[link.parent] + onto if link.parent in passed else onto
+        return jax.tree.map(lambda *x: jnp.stack(x), *rest)
+
+    def turn(slots: Array, x: tuple) -> tuple[Array, PyTree]:
+        given, read, write = x
+        passed, found = link_of(taken(slots, write), given, False)
+        emptied, filled = (y.reshape(-1, *[1] * nothing.ndim) for y in (write, read))
+        return (1 - emptied) * slots + filled * passed[None], found
+
+    start = jnp.zeros((fixed.read.shape[1], *nothing.shape), nothing.dtype)
+    return lax.scan(turn, start, (given, fixed.read, fixed.write), reverse=True)[1]
 
 
 def flat(geometry: Geometry, q: PyTree) -> Coordinates:
@@ -91,9 +156,11 @@ def flat(geometry: Geometry, q: PyTree) -> Coordinates:
             numbers.append(jnp.ravel(x))
     every = [*numbers, *quaternions]
     dtype = jnp.result_type(*every) if every else float
-    joined = [jnp.concatenate([jnp.zeros((0, *end), dtype), *row]) for end, row in
-              (((), numbers), ((4,), quaternions), ((3,), positions))]  # fmt: skip
-    return Coordinates(*joined)
+
+    def joined(row: list, end: tuple[int, ...]) -> Any:
+        return jnp.concatenate(row).astype(dtype) if row else np.zeros((0, *end), dtype)
+
+    return Coordinates(joined(numbers, ()), joined(quaternions, (4,)), joined(positions, (3,)))
 
 
 def unflat(geometry: Geometry, x: Coordinates) -> dict[str, PyTree]:
@@ -158,70 +225,87 @@ def joint_rates(geometry: Geometry, q: Coordinates, v: Coordinates) -> Float[Arr
     return jnp.where(geometry.ball[:, None], of_links(spins(q.quaternions, v.quaternions), geometry.quaternions), rates)
 
 
-def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates) -> Joints:
-    """The links as seen from their parents."""
+def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates | None) -> Joints:
+    """The links as seen from their parents; at rest without v."""
     dtype = q.numbers.dtype
-    s, rates = numbers_of_links(geometry, q.numbers)[:, 0], joint_rates(geometry, q, v)
-    turns, slides = (jnp.asarray(x, dtype) for x in (geometry.turns, geometry.slides))
-    half = s * turns[:, 0] / 2
-    nothing = jnp.zeros_like(half)
-    e = jnp.stack([jnp.cos(half), nothing, nothing, jnp.sin(half)], axis=1)
-    axes = jnp.swapaxes(jnp.asarray(geometry.frame_a, dtype), 1, 2)
-    used = axes if geometry.k == 3 else axes[:, :, 2:]
-    if geometry.k == 3:
-        # The axis of a hinge or slide comes first.
-        used = jnp.where(geometry.ball[:, None, None], axes, axes[:, :, ::-1])
-    used = used * (turns + slides)[:, None, :]
+    s = numbers_of_links(geometry, q.numbers)[:, 0]
+    rates = None if v is None else joint_rates(geometry, q, v)
+    turns, slides, axes, (still, by_cosine, by_sine), *_ = given.fixed
+    angle = s[:, None, None]
+    turn = still + by_cosine * jnp.cos(angle) + by_sine * jnp.sin(angle)
     offset, free = given.a, geometry.free[:, None]
-    base_spin = base_velocity = jnp.zeros((geometry.n, 3), dtype)
+    if geometry.slides.any():
+        offset = offset + applied(axes, slides * s[:, None])
+    spin = velocity = None
     if len(q.quaternions):
         unit = q.quaternions / jnp.sqrt(_dot(q.quaternions, q.quaternions))[:, None]
-        spin = of_links(spins(q.quaternions, v.quaternions), geometry.quaternions)
-        e = jnp.where((geometry.ball | geometry.free)[:, None], of_links(unit, geometry.quaternions), e)
-        base_spin = jnp.where(free, spin, 0.0)
-        base_velocity = jnp.where(free, of_links(v.positions, geometry.quaternions), 0.0)
+        before, after = (jnp.asarray(x, dtype)[geometry.links_of_quaternions] for x in geometry.frames)
+        turned = times(before, times(jax.vmap(rotation_matrix)(unit), after))
+        has = (geometry.ball | geometry.free)[:, None, None]
+        turn = jnp.where(has, of_links(turned, geometry.quaternions), turn)
         offset = jnp.where(free, of_links(q.positions, geometry.quaternions), offset)
-    slid = applied(used, slides * s[:, None])
-    joint = times(axes, times(jax.vmap(rotation_matrix)(e), jnp.asarray(geometry.frame_b, dtype)))
-    return Joints(
-        joint, offset + slid, -given.b, used,
-        applied(used, turns * rates) + base_spin, applied(used, slides * rates) + base_velocity,
-    )  # fmt: skip
+        if v is not None:
+            spin = of_links(spins(q.quaternions, v.quaternions), geometry.quaternions)
+            spin, velocity = (jnp.where(free, x, 0.0) for x in (spin, of_links(v.positions, geometry.quaternions)))
+    still = jnp.zeros_like(turns)
+    turning, sliding = (still, still) if rates is None else (turns * rates, slides * rates)
+    return Joints(turn, offset, -given.b, axes, turning, sliding, spin, velocity)
 
 
-def in_space(geometry: Geometry, joints: Joints) -> LinkMotion:
+def in_space(geometry: Geometry, fixed: FixedNumbers, joints: Joints) -> LinkMotion:
     """The links in space, one after the other."""
-    dtype = joints.turn.dtype
-    read, write = (jnp.asarray(x, dtype) for x in geometry.slots)
-    ground = jnp.zeros((3, 6), dtype).at[:, :3].set(jnp.eye(3, dtype=dtype))
-    columns = [joints.turn, joints.offset[:, :, None], joints.spin[:, :, None], joints.slide[:, :, None], joints.axes]
+    ground = jnp.zeros((3, 6), joints.turn.dtype).at[:, :3].set(jnp.eye(3, dtype=joints.turn.dtype))
+    columns = jnp.concatenate([joints.turn, joints.offset[:, :, None], joints.axes], axis=2)
+    free = None if joints.spin is None else jnp.stack([joints.spin, joints.velocity], axis=2)
 
-    def outward(slots: Array, x: tuple) -> tuple[Array, tuple[Array, Array]]:
-        columns, arm, read, write, root = x
-        before = root * ground + taken(slots, read)
-        moved = times(before[:, :3], columns)
-        offset, spin, slide = moved[:, 3], moved[:, 4], moved[:, 5]
+    def link_of(parent: Array | None, x: tuple) -> tuple[Array, Array]:
+        columns, arm, turning, sliding, free = x
+        moved = columns if parent is None else times(parent[:, :3], columns)
+        offset, axes = moved[:, 3], moved[:, 4:]
         arm = applied(moved[:, :3], arm)
-        turned = before[:, 4] + spin
-        centre = before[:, 3] + offset + arm
-        velocity = before[:, 5] + jnp.cross(before[:, 4], offset) + slide + jnp.cross(turned, arm)
-        link = jnp.concatenate([moved[:, :3], jnp.stack([centre, turned, velocity], axis=1)], axis=1)
-        return left(slots, write, link), (
-            link,
-            jnp.concatenate([jnp.stack([arm, before[:, 4]], axis=1), moved[:, 3:]], axis=1),
-        )
+        spin, slide = applied(axes, turning), applied(axes, sliding)
+        if free is not None:
+            spin, slide = spin + free[:, 0], slide + free[:, 1]
+        centre, velocity = offset + arm, slide
+        if parent is not None:
+            centre, velocity = centre + parent[:, 3], velocity + parent[:, 5] + cross(parent[:, 4], offset)
+            spin = spin + parent[:, 4]
+        velocity = velocity + cross(spin, arm)
+        link = jnp.concatenate([moved[:, :3], jnp.stack([centre, spin, velocity], axis=1)], axis=1)
+        return link, jnp.concatenate([arm[:, None], moved[:, 3:]], axis=1)
 
-    start = jnp.zeros((read.shape[1], 3, 6), dtype)
-    root = jnp.asarray(geometry.root, dtype)
-    given = jnp.concatenate(columns, axis=2), joints.arm, read, write, root
-    _, (link, rest) = lax.scan(outward, start, given)
+    of_links = columns, joints.arm, joints.turning, joints.sliding, free
+    link, beside = outward(geometry, fixed, link_of, ground, of_links)
+    axes = beside[:, :, 2:]
+    spin, slide = applied(axes, joints.turning), applied(axes, joints.sliding)
+    if joints.spin is not None:
+        spin, slide = spin + joints.spin, slide + joints.velocity
     return LinkMotion(
-        link[:, :, :3], link[:, :, 3], link[:, :, 4], link[:, :, 5], rest[:, :, 2], rest[:, :, 0], rest[:, :, 3],
-        rest[:, :, 4], rest[:, :, 1], rest[:, :, 5:],
-    )  # fmt: skip
+        link[:, :, :3], link[:, :, 3], link[:, :, 4], link[:, :, 5], beside[:, :, 1], beside[:, :, 0], spin, slide, axes
+    )
 
 
 @partial(jax.jit, static_argnums=0)
 def moving(geometry: Geometry, given: LinkNumbers, q: Coordinates, v: Coordinates) -> LinkMotion:
     """Where the links are and how they move. Jitted, so that it is traced once."""
-    return in_space(geometry, seen_from_parents(geometry, given, q, v))
+    return in_space(geometry, given.fixed, seen_from_parents(geometry, given, q, v))
+
+
+@partial(jax.jit, static_argnums=0)
+def placing(
+    geometry: Geometry, given: LinkNumbers, q: Coordinates
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
+    """Where the links are, r and R."""
+    joints = seen_from_parents(geometry, given, q, None)
+    ground = jnp.zeros((3, 4), joints.turn.dtype).at[:, :3].set(jnp.eye(3, dtype=joints.turn.dtype))
+
+    def link_of(parent: Array | None, x: tuple) -> tuple[Array, None]:
+        columns, arm = x
+        moved = columns if parent is None else times(parent[:, :3], columns)
+        centre = moved[:, 3] + applied(moved[:, :3], arm)
+        centre = centre if parent is None else centre + parent[:, 3]
+        return jnp.concatenate([moved[:, :3], centre[:, None]], axis=1), None
+
+    columns = jnp.concatenate([joints.turn, joints.offset[:, :, None]], axis=2)
+    found, _ = outward(geometry, given.fixed, link_of, ground, (columns, joints.arm))
+    return found[:, :, 3], found[:, :, :3]

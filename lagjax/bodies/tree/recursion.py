@@ -23,11 +23,10 @@ Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, the
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
-from lagjax.bodies.tree.motion import LinkMotion, applied, left, taken, times
+from lagjax.bodies.tree.motion import LinkMotion, applied, cross, inward, outward, times
 from lagjax.numerics import dense
 
 
@@ -44,23 +43,20 @@ def accelerated(
 ) -> Accelerated:
     """The accelerations under forces `torque` of joints, and moments and forces on centres of mass, `wrench`."""
     dtype = motion.turn.dtype
-    turns, slides = (jnp.asarray(x, dtype)[:, None, :] for x in (geometry.turns, geometry.slides))
-    spin, before, arm = motion.spin, motion.before, motion.arm
+    turns, slides = (x[:, None, :] for x in (given.fixed.turns, given.fixed.slides))
+    spin, arm, joint_spin = motion.spin, motion.arm, motion.joint_spin
+    before = spin - joint_spin
     twist = turns * motion.axes
-    levered = jnp.swapaxes(jnp.cross(jnp.swapaxes(twist, 1, 2), arm[:, None, :]), 1, 2)
+    levered = jnp.swapaxes(cross(jnp.swapaxes(twist, 1, 2), arm[:, None, :]), 1, 2)
     freedoms = jnp.concatenate([twist, levered + slides * motion.axes], axis=1)
     beside = (1 - turns - slides)[:, 0, :] + given.armature
-    gamma = jnp.cross(before, motion.joint_spin)
-    bias = jnp.concatenate(
-        [
-            gamma,
-            jnp.cross(before, jnp.cross(before, motion.offset)) + 2 * jnp.cross(before, motion.joint_slide)
-            + jnp.cross(gamma, arm) + jnp.cross(spin, jnp.cross(spin, arm)),
-        ],
-        axis=1,
-    )  # fmt: skip
+    gamma = cross(before, joint_spin)
+    centripetal = cross(gamma, arm) + cross(spin, cross(spin, arm)) + cross(before, cross(before, motion.offset))
+    if geometry.slides.any() or geometry.free.any():
+        centripetal = centripetal + 2 * cross(before, motion.joint_slide)
+    bias = jnp.concatenate([gamma, centripetal], axis=1)
     inertia = times(times(motion.turn, given.inertia), jnp.swapaxes(motion.turn, 1, 2))
-    gyroscopic = jnp.cross(spin, applied(inertia, spin))
+    gyroscopic = cross(spin, applied(inertia, spin))
     mass = given.mass[:, None, None] * jnp.eye(3, dtype=dtype)[None]
     zero = jnp.zeros_like(inertia)
     own = jnp.concatenate([jnp.concatenate([inertia, zero], axis=2), jnp.concatenate([zero, mass], axis=2)], axis=1)
@@ -68,26 +64,25 @@ def accelerated(
     load = jnp.concatenate([gyroscopic, jnp.zeros_like(gyroscopic)], axis=1) - wrench
     own = jnp.concatenate([own, load[:, :, None]], axis=2)
     shift = motion.offset + arm
-    read, write = (jnp.asarray(x, dtype) for x in geometry.slots)
     has_free = bool(geometry.free.any())
 
-    def inward(slots: Array, x: tuple) -> tuple[Array, tuple]:
-        own, freedoms, bias, shift, torque, beside, read, write = x
-        both = own + taken(slots, write)
+    def inward_link(children: Array | None, x: tuple, at_ground: bool) -> tuple[Array | None, tuple]:
+        own, freedoms, bias, shift, torque, beside = x
+        both = own if children is None else own + children
         articulated, load = both[:, :6], both[:, 6]
         pushed = times(articulated, freedoms)
         solve = _inverse(times(freedoms.T, pushed) + jnp.diag(beside))
         force = torque - applied(freedoms.T, load)
         rows = times(solve, pushed.T)
+        found = rows, applied(solve, force), both if has_free else ()
+        if at_ground:
+            return None, found
         passed = articulated - times(pushed, rows)
         along = load + applied(passed, bias) + applied(rows.T, force)
-        passed = _shifted(jnp.concatenate([passed, along[:, None]], axis=1), shift)
-        kept = (1 - write)[:, None, None] * slots + read[:, None, None] * passed[None]
-        return kept, (rows, applied(solve, force), both if has_free else ())
+        return _shifted(jnp.concatenate([passed, along[:, None]], axis=1), shift), found
 
-    start = jnp.zeros((read.shape[1], 6, 7), dtype)
-    given_inward = own, freedoms, bias, shift, torque, beside, read, write
-    _, (rows, force, every) = lax.scan(inward, start, given_inward, reverse=True)
+    given_inward = own, freedoms, bias, shift, torque, beside
+    rows, force, every = inward(geometry, given.fixed, inward_link, jnp.zeros((6, 7), dtype), given_inward)
 
     free = jnp.zeros((geometry.n, 6), dtype)
     if has_free:
@@ -96,16 +91,18 @@ def accelerated(
             solved = dense.solve(every[i, :, :6], -every[i, :, 6])
             free = free + (jnp.arange(geometry.n) == i)[:, None] * solved[None]
 
-    def outward(slots: Array, x: tuple) -> tuple[Array, tuple[Array, Array]]:
-        rows, force, freedoms, bias, shift, free, read, write = x
-        before = taken(slots, read)
-        carried = before + bias + free + jnp.concatenate([jnp.zeros(3, dtype), jnp.cross(before[:3], shift)])
+    def outward_link(parent: Array | None, x: tuple) -> tuple[Array, Array]:
+        rows, force, freedoms, bias, shift, free = x
+        carried = bias + free
+        if parent is not None:
+            leaning = jnp.concatenate([jnp.zeros(3, dtype), cross(parent[:3], shift)])
+            carried = carried + parent + leaning
         joint = force - applied(rows, carried)
-        link = carried + applied(freedoms, joint)
-        return left(slots, write, link), (joint, link)
+        return carried + applied(freedoms, joint), joint
 
-    given_outward = rows, force, freedoms, bias, shift, free, read, write
-    return Accelerated(*lax.scan(outward, jnp.zeros((read.shape[1], 6), dtype), given_outward)[1])
+    given_outward = rows, force, freedoms, bias, shift, free
+    links, joints = outward(geometry, given.fixed, outward_link, jnp.zeros(6, dtype), given_outward)
+    return Accelerated(joints, links)
 
 
 def _shifted(body: Float[Array, "6 7"], d: Float[Array, "3"]) -> Float[Array, "6 7"]:

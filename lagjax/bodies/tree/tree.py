@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.bodies.body import Body, Pose, check_bodies
+from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
 from lagjax.bodies.shapes import usual_shapes
 from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
 from lagjax.bodies.tree.links import check_armature, links_of
-from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, rates_of, wrenches
+from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, wrenches
 from lagjax.bodies.tree.motion import (
     Coordinates,
     LinkMotion,
@@ -27,6 +27,7 @@ from lagjax.bodies.tree.motion import (
     moving,
     numbers_of_links,
     of_links,
+    placing,
     spins,
     unflat,
 )
@@ -115,14 +116,14 @@ class Tree:
         e = jnp.zeros((count, 4)).at[:, 0].set(1.0)
         return unflat(geometry, Coordinates(jnp.zeros(len(geometry.links_of_numbers)), e, jnp.zeros((count, 3))))
 
-    def poses(self, q: PyTree, params: PyTree = None) -> dict[str, Pose]:
-        """The poses of all bodies by name; `params` where places of joints are functions of them."""
+    def poses(self, q: PyTree, params: PyTree = None) -> dict[str, PoseOnTree]:
+        """The poses of all bodies by name, `position`, `quaternion` and the rotation's `matrix`; `params` where places
+        of joints are functions of them."""
         q = jax.tree.map(jnp.asarray, q)
-        _, motion = _moving(self._geometry, q, jax.tree.map(jnp.zeros_like, q), params)
-        poses = poses_of(motion)
-        return {body.name: Placed(self._geometry, poses, q)[body.name] for body in self.bodies}
+        placed = _placed(self._geometry, q, params)
+        return {body.name: placed[body.name] for body in self.bodies}
 
-    def rates(self, q: PyTree, v: PyTree, params: PyTree = None) -> dict[str, Pose]:
+    def rates(self, q: PyTree, v: PyTree, params: PyTree = None) -> dict[str, PoseOnTree]:
         """The rates of their poses by name, for `body.velocity(q, v)` and the like."""
         # As the derivative of the poses, which shows that it is linear in v; 0.0 makes whole numbers floats.
         q, v = (jax.tree.map(lambda x: jnp.asarray(x) + 0.0, x) for x in (q, v))
@@ -164,7 +165,11 @@ class Tree:
         rows = [[x] if isinstance(x, Holonomic) else x for x in self.joints.values()]
         joined = [*(joint for row in rows for joint in row), *named(closures or {}).values()]
         looks_like = [*(joint.function for joint in joined), *(load.potential for load in loads)]
-        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), self.poses))
+
+        def drawn(q, params):
+            return {name: Pose(pose.position, pose.quaternion) for name, pose in self.poses(q, params).items()}
+
+        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), drawn))
         return System(
             total,
             {name: _closure(dynamics, c) for name, c in named(closures or {}).items()},
@@ -207,9 +212,13 @@ class Dynamics(NamedTuple):
 
     def placed(self, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Placed]:
         """q and v as loads and closures read them."""
-        _, motion = _moving(self.geometry, q, v, params)
-        poses = poses_of(motion)
-        return Placed(self.geometry, poses, q), Placed(self.geometry, rates_of(motion, poses), v)
+        return jax.jvp(lambda q: _placed(self.geometry, q, params), (q,), (v,))
+
+
+def _placed(geometry: Geometry, q: PyTree, params: PyTree) -> Placed:
+    """Where bodies are."""
+    x = flat(geometry, q)
+    return Placed(geometry, poses_of(*placing(geometry, geometry.at(params, x.numbers.dtype), x)), q)
 
 
 def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[LinkNumbers, LinkMotion]:
@@ -275,8 +284,7 @@ def _closure(dynamics: Dynamics, constraint: Holonomic | Nonholonomic) -> Holono
     if isinstance(constraint, Holonomic):
 
         def closes(t, q, params):
-            placed, _ = dynamics.placed(q, jax.tree.map(jnp.zeros_like, q), params)
-            return constraint.g(t, placed, params)
+            return constraint.g(t, _placed(dynamics.geometry, q, params), params)
 
         return Holonomic(closes)
 
