@@ -150,7 +150,7 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     project = settings.drift == "project"
     if equations.are_taken_for_regular:
-        (q, v), verdict = equations.begun(t, q, v, project)
+        (q, v), verdict = equations.begin(t, q, v, project)
     else:
         if project:
             q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
