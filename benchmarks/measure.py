@@ -104,7 +104,7 @@ def main(rows, doc, draw=None):
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="also write the rows there")
-    parser.add_argument("--only", metavar="TEXT", default="", help="measure only the rows whose name contains it")
+    parser.add_argument("--only", metavar="TEXT", default="", help="only the rows whose name contains it; they replace those of FILE")
     if draw:
         parser.add_argument("--plot", metavar="FILE", help="draw the results")
     parser.add_argument("--processor-time", action="store_true", help="instead of wall time; for a shared machine")
@@ -113,18 +113,31 @@ def main(rows, doc, draw=None):
         CLOCK["seconds"] = time.process_time
     clock = "processor time" if options.processor_time else "wall time"
     print(f"{machine()}, {clock}; " + ", ".join(f"{name} {version}" for name, version in versions().items()))
-    found = []
+    found, before = [], None
+    if options.json and options.only and Path(options.json).exists():
+        before = json.loads(Path(options.json).read_text())
     for line in rows(lambda what: options.only.lower() in what.lower()):
         found.append(line)
         print(written(line), flush=True)
         if options.json:
             # After each row: an interrupted run keeps what it has.
             result = {"machine": machine(), "clock": clock, "versions": versions(), "rows": found}
+            result = result if before is None else merged(before, result)
             Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
     if not found:
         parser.error(f"no row's name contains {options.only!r}")
     if draw and options.plot:
         draw(options.plot)
+
+
+def merged(before, now):
+    """Results of an earlier run with some rows of this one in their places, new ones last; `later` names them."""
+    if any(before.get(key) != now[key] for key in ("machine", "clock")):
+        raise SystemExit("the file was measured on another machine or clock: measure all rows, or write another file")
+    fresh = {line["what"]: line for line in now["rows"]}
+    later = {*before.get("later", []), *fresh}
+    rows = [fresh.pop(line["what"], line) for line in before["rows"]] + list(fresh.values())
+    return before | {"later": [line["what"] for line in rows if line["what"] in later], "rows": rows}
 
 
 def written(line):

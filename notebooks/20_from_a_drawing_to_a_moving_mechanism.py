@@ -76,7 +76,8 @@ params = {"crank": 0.2, "rod": 0.6, "rail": 0.1, "torque": 3.0, "c": 12.0}
 # %% [markdown]
 # ## A rough drawing
 #
-# The rod was drawn somewhere near the pin. `lj.constraint_residual` says by how much each joint is open,
+# The rod was drawn somewhere near the pin. `lj.draw` shows it, with each body's axes (x red, y green, z blue), the axes of
+# joints in black, and a magenta line where the pin is open. `lj.constraint_residual` says by how much each joint is open,
 # `lj.consistent_state` finds the nearest state that the joints allow, here with the crank and its speed as drawn.
 
 # %%
@@ -86,6 +87,9 @@ drawn = {
     "rod": lj.Pose.at((0.45, 0.03, -0.04), axis=(1.0, 0.05, 0.1), angle=TILT),
 }
 moving = {"crank": drawn["crank"].moving(spin=3.0 * AXIS), "rod": drawn["rod"].moving()}
+lj.draw(pump, drawn, params, frames=True).figure()
+
+# %%
 for name, open_by in lj.constraint_residual(pump, 0.0, drawn, moving, params).items():
     print(f"{name:16} {np.abs(open_by).max():.3f}")
 
@@ -94,6 +98,7 @@ q0, v0 = lj.consistent_state(pump, 0.0, drawn, moving, params, hold="crank")
 closed = lj.constraint_residual(pump, 0.0, q0, v0, params)
 print("open by", max(float(jnp.abs(x).max()) for x in closed.values()))
 print("the rod's middle", q0["rod"].position.round(6))
+assert not lj.draw(pump, q0, params).apart()
 
 # %% [markdown]
 # With the rail 70 cm up and a rod of 60 cm it cannot close, and the message says by how much each joint stays open.

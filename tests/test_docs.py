@@ -21,6 +21,7 @@ import pytest
 import result_pages
 
 import lagjax as lj
+from benchmarks import measure
 from lagjax.mechanisms import MECHANISMS
 from lagjax.scenes import SCENES
 
@@ -122,6 +123,22 @@ def test_results_keep_what_is_missed():
     row = {"what": "a_b", "value": 2.0, "target": 1.0, "met": False, "better": "less"}
     assert result_pages.line(row) == "| a\\_b | 2 | ≤ 1 | **missed** |"
     assert "missed" not in result_pages.line(row | {"met": True})
+
+
+def test_rows_measured_later_are_said():
+    """Rows of a second run replace those of the first, new ones are last, and the page names them, with the note.
+
+    Twin: rows of another clock are refused.
+    """
+    run = {"machine": "m", "clock": "wall time", "note": "beside other work"}
+    first = run | {"rows": [measure.row("a", 1.0), measure.row("b", 2.0)]}
+    second = {"machine": "m", "clock": "wall time", "rows": [measure.row("c", 4.0), measure.row("b", 3.0)]}
+    found = measure.merged(first, second)
+    assert [(x["what"], x["value"]) for x in found["rows"]] == [("a", 1.0), ("b", 3.0), ("c", 4.0)]
+    page = result_pages.one_file("none", measure.merged(found, second))
+    assert "Note: beside other work. Measured later than the rest: b, c." in page
+    with pytest.raises(SystemExit, match="another machine or clock"):
+        measure.merged(first, second | {"clock": "processor time"})
 
 
 @pytest.mark.parametrize("name", [*SCENES, "woodpecker", *MECHANISMS])

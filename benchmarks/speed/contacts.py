@@ -9,6 +9,9 @@ time-stepping scheme with several steps; contacts of MuJoCo are stiffer for shor
 scheme is that of Moreau and Jean, with projected Gauss-Seidel; most of its time is that of Python, so it says what its
 steps reach, and not how fast they could be.
 
+Slow sliding is that of a block on a slope of tan α = μ, pushed across it: with the speeds s and w downhill, |s| + w stays,
+so that w ends at half of the push. Fast sliding is a block thrown on a slope a little flatter.
+
 First answers are processor time in a new process, without importing. Lanes are blocks on springs that stop, each with
 another start, beside as many without friction.
 
@@ -251,6 +254,22 @@ def lanes(wanted):
                   other_s=times.medians[i], other_error=off[i], other_steps=steps[i])  # fmt: skip
 
 
+def sliding(wanted):
+    """Steps of an explicit and of an implicit method where a block slides slowly for long, and where it is fast."""
+    floor = lj.Friction(lambda t, q, v, p: v, MU, normal=G)
+    slope = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p * G * q[1], elements={"floor": floor})
+    ts, push = jnp.array([0.0, 30.0]), 0.02
+    for name, tan, v0 in (("slow", MU, np.array([push, 0.0])), ("fast", 0.99 * MU, np.array([2.0, 1.5]))):
+        what = f"{name} sliding in a plane: steps by default / by Radau5"
+        if wanted(what):
+            runs = [lj.integrate(slope, np.zeros(2), v0, tan, ts=ts, estimate_error=False, **how)
+                    for how in ({}, {"method": lj.Radau5()})]  # fmt: skip
+            steps = [int(run.stats["num_steps"]) for run in runs]
+            ends = [float(np.hypot(*run.v[-1])) for run in runs]
+            off = max(abs(end - (push / 2 if name == "slow" else 0.0)) for end in ends)
+            yield row(what, steps[0] / steps[1], default=steps[0], radau5=steps[1], error_of_last_speed=off)
+
+
 START = """
 import json, time
 import jax, jax.numpy as jnp, numpy as np
@@ -289,9 +308,10 @@ def first_answers(wanted):
 
 
 def rows(wanted):
-    """Examples, lanes, first answers."""
+    """Examples, sliding, lanes, first answers."""
     for name, example in (("cradle", cradle), ("stack", stack), ("spring", spring)):
         yield from compared(name, example(), wanted)
+    yield from sliding(wanted)
     yield from lanes(wanted)
     yield from first_answers(wanted)
 

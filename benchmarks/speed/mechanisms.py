@@ -241,9 +241,36 @@ q = {b.name: pose for b, pose in zip(shafts, poses)}
 v = {b.name: pose.moving() for b, pose in zip(shafts, poses)} | {"in": poses[0].moving(spin=(3.0, 0.0, 0.0))}
 start = lj.consistent_state(system, 0.0, q, v, params)
 """
+ARM = """
+# Seven rods, each on the one before it by a hinge, about y and x by turns.
+count, y, x = 7, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
+rods = [lj.Body(f"rod {i}", mass=1.0, inertia=(0.02, 0.02, 0.001)) for i in range(count)]
+low, high = (0.0, 0.0, -0.25), (0.0, 0.0, 0.25)
+below = [lj.ground.at(axis=y), *(rod.at(high, (y, x)[(i + 1) % 2]) for i, rod in enumerate(rods[:-1]))]
+joints = {f"hinge {i}": lj.revolute(a, rod.at(low, (y, x)[i % 2])) for i, (a, rod) in enumerate(zip(below, rods))}
+system, params = lj.multibody(rods, joints, [lj.weight(rods, lambda p: jnp.array([0.0, 0.0, -p["g"]]))]), {"g": 9.81}
+poses = [lj.Pose.at((0.0, 0.0, 0.25 + 0.5 * i)) for i in range(count)]
+start = {rod.name: pose for rod, pose in zip(rods, poses)}, {rod.name: pose.moving() for rod, pose in zip(rods, poses)}
+"""
+PIPE = """
+# A ball that rolls in a standing pipe: f is the distance to the wall, or its square.
+ball, radius = lj.Body("ball", mass=1.0, inertia=(0.004, 0.004, 0.004)), 0.1
+across = lambda r: jnp.sqrt(r[0] ** 2 + r[1] ** 2)
+pipe = lj.Surface({f}, is_distance={is_distance})
+contact = lj.rolling_sphere(ball.at(), pipe, radius)
+system, params = lj.multibody([ball], {{"wall": contact}}, [lj.weight([ball])]), {{"radius": 1.0}}
+place = lj.Pose.at((0.9, 0.0, 0.0))
+start = {{"ball": place}}, {{"ball": place.moving((0.0, 2.7, 0.5), spin=(0.0, 5.0, -27.0))}}
+start, key = lj.consistent_state(system, 0.0, *start, params), "radius"
+# The start is consistent for one radius alone.
+answer = lambda x: lj.integrate(system, *start, params, ts=ts * x)
+"""
 SOLVED = """
 key = globals().get("key", "g")
 answer = lambda x: lj.integrate(system, *start, params | {key: params[key] * x}, ts=ts)
+"""
+ACCELERATIONS = """
+answer = lambda x: lj.accelerations(system, 0.0, *start, {"g": 9.81 * x})
 """
 LEDGER = """
 answer = lambda x: lj.energy_ledger(lj.integrate(system, *start, params | {'g': x * 9.81}, ts=ts)).closure
@@ -274,6 +301,11 @@ CASES = {
     "chain of 256": Case(CHAIN.format(count=256), 20.0),
     "free body": Case(BODY, None),
     "top": Case(TOP, None),
+    "arm of seven bodies, accelerations": Case(ARM, None, ACCELERATIONS),
+    "ball in a pipe, by its distance": Case(
+        PIPE.format(f='lambda r, p: p["radius"] - across(r)', is_distance=True), None, ""),
+    "ball in a pipe, by its square": Case(
+        PIPE.format(f='lambda r, p: p["radius"] ** 2 - across(r) ** 2', is_distance=False), None, ""),
 }
 
 

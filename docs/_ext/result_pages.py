@@ -70,7 +70,9 @@ def one_file(name: str, found: dict) -> str:
     measured = f"Measured on {found['machine']}" + (f", {found['clock']}" if "clock" in found else "")
     title = question.split("\n")[0].rstrip(".") or name
     author = f" Written by `{script.relative_to(ROOT).as_posix()}`." if script else ""
-    said = f"{measured}{'; ' + versions if versions else ''}.{author}\n"
+    note = f" Note: {plain(found['note'].rstrip('.'))}." if "note" in found else ""
+    later = f" Measured later than the rest: {plain(', '.join(found['later']))}." if "later" in found else ""
+    said = f"{measured}{'; ' + versions if versions else ''}.{author}{note}{later}\n"
     return f"# {plain(title)}\n\n{said}\n{table(found['rows'])}"
 
 

@@ -276,8 +276,13 @@ def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free
     def length(y: Array) -> Array:
         return (y - start) @ fixed_metric @ (y - start)
 
-    off = jnp.max(jnp.abs(residual(fixed, nearest)))
-    kept = (off <= jnp.sqrt(jnp.finfo(y0.dtype).eps)) & (length(nearest) <= length(near) * (1 + 1e-6))
+    def off(y: Array):
+        return jnp.max(jnp.abs(residual(fixed, y)))
+
+    small = jnp.sqrt(jnp.finfo(y0.dtype).eps)
+    # Where nothing satisfies the constraints, one more step may lead far away from the best state.
+    near = jnp.where(off(near) <= off(reached) + small, near, reached)
+    kept = (off(nearest) <= small) & (length(nearest) <= length(near) * (1 + 1e-6))
     return jnp.where(kept, nearest, near)
 
 

@@ -1,5 +1,7 @@
 """The nearest consistent state: it is the nearest, can hold coordinates, is differentiable, and fails openly."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -131,6 +133,17 @@ def test_unreachable_is_an_error_with_the_residual_by_name():
     }
     with pytest.raises(ValueError, match="(?s)'left' = .*'right' = |'right' = |'left' = "):
         lj.consistent_state(lj.System(lagrangian, walls), 0.0, *state, PARAMS)
+
+
+@pytest.mark.slow
+def test_the_best_state_is_where_the_least_is_missing():
+    """Two circles of radius one, their centres 2.5 apart, miss each other by 0.5: the point between by 0.25 each."""
+    away = lambda x: lj.Holonomic(lambda t, q, params: jnp.hypot(q["x"] - x, q["y"]) - 1.0)
+    system = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), {"a": away(1.0), "b": away(-1.5)})
+    with pytest.raises(ValueError, match="no consistent state") as caught:
+        lj.consistent_state(system, 0.0, {"x": 0.3, "y": 0.8}, {"x": 0.0, "y": 0.0}, None)
+    missed = [float(x) for x in re.findall(r"'[ab]' = ([-+0-9.e]+[0-9])", str(caught.value))]
+    np.testing.assert_allclose(missed, [0.25, 0.25], atol=0.01)
 
 
 @pytest.mark.exhaustive
