@@ -2,11 +2,16 @@
 
 from collections.abc import Callable, Iterable, Mapping
 
-from lagjax.bodies.body import Body, check_bodies
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from lagjax.bodies.body import Body, check_bodies, floats, kinetic_energy, together
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.shapes import usual_shapes
 from lagjax.display import Drawing
+from lagjax.jaxtools import numpy_of
 from lagjax.system import Holonomic, Nonholonomic, System
 
 # What else a system may have: arguments of `lj.System` that are passed on.
@@ -60,13 +65,23 @@ def multibody(
     acting = beside.with_loads(loads, lambda q, v, params: (q, v))
 
     def total(t, q, v, params):
-        kinetic = sum(body.kinetic(q, v, params) for body in bodies)
+        kinetic = _kinetic(bodies, q, v, params)
         potential = sum(load.potential(t, q, v, params) for load in loads if load.potential is not None)
         return kinetic - potential + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
 
     looks_like = [*(joint.function for joint in joints.values()), *(load.potential for load in loads)]
     setattr(total, "drawing", Drawing(lambda params: usual_shapes(bodies, looks_like, params)))
     return System(total, units | joints, force=acting.force, dissipation=acting.dissipation, **others)
+
+
+def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
+    """The kinetic energy of all bodies, in lanes: a program as long for many as for one."""
+    dtype = floats(q)
+    masses, inertias = zip(*(body.given(params, dtype) for body in bodies))
+    of = numpy_of((masses, inertias))
+    masses, inertias = of.asarray(masses, dtype), of.stack(inertias)
+    poses, rates = together([body.pose(q) for body in bodies]), together([body.rates(v) for body in bodies])
+    return jnp.sum(jax.vmap(kinetic_energy)(masses, inertias, poses, rates))
 
 
 def _check_joints(joints: Mapping | None):

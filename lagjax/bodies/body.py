@@ -6,7 +6,7 @@ r is the centre of mass, e the quaternion (`rotation.py`), I the inertia about t
 The last term vanishes with the constraint |e|² = 1. It is there so that the mass matrix is regular for all rates of e.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,7 +16,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space
+from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned
+from lagjax.jaxtools import numpy_of
 from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
 # By how much of their sum moments of inertia may miss the triangle inequality: those of thin plates reach it.
@@ -64,9 +65,13 @@ class Pose(NamedTuple):
         """The angular velocity along the body's axes."""
         return spin_in_body(self.quaternion, rates.quaternion)
 
+    def directed(self, r: ArrayLike) -> Float[Array, "... 3"]:
+        """Vectors (..., 3) in space that are fixed in the body."""
+        return turned(self.quaternion, r)
+
     def velocity(self, rates: Any, r: Array) -> Float[Array, "3"]:
         """The velocity of a point of the body."""
-        return rates.position + jnp.cross(self.spin(rates), self.matrix @ r)
+        return rates.position + jnp.cross(self.spin(rates), self.directed(r))
 
 
 class PoseOnTree(NamedTuple):
@@ -93,6 +98,10 @@ class PoseOnTree(NamedTuple):
     def spin_in_body(self, rates: "PoseOnTree") -> Float[Array, "3"]:
         """The angular velocity along the body's axes: Rᵀ Ṙ is Ω×."""
         return _turning(rates.matrix.T @ self.matrix)
+
+    def directed(self, r: ArrayLike) -> Float[Array, "... 3"]:
+        """Vectors (..., 3) in space that are fixed in the body."""
+        return jnp.asarray(r, self.matrix.dtype) @ self.matrix.T
 
     def velocity(self, rates: "PoseOnTree", r: Array) -> Float[Array, "3"]:
         """The velocity of a point of the body."""
@@ -198,8 +207,11 @@ class Body:
 
     def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """A vector in space that is fixed in the body."""
-        pose = self.pose(q)
-        return pose.matrix @ jnp.asarray(r, pose.quaternion.dtype)
+        return self.pose(q).directed(r)
+
+    def directions(self, q: PyTree, rows: ArrayLike) -> Float[Array, "k 3"]:
+        """Vectors in space that are fixed in the body, each a row."""
+        return self.pose(q).directed(rows)
 
     def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
         """The velocity in space of a point of the body."""
@@ -221,12 +233,11 @@ class Body:
 
     def kinetic(self, q: PyTree, v: PyTree, params: PyTree = None) -> Float[Array, ""]:
         """The kinetic energy; `params` where mass or inertia are functions of them."""
-        spin = self.spin_in_body(q, v)
-        inertia = self._inertia(params, spin.dtype)
-        rates = self.rates(v)
-        growth = 2 * jnp.dot(self.pose(q).quaternion, rates.quaternion)
-        of_rotation = jnp.dot(spin, inertia @ spin) + jnp.trace(inertia) / 3 * growth**2
-        return (valued(self.mass, params) * jnp.sum(rates.position**2) + of_rotation) / 2
+        return kinetic_energy(*self.given(params, floats(q)), self.pose(q), self.rates(v))
+
+    def given(self, params: PyTree, dtype) -> tuple[ArrayLike, Float[Array, "3 3"]]:
+        """Mass and inertia by the values of the parameters."""
+        return valued(self.mass, params), self._inertia(params, dtype)
 
     def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
         """A place on the body for joints and springs: see `lj.Marker`."""
@@ -249,8 +260,23 @@ class Body:
         return entry
 
     def _inertia(self, params: PyTree, dtype) -> Float[Array, "3 3"]:
-        inertia = jnp.asarray(valued(self.inertia, params), dtype)
-        return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+        given = valued(self.inertia, params)
+        of = numpy_of(given)
+        inertia = of.asarray(given, dtype)
+        return of.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+def together(poses: Sequence[Pose]) -> Pose:
+    """Poses of several bodies along a new first axis; `jnp.stack` has an operation for each."""
+    return Pose(*(jnp.concatenate(x).reshape(len(poses), -1) for x in zip(*poses)))
+
+
+def kinetic_energy(mass: ArrayLike, inertia: Float[Array, "3 3"], pose: Pose, rates: Pose) -> Float[Array, ""]:
+    """The kinetic energy of one body."""
+    spin = pose.spin_in_body(rates)
+    growth = 2 * jnp.dot(pose.quaternion, rates.quaternion)
+    of_rotation = jnp.dot(spin, inertia @ spin) + jnp.trace(inertia) / 3 * growth**2
+    return (mass * jnp.sum(rates.position**2) + of_rotation) / 2
 
 
 @dataclass(frozen=True)
@@ -278,6 +304,10 @@ class Ground:
     def direction(self, q: PyTree, r: ArrayLike) -> Float[Array, "3"]:
         """The vector itself."""
         return jnp.asarray(r, floats(q))
+
+    def directions(self, q: PyTree, rows: ArrayLike) -> Float[Array, "k 3"]:
+        """The rows themselves."""
+        return jnp.asarray(rows, floats(q))
 
     def velocity(self, q: PyTree, v: PyTree, r: ArrayLike = (0.0, 0.0, 0.0)) -> Float[Array, "3"]:
         """Zero."""
@@ -342,7 +372,7 @@ class Marker:
 
     def axes(self, q: PyTree) -> Float[Array, "3 3"]:
         """Its three unit vectors in space, as rows; the last one is the axis."""
-        return jnp.stack([self.body.direction(q, e) for e in self.frame])
+        return self.body.directions(q, self.frame)
 
     def axis(self, q: PyTree) -> Float[Array, "3"]:
         """Its axis in space."""

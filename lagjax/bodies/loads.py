@@ -19,9 +19,11 @@ from lagjax.bodies.body import (
     check_markers,
     check_takes_params,
     check_takes_state,
+    together,
     valued,
 )
 from lagjax.bodies.shapes import line, looks
+from lagjax.jaxtools import numpy_of
 
 
 class Load(NamedTuple):
@@ -64,9 +66,10 @@ class Weight(NamedTuple):
     g: ArrayLike | Callable
 
     def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
-        centres = [body.pose(q).position for body in self.bodies]
-        field = jnp.asarray(valued(self.g, params), centres[0].dtype)
-        return -sum(valued(body.mass, params) * jnp.dot(field, r) for body, r in zip(self.bodies, centres))
+        masses = [valued(body.mass, params) for body in self.bodies]
+        centres = together([body.pose(q) for body in self.bodies]).position
+        masses = numpy_of(masses).asarray(masses, centres.dtype)
+        return -jnp.dot(masses @ centres, jnp.asarray(valued(self.g, params), centres.dtype))
 
 
 def spring(

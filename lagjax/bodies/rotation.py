@@ -10,10 +10,11 @@ Source: Goldstein, *Classical Mechanics*, §4.5; Diebel, *Representing Attitude*
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from lagjax.jaxtools import judging
+from lagjax.jaxtools import judging, numpy_of
 
 # Not a jump of a force that reads a quaternion: e and -e are one rotation.
 _is_larger = judging(jnp.greater)
@@ -42,14 +43,42 @@ def rotation_matrix(e: Float[Array, "4"]) -> Float[Array, "3 3"]:
     )
 
 
+def _product_of_numbers(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.append(a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))
+
+
+# Coefficients of the bilinear forms below: what is many operations on single numbers is a product of arrays, for which
+# XLA compiles far less, in derivatives above all.
+# (a b)_k = PRODUCT_abk a_a b_b
+PRODUCT = np.array([[_product_of_numbers(a, b) for b in np.eye(4)] for a in np.eye(4)])
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+# R_ij = TURNED_jiab e_a e_b, from e r e*
+TURNED = np.einsum("ajm,mbi,b->jiab", PRODUCT, PRODUCT, CONJUGATE)[1:, 1:]
+SPIN_IN_BODY = 2 * np.einsum("abk,a->kab", PRODUCT, CONJUGATE)[1:]
+SPIN_IN_SPACE = 2 * np.einsum("bak,a->kab", PRODUCT, CONJUGATE)[1:]
+
+
+def turned(e: Float[Array, "4"], r: ArrayLike) -> Float[Array, "... 3"]:
+    """R(e) r in space, for vectors r (..., 3) that are given along the body's axes."""
+    of = numpy_of(r)
+    return _bilinear(of.tensordot(of.asarray(r), TURNED, 1), e, e)
+
+
 def spin_in_body(e: Float[Array, "4"], rate: Float[Array, "4"]) -> Float[Array, "3"]:
     """The angular velocity along the body's axes."""
-    return 2 * product(conjugate(e), rate)[1:]
+    return _bilinear(SPIN_IN_BODY, e, rate)
 
 
 def spin_in_space(e: Float[Array, "4"], rate: Float[Array, "4"]) -> Float[Array, "3"]:
     """The angular velocity along the axes of space."""
-    return 2 * product(rate, conjugate(e))[1:]
+    return _bilinear(SPIN_IN_SPACE, e, rate)
+
+
+def _bilinear(form: ArrayLike, a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "... 3"]:
+    """`Σ form_ab a_a b_b` over the last two axes of a form, with all digits on an accelerator too."""
+    # One product, of the form and all a_a b_b: its derivatives compile in two thirds of the time of two products.
+    form = numpy_of(form).asarray(form, a.dtype)
+    return jnp.dot(form.reshape(*form.shape[:-2], 16), (a[:, None] * b[None, :]).reshape(16), precision="highest")
 
 
 def about(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:

@@ -19,6 +19,7 @@ from lagjax.jaxtools.fuse_both_modes import one_function_in_both_modes
 from lagjax.jaxtools.fuse_cpu import PRODUCT, TOGETHER, apart, calls_host, kept_as_call, one_function, poisoned
 from lagjax.jaxtools.jaxpr import (
     ADDITIVE,
+    ARITHMETIC,
     BILINEAR,
     LINEAR_IN_FIRST,
     MOVING,
@@ -31,6 +32,7 @@ from lagjax.jaxtools.jaxpr import (
     bodies,
     depends,
     equations,
+    evaluate,
     interpreted,
     length,
     needed,
@@ -39,6 +41,7 @@ from lagjax.jaxtools.jaxpr import (
     run,
     staged,
     stands_for,
+    written,
 )
 from lagjax.jaxtools.jaxpr_identity import Itself, Meaning, content_of, meaning_of, rules_of, with_own_constants
 from lagjax.jaxtools.linearity import is_linear

@@ -51,6 +51,8 @@ PERIODIC = {"cos", "sin"}
 # Primitives that stand for the program that they carry; the second kind has rules of its own for derivatives.
 CALLS = {"jit", "closed_call"}
 CALLS_WITH_RULES = {"custom_jvp_call", "custom_vjp_call", "remat2"}
+# Programs of these alone compute the same by `vmap` as one by one, and cost no more.
+ARITHMETIC = ELEMENTWISE | REDUCING | MOVING | CALLS | {"dot_general"}
 CONTROL_FLOW = {"cond", "scan", "while"}
 # Equinox's primitives: for use under `vmap`, and marks for derivatives.
 EQUINOX_PRIMITIVES = {

@@ -22,6 +22,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE
+from lagjax.system.lanes import vectors
 
 
 class Holonomic(eqx.Module):
@@ -53,15 +54,6 @@ class Holonomic(eqx.Module):
     def residual(self, t: Array, q: PyTree, v: PyTree, params: PyTree):
         """`g` at a state, as the user wrote it."""
         return self.g(t, q, params)
-
-    def velocity_residual(self, model, t: Array, x: Array, u: Array):
-        """`dg/dt`, in vector form."""
-        return jax.jvp(lambda t, x: self.g(t, model.tree(x), model.params), (t, x), (jnp.ones_like(t), u))[1]
-
-    def feedback(self, model, t: Array, x: Array, u: Array, rate: Array):
-        """The term in gamma with which g'' + 2 rate g' + rate² g = 0."""
-        position = jnp.atleast_1d(self.g(t, model.tree(x), model.params))
-        return -2 * rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u)) - rate**2 * position
 
     def __repr__(self):
         return f"Holonomic({getattr(self.g, '__name__', 'g')})"
@@ -96,14 +88,6 @@ class Nonholonomic(eqx.Module):
         """`phi` at a state, as the user wrote it."""
         return self.phi(t, q, v, params)
 
-    def velocity_residual(self, model, t: Array, x: Array, u: Array):
-        """`phi`, in vector form."""
-        return self.phi(t, model.tree(x), model.tree(u), model.params)
-
-    def feedback(self, model, t: Array, x: Array, u: Array, rate: Array):
-        """The term in gamma with which phi' + rate phi = 0."""
-        return -rate * jnp.atleast_1d(self.velocity_residual(model, t, x, u))
-
     def __repr__(self):
         return f"Nonholonomic({getattr(self.phi, '__name__', 'phi')})"
 
@@ -125,13 +109,12 @@ def _check_callable(function: Callable, kind, signature: str):
 
 def position_residual(model, t: Array, x: Array) -> Float[Array, " mh"]:
     """`g(t, q)` of the holonomic constraints, stacked."""
-    q, of_positions = model.tree(x), [c for c in model.system.constraints.values() if c.of_positions]
-    return _stack([c.g(t, q, model.params) for c in of_positions], x.dtype)
+    return _stack(_positions(model, t, x), x.dtype)
 
 
 def velocity_residual(model, t: Array, x: Array, u: Array) -> Float[Array, " m"]:
     """`dg/dt` or `phi(t, q, v)` of each constraint, stacked in the order of their names."""
-    return _stack([c.velocity_residual(model, t, x, u) for c in model.system.constraints.values()], x.dtype)
+    return _stack(_velocities(model, t, x, u), x.dtype)
 
 
 def jacobian(model, t: Array, x: Array, u: Array) -> Float[Array, "m n"]:
@@ -150,10 +133,33 @@ def baumgarte_feedback(model, t: Array, x: Array, u: Array, rate: Array):
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1.
     """
-    return _stack([c.feedback(model, t, x, u, rate) for c in model.system.constraints.values()], x.dtype)
+    position, terms = iter(_positions(model, t, x)), []
+    for c, velocity in zip(model.system.constraints.values(), _velocities(model, t, x, u)):
+        of_position = -2 * rate * velocity - rate**2 * next(position) if c.of_positions else -rate * velocity
+        terms.append(of_position)
+    return _stack(terms, x.dtype)
+
+
+def _positions(model, t: Array, x: Array) -> list[Float[Array, " k"]]:
+    """`g(t, q)` of each holonomic constraint."""
+    holonomic = [c.g for c in model.system.constraints.values() if c.of_positions]
+    return vectors(holonomic, (t, model.tree(x), model.params))
+
+
+def _velocities(model, t: Array, x: Array, u: Array) -> list[Float[Array, " k"]]:
+    """`dg/dt` or `phi(t, q, v)` of each constraint."""
+    given = list(model.system.constraints.values())
+    of_positions = of_velocities = iter(())
+    if any(c.of_positions for c in given):
+        _, rates = jax.jvp(lambda t, x: _positions(model, t, x), (t, x), (jnp.ones_like(t), u))
+        of_positions = iter(rates)
+    if not all(c.of_positions for c in given):
+        phis = [c.phi for c in given if not c.of_positions]
+        of_velocities = iter(vectors(phis, (t, model.tree(x), model.tree(u), model.params)))
+    return [next(of_positions if c.of_positions else of_velocities) for c in given]
 
 
 def _stack(parts: Sequence, dtype: DTypeLike):
     if not parts:
         return jnp.zeros((0,), dtype)
-    return jnp.concatenate([jnp.atleast_1d(part).astype(dtype) for part in parts])
+    return jnp.concatenate([part.astype(dtype) for part in parts])

@@ -71,7 +71,7 @@ class TracedProgram:
             structures.append(jtu.tree_structure(found))
             return [x for x in jtu.tree_leaves(found) if is_array(x) or isinstance(x, NUMBERS)]
 
-        arrays = _arrays(args)
+        arrays = arrays_of(args)
         with full_products():
             closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
             # What a function computes and does not use would be traced again with each of its derivatives.
@@ -98,8 +98,13 @@ class TracedProgram:
         own = list(given)
         if signature_of(args) != self.signature:
             return self.function_with(arrays)(*args)
-        results = eval_jaxpr(self.jaxpr, constants, *own, *_arrays(args))
+        results = eval_jaxpr(self.jaxpr, constants, *own, *arrays_of(args))
         return jtu.tree_unflatten(self._structure, results)
+
+    @property
+    def constants(self) -> list[np.ndarray]:
+        """The arrays in the program, where it reads none from outside."""
+        return self._fixed
 
     def function_with(self, arrays: Sequence) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
@@ -195,7 +200,8 @@ def _varies(x: Array):
     return is_array(x) or isinstance(x, LIKE_ARRAYS)
 
 
-def _arrays(args: tuple):
+def arrays_of(args: tuple) -> list:
+    """The arrays among some arguments, and their Python floats."""
     return [x for x in jtu.tree_leaves(args) if _varies(x)]
 
 
