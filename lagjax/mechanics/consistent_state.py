@@ -229,46 +229,45 @@ def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free
         bent = jax.jacfwd(lambda y: multipliers @ rows_at(fixed, y))(y)
         return jnp.where(free[:, None] & free[None, :], bent, 0.0)
 
-    def newton_matrix(y: Array, multipliers: Array):
+    def newton_step(target: Array, state: Array):
+        """One step towards the stationary point for a target, and the inverse of its matrix.
+
+        What it needs of the constraints is at one place of the program: derivatives of a mechanism are long.
+        """
+        y, multipliers = state[:n], state[n:]
         rows = rows_at(fixed, y)
         independent = usable_rows(rows)
+        left = jnp.where(independent, residual(fixed, y), 0.0)
+        left = jnp.concatenate([fixed_metric @ (y - target) + multipliers @ rows, left])
         # The full matrix, even for more equations than coordinates: all multipliers are unknowns.
         rows = jnp.where(independent[:, None], rows, 0.0)
         matrix = fixed_metric + curvature(y, multipliers)
-        return jnp.block([[matrix, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
+        matrix = jnp.block([[matrix, rows.T], [rows, jnp.diag(jnp.where(independent, 0.0, 1.0))]])
+        inverted = dense.inverse(matrix)
+        step = dense.refined(inverted, matrix, left)
+        step = step.at[n:].set(jnp.where(independent, step[n:], multipliers))
+        return jnp.where(jnp.any(left != 0), state - step, state), inverted
 
-    def equations(problem: PyTree, metric: Array, target: Array, y: Array, multipliers: Array):
-        force = metric @ (y - target) + multipliers @ rows_at(problem, y)
-        return jnp.concatenate([force, residual(problem, y)])
-
-    def step(state: Array, left: Array, i):
-        y, multipliers = state[:n], state[n:]
-        independent = usable_rows(rows_at(fixed, y))
-        left = left.at[n:].set(jnp.where(independent, left[n:], 0.0))
-        step = dense.solve(newton_matrix(y, multipliers), left)
-        return step.at[n:].set(jnp.where(independent, step[n:], multipliers))
-
-    def left_at(target: Array, state: Array) -> Array:
-        return equations(fixed, fixed_metric, target, state[:n], state[n:])
-
-    def follow(state: Array, share: Array):
-        target = reached + share * (start - reached)
-        return newton(partial(left_at, target), step, state, PER_STAGE), None
+    def follow(i: Array, found: tuple):
+        share = jnp.minimum(i // PER_STAGE + 1, STAGES) / STAGES
+        return newton_step(reached + share.astype(y0.dtype) * (start - reached), found[0])
 
     reached = start if is_linear else some_state()
     zero = jnp.zeros_like(residual(fixed, start))
     begin = jnp.concatenate([reached, zero])
     if is_linear:
-        followed = begin - step(begin, left_at(start, begin), 0)
+        followed, inverted = newton_step(start, begin)
     else:
-        followed, _ = lax.scan(follow, begin, (jnp.arange(STAGES, dtype=y0.dtype) + 1) / STAGES)
+        # Once more than the stages have steps: the matrix that remains is that of the point found.
+        nothing = jnp.zeros((begin.size, begin.size), y0.dtype)
+        followed, inverted = lax.fori_loop(0, STAGES * PER_STAGE + 1, follow, (begin, nothing))
     y, multipliers = followed[:n], followed[n:]
-    finite = jnp.all(jnp.isfinite(y))
+    finite = jnp.all(jnp.isfinite(y)) & jnp.all(jnp.isfinite(inverted))
     y, multipliers = jnp.where(finite, y, reached), jnp.where(finite, multipliers, zero)
+    y, multipliers, reached, inverted = stop_gradient((y, multipliers, reached, jnp.where(finite, inverted, 0.0)))
     # One more Newton step gives the nearest point all its derivatives, by the implicit function theorem.
-    inverted = lax.stop_gradient(dense.inverse(newton_matrix(y, multipliers)))
-    y, multipliers, reached = stop_gradient((y, multipliers, reached))
-    nearest = y - (inverted @ equations(problem, metric, y0, y, multipliers))[:n]
+    force = metric @ (y - y0) + multipliers @ rows_at(problem, y)
+    nearest = y - (inverted @ jnp.concatenate([force, residual(problem, y)]))[:n]
     # If the path to it was lost, the result is the point reached by shortest steps, with the derivatives of one step.
     back = lax.stop_gradient(to_displacement(reached))
     near = last_step(reached, y0, lambda y: back @ residual(problem, y))
@@ -282,7 +281,7 @@ def _nearest(residual: Callable, problem: PyTree, y0: Array, metric: Array, free
     small = jnp.sqrt(jnp.finfo(y0.dtype).eps)
     # Where nothing satisfies the constraints, one more step may lead far away from the best state.
     near = jnp.where(off(near) <= off(reached) + small, near, reached)
-    kept = (off(nearest) <= small) & (length(nearest) <= length(near) * (1 + 1e-6))
+    kept = finite & (off(nearest) <= small) & (length(nearest) <= length(near) * (1 + 1e-6))
     return jnp.where(kept, nearest, near)
 
 
