@@ -34,8 +34,8 @@ from lagjax.jaxtools import (
 )
 from lagjax.system.traced_functions import Traced, arrays_of, signature_of
 
-# Shorter programs stay as they are: to bring their operands together takes as many operations.
-LONG = 20
+# Functions stay as they are where lanes would save fewer operations: to bring operands together takes as many.
+SAVED = 20
 
 
 class Opened(NamedTuple):
@@ -52,8 +52,8 @@ class Opened(NamedTuple):
 
 @once_per_program
 def opened(jaxpr: Jaxpr) -> Opened | None:
-    """The program in this form; None for one that is short, or is more than arithmetic, as a loop."""
-    if length(jaxpr) < LONG or any(e.primitive.name not in ARITHMETIC or e.effects for e in equations(jaxpr)):
+    """The program in this form; None for one that is more than arithmetic, as a loop."""
+    if any(e.primitive.name not in ARITHMETIC or e.effects for e in equations(jaxpr)):
         return None
     variables = [x for e in jaxpr.eqns for x in e.invars] + list(jaxpr.outvars)
     read = list(dict.fromkeys(x for x in variables if not isinstance(x, Literal) and x in jaxpr.invars))
@@ -93,11 +93,13 @@ def vectors(functions: Sequence[Callable], args: tuple) -> list[Float[Array, " m
         kind = _kind(function, args)
         kinds[i if kind is None else kind].append(i)
     for places in kinds.values():
-        if len(places) == 1:
-            results[places[0]] = jnp.atleast_1d(functions[places[0]](*args))
+        alike = [functions[i] for i in places]
+        if len(alike) > 1 and (len(alike) - 1) * length(alike[0].program.jaxpr) >= SAVED:
+            found = _in_lanes([function.program for function in alike], arrays_of(args))
         else:
-            for i, value in zip(places, _in_lanes([functions[i].program for i in places], arrays_of(args))):
-                results[i] = value
+            found = [jnp.atleast_1d(function(*args)) for function in alike]
+        for i, value in zip(places, found):
+            results[i] = value
     return results
 
 
@@ -139,4 +141,4 @@ def _together(values: Sequence[np.ndarray]) -> tuple[np.ndarray, int | None]:
 
 def _stacked(values: Sequence[Array]) -> Array:
     """The same as `jnp.stack`, in two operations."""
-    return lax.concatenate([x.reshape(-1) for x in values], 0).reshape(len(values), *values[0].shape)
+    return jnp.concatenate([jnp.ravel(x) for x in values]).reshape(len(values), *jnp.shape(values[0]))

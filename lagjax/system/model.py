@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -82,8 +83,13 @@ class Form(NamedTuple):
         """A vector (..., n) in the structure of q."""
         if len(self.shapes) == 1:
             return jtu.tree_unflatten(self.structure, [x.reshape(x.shape[:-1] + self.shapes[0])])
-        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)]).tolist()
-        leaves = [x[..., a:b].reshape(x.shape[:-1] + shape) for a, b, shape in zip(ends, ends[1:], self.shapes)]
+        sizes = [int(np.prod(shape)) for shape in self.shapes]
+        if isinstance(x, np.ndarray):
+            parts = np.split(x, np.cumsum(sizes)[:-1], -1)
+        else:
+            # One operation, whose transpose is one: slices become paddings and sums.
+            parts = lax.split(x, sizes, x.ndim - 1)
+        leaves = [part.reshape(x.shape[:-1] + shape) for part, shape in zip(parts, self.shapes)]
         return jtu.tree_unflatten(self.structure, leaves)
 
 
