@@ -87,8 +87,8 @@ def test_derivatives():
 
 
 def test_what_stays_alone():
-    """Loops and functions with rules of their own; functions with other whole numbers, which may be places, are not of one
-    kind, and those that are the same function still have a place each."""
+    """Loops and functions with rules of their own; functions with other whole numbers, which may be places, are not of
+    one kind, and those that are the same function still have a place each."""
 
     @jax.custom_jvp
     def with_rule(x):
