@@ -19,7 +19,6 @@ from lagjax.bodies.body import (
     check_markers,
     check_takes_params,
     check_takes_state,
-    together,
     valued,
 )
 from lagjax.bodies.shapes import line, looks
@@ -67,7 +66,7 @@ class Weight(NamedTuple):
 
     def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
         masses = [valued(body.mass, params) for body in self.bodies]
-        centres = together([body.pose(q) for body in self.bodies]).position
+        centres = jnp.concatenate([body.pose(q).position for body in self.bodies]).reshape(-1, 3)
         masses = numpy_of(masses).asarray(masses, centres.dtype)
         return -jnp.dot(masses @ centres, jnp.asarray(valued(self.g, params), centres.dtype))
 
