@@ -72,7 +72,7 @@ SMALL = REDUCING | ACCUMULATING - {"cumlogsumexp"} | {"argmax", "argmin"}
 WITH_BODIES = CALLS | CALLS_WITH_RULES | CONTROL_FLOW | {"one_function"}
 
 
-def one_function(function: Callable, *args, checked: bool = False, in_blocks: bool = False):
+def one_function(function: Callable, *args, checked: bool = False, in_blocks: bool = False, in_parts: bool = False):
     """`function(*args)`, compiled as one machine function where that is possible.
 
     >>> import jax.numpy as jnp
@@ -82,7 +82,8 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     **Arguments:** pytrees, of which the arrays are passed and all else is compiled in; what `function` returns may
     contain anything too. It must not close over traced values. `checked` says that all of equinox's checks in it
     (`error_if`, a call of the host) are known to pass: they are left out. With `in_blocks`, a batch on a CPU is
-    processed a few hundred lanes at a time.
+    processed a few hundred lanes at a time. With `in_parts`, only those parts become functions that ask for it
+    themselves: LLVM's time for one function grows faster than its length.
 
     Its forward derivative is one function too, also along many directions. Reverse mode must use `function` itself.
     """
@@ -105,7 +106,7 @@ def one_function(function: Callable, *args, checked: bool = False, in_blocks: bo
     jaxpr, shapes = jax.make_jaxpr(of_leaves, return_shape=True)(*leaves)
     jaxpr = without_chains(without_checks(jaxpr) if checked else jaxpr)
     found = _one_function_p.bind(
-        *leaves, jaxpr=jaxpr, in_blocks=in_blocks, points=len(leaves), values=0, checked=checked
+        *leaves, jaxpr=jaxpr, in_blocks=in_blocks, in_parts=in_parts, points=len(leaves), values=0, checked=checked
     )
     return eqx.combine(jtu.tree_unflatten(jtu.tree_structure(shapes), found), rest[0])
 
@@ -296,9 +297,9 @@ def _unmarked(*operands, jaxpr: ClosedJaxpr, **params):
     return jaxpr_as_fun(jaxpr)(*operands)
 
 
-def _marked(*operands, jaxpr: ClosedJaxpr, **params):
+def _marked(*operands, jaxpr: ClosedJaxpr, in_parts: bool = False, **params):
     original, jaxpr = jaxpr, without_library(jaxpr)
-    if not fits(jaxpr.jaxpr):
+    if in_parts or not fits(jaxpr.jaxpr):
         return _unmarked(*operands, jaxpr=original)
 
     # XLA ends the process if an operand of such a call is not used in it: one that is never used, one that it finds to
@@ -354,8 +355,9 @@ def _jvp(primitive: Primitive, primals: Sequence, tangents: Sequence, *, jaxpr: 
 
 
 def _batched(
-    operands: Sequence, axes: Sequence, *, jaxpr: ClosedJaxpr, in_blocks: bool, points: int, values: int, checked: bool
-):
+    operands: Sequence, axes: Sequence, *, jaxpr: ClosedJaxpr, in_blocks: bool, in_parts: bool, points: int,
+    values: int, checked: bool,
+):  # fmt: skip
     front = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes)]
     batched = tuple(axis is not None for axis in axes)
     lanes = next(x.shape[0] for x, b in zip(front, batched) if b)
@@ -364,7 +366,7 @@ def _batched(
         # Many directions at one point, whose values are computed once.
         out_axes = [None] * values + [0] * (len(jaxpr.out_avals) - values)
         together = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(jaxpr), [0 if b else None for b in batched], out_axes))(*front)
-        params = dict(in_blocks=in_blocks, points=points, values=values, checked=checked)
+        params = dict(in_blocks=in_blocks, in_parts=in_parts, points=points, values=values, checked=checked)
         results = _one_function_p.bind(*front, jaxpr=together, **params)
         return results, [axis if axis is None else 0 for axis in out_axes]
     results = _in_blocks_p.bind(*front, **params) if in_blocks else _lanes_together(*front, **params)

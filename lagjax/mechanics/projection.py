@@ -21,10 +21,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
-from lagjax.jaxtools import compiled, stop_gradient
+from lagjax.jaxtools import compiled, jitted, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.mechanics.first_order import resolved
-from lagjax.numerics import largest, last_step, newton
+from lagjax.numerics import largest
 from lagjax.system import InModes, Model, constraints, coordinates, given_in
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
@@ -62,38 +62,60 @@ def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Arra
     frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
     displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
     of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
-    live, holonomic = (model, t), model.holonomic
-    fixed = stop_gradient(live)
-
-    def position_residual(problem: tuple, x: Array) -> Array:
-        return constraints.position_residual(*problem, x)
+    live, holonomic, left = (model, t), model.holonomic, []
 
     if holonomic.any():
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        x = _newton(position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
+        x, r = _newton(_position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
+        left.append(jnp.abs(r) <= slope[holonomic] * of_q)
 
-    def velocity_residual(problem: tuple, u: Array) -> Array:
-        return constraints.velocity_residual(*problem, u)
-
-    u = _newton(velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
-    left = jnp.concatenate([position_residual(fixed, x), velocity_residual((*fixed, x), u)])
-    allowed = jnp.concatenate([slope[holonomic] * of_q, slope * of_v])
-    holds = jnp.all(jnp.abs(left) <= allowed)
+    u, r = _newton(_velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
+    left.append(jnp.abs(r) <= slope * of_v)
+    holds = jnp.all(jnp.concatenate(left))
     return Projected(model.tree(x), model.tree(resolved(model, t, x, u)), lax.stop_gradient(holds))
 
 
+# Jitted, so that JAX traces them once for all the places of a program that need them.
+@jitted
+def _position_residual(problem: tuple, x: Array) -> Array:
+    return constraints.position_residual(*problem, x)
+
+
+@jitted
+def _velocity_residual(problem: tuple, u: Array) -> Array:
+    return constraints.velocity_residual(*problem, u)
+
+
 def _newton(residual: Callable, problem: PyTree, y: Array, displacement: Callable, slope: Array):
-    """Iterate `y - displacement(r(problem, y))`; differentiate only the last iteration, enough where r vanishes."""
+    """Iterate `y - displacement(r(problem, y))`; return y and what is left of r.
+
+    Only the last iteration is differentiated, enough where r vanishes. The residual is in the program twice: four
+    copies made up half of a vehicle's.
+    """
     fixed, start = stop_gradient((problem, y))
 
     def size(r: Array):
         return largest(r / jnp.where(slope > 0, slope, 1.0))
 
-    near = newton(
-        partial(residual, fixed), lambda y, r, i: displacement(r), start, ITERATIONS, size=size,
-        relative=ONE_IS_ENOUGH_BELOW,
-    )  # fmt: skip
-    return last_step(near, y, lambda y: displacement(residual(problem, y)))
+    def iterate(state):
+        i, _, y, first, _ = state
+        r = residual(fixed, y)
+        first = jnp.where(i == 0, size(r), first)
+        going = size(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(largest(y), first)
+        return i + 1, y, y - displacement(r), first, going
+
+    def unfinished(state):
+        return (state[0] <= ITERATIONS) & state[4]
+
+    at_start = jnp.asarray(0), start, start, jnp.zeros((), y.dtype), jnp.asarray(True)
+    near = lax.while_loop(unfinished, iterate, at_start)[1]
+
+    def last(y: Array, moves: Array):
+        r = residual(problem, y)
+        return y - displacement(jnp.where(moves, r, 0.0)), r
+
+    y, residuals = lax.scan(last, near + (y - lax.stop_gradient(y)), jnp.asarray([True, False]))
+    return y, residuals[1]
 
 
 def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array):
@@ -151,7 +173,7 @@ def _allowed(size: Array, rtol: Array, atol: Array):
 def residuals_and_slopes(equations: Equations, t: Array, q: PyTree, v: PyTree):
     """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     model, (x, u) = equations.model, equations.model.vectors(q, v)
-    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
+    position, velocity = _position_residual((model, t), x), _velocity_residual((model, t, x), u)
     return jnp.concatenate([position, velocity]), *_slopes(model, equations.row_sizes(t, q, v), q, v)
 
 

@@ -37,10 +37,10 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools import compiled
+from lagjax.jaxtools import compiled, jitted
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
-from lagjax.mechanics.lagrangian import LinearEquation, mass_and_forcing
-from lagjax.mechanics.multiplier_forces import Reactions, with_reactions
+from lagjax.mechanics.lagrangian import LinearEquation, applied_force, mass_and_forcing
+from lagjax.mechanics.multiplier_forces import Reactions, response, with_reactions
 from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense, independent_rows, unit_rows
 from lagjax.system import Model, State, constraints
 
@@ -105,13 +105,12 @@ class Dense(NamedTuple):
 
         If None, they are chosen at this state.
         """
-        linear = mass_and_forcing(model, t, x, u)
+        linear, (jacobian, gamma) = linear_equations(model, t, x, u)
         if not model.m:
             no_multipliers = jnp.zeros(0, x.dtype)
             if self.diagonal:
                 return linear.forcing / jnp.sum(linear.mass, axis=1), no_multipliers
             return dense.solve(linear.mass, linear.forcing), no_multipliers
-        jacobian, gamma = constraints.acceleration_rows(model, t, x, u)
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
         independent = chosen(model, jacobian) if independent is None else independent
@@ -121,18 +120,18 @@ class Dense(NamedTuple):
         self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
     ) -> Bool[Array, " m"]:
         """Which constraint equations to solve with."""
-        return chosen(model, constraints.jacobian(model, t, x, u), dependent_below)
+        return chosen(model, linear_equations(model, t, x, u)[1].jacobian, dependent_below)
 
     def displacement(self, *state) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
-        jacobian = constraints.jacobian(*state)
+        linear, (jacobian, _) = linear_equations(*state)
         # The rows are chosen here and not at the step's start, as the step may have come near a singular position.
-        matrix = displacement_map(mass_and_forcing(*state).mass, jacobian, chosen(state[0], jacobian))
+        matrix = displacement_map(linear.mass, jacobian, chosen(state[0], jacobian))
         return lambda which, r: matrix[:, which] @ r
 
     def row_sizes(self, *state) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation."""
-        return jnp.sum(jnp.abs(constraints.jacobian(*state)), axis=1)
+        return jnp.sum(jnp.abs(linear_equations(*state)[1].jacobian), axis=1)
 
     def verdict(self, *state) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, and agree with each other."""
@@ -152,6 +151,33 @@ class Dense(NamedTuple):
     def __str__(self):
         by = "division" if self.diagonal else "elimination" if self.unknowns <= dense.ELIMINATE_UP_TO else "LAPACK"
         return f"{self.unknowns} equations by {by}"
+
+
+# Jitted, so that JAX traces the derivatives of L and of the constraints once for all that needs them.
+@jitted
+def linear_equations(model: Model, t: Array, x: Array, u: Array) -> tuple[LinearEquation, constraints.ConstraintRows]:
+    """`M a = F` and `A a = gamma` at one state.
+
+    Momenta and constraints are linearised together, and pushed along the motion and the unit velocities as the lanes of
+    one program, some two thirds as long as programs for each of M, F, A and gamma.
+    """
+    if not model.m or model.form.first_order is not None:
+        # Alone M may be constant, and is then factored before a loop over states.
+        return mass_and_forcing(model, t, x, u), constraints.acceleration_rows(model, t, x, u)
+
+    def of_state(t: Array, x: Array, u: Array):
+        gradient, p = jax.grad(model.lagrangian, argnums=(1, 2))(t, x, u)
+        return (p, constraints.velocity_residual(model, t, x, u)), gradient
+
+    _, push, gradient = jax.linearize(of_state, t, x, u, has_aux=True)
+    still = jnp.zeros((x.size, x.size), x.dtype)
+    along_t = jnp.ones_like(t) * jnp.eye(1, x.size + 1, dtype=x.dtype)[0]
+    along_x, along_u = jnp.concatenate([u[None], still]), jnp.eye(x.size + 1, x.size, -1, dtype=x.dtype)
+    momentum, residual = jax.vmap(push)(along_t, along_x, along_u)
+    forcing = gradient - momentum[0] + applied_force(model, t, x, u)
+    reacting = response(model, t, x, u) if model.reacts else None
+    linear = LinearEquation(momentum[1:].astype(x.dtype), forcing.astype(x.dtype), reacting)
+    return linear, constraints.ConstraintRows(residual[1:].T, -residual[0])
 
 
 def chosen(model: Model, jacobian: Array, dependent_below: float | None = None) -> Bool[Array, " m"]:
@@ -313,8 +339,8 @@ def examined(model: Model, s: State) -> Examined:
 
 def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:
     """The same in vector form."""
-    linear = mass_and_forcing(model, t, x, u)
-    rows = _without_vanishing(model, t, x, u)
+    linear, rows = linear_equations(model, t, x, u)
+    rows = _without_vanishing(model, rows, t, x, u)
     independent = chosen(model, rows.jacobian)
     a, multipliers, unique = _solved(linear, rows.jacobian, rows.gamma, independent)
     return Examined(
@@ -330,9 +356,8 @@ def _examined(model: Model, t: Array, x: Array, u: Array) -> Examined:
     )
 
 
-def _without_vanishing(model: Model, t: Array, x: Array, u: Array):
-    """The rows of all constraints; those that are round-off, being far larger at a nearby state, are set to zero."""
-    rows = constraints.acceleration_rows(model, t, x, u)
+def _without_vanishing(model: Model, rows: constraints.ConstraintRows, t: Array, x: Array, u: Array):
+    """The rows, of which those that are round-off, being far larger at a nearby state, are set to zero."""
     if not rows.gamma.size:
         return rows
     nearby = constraints.jacobian(model, t, *map(slightly_off, (x, u)))

@@ -48,7 +48,6 @@ def newton(
     most: int,
     *,
     size: Callable[[Array], Array] = largest,
-    relative: float = 0.0,
     falls: float | None = None,
     fractions: np.ndarray | None = None,
 ) -> Float[Array, " n"]:
@@ -58,13 +57,12 @@ def newton(
     [1.414214]
 
     **Arguments:** f is the first of the `fractions` for which `size(r)` is least, or 1. The iteration ends when
-    `size(r)` is at most `relative` times the larger of `|y|` and its first value or, with `falls`, when it is no longer
-    below `falls` times the one before.
+    `size(r)` is zero or, with `falls`, when it is no longer below `falls` times the one before.
     """
 
     def unfinished(state):
         i, y, r, before = state
-        going = (i < most) & (size(r) > (relative * jnp.maximum(largest(y), first) if relative else 0.0))
+        going = (i < most) & (size(r) > 0.0)
         return going if falls is None else going & (size(r) < falls * before)
 
     def iterate(state):
@@ -79,8 +77,7 @@ def newton(
         return i + 1, trials[best], residuals[best], before
 
     r = residual(y0)
-    first = size(r)
-    return lax.while_loop(unfinished, iterate, (0, y0, r, jnp.full_like(first, jnp.inf)))[1]
+    return lax.while_loop(unfinished, iterate, (0, y0, r, jnp.full_like(size(r), jnp.inf)))[1]
 
 
 def last_step(near: Array, y0: Array, step: Callable[[Array], Array]) -> Array:

@@ -74,6 +74,30 @@ def test_compiled_as_one_call():
     assert 'inlineable="false"' not in entry(solve, jnp.eye(9))
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="one function is for CPUs")
+def test_in_parts():
+    """Only the part that asks for it is one function, not the loop around it; values, derivatives and lanes stay."""
+
+    def in_turn(x, y):
+        step = lambda s: one_function(lambda a, b: (1.5 * a + b, jnp.sin(a) + b), *s)
+        return lax.while_loop(lambda s: s[0] < 100.0, step, (x, y))
+
+    def outermost(function):
+        text = jax.jit(function).lower(*TWO).as_text()
+        return text[: text.index("func.func private")]
+
+    parts = lambda x, y: one_function(in_turn, x, y, in_parts=True)
+    assert "stablehlo.while" in outermost(parts) and "stablehlo.while" not in outermost(whole)
+    loop = outermost(parts).index("stablehlo.while")
+    assert outermost(parts).index('inlineable = "false"') > loop
+    np.testing.assert_array_equal(parts(*TWO), grown(*TWO))
+    forward = jax.jit(jax.jacfwd(parts))(*TWO)
+    np.testing.assert_allclose(forward, jax.jacfwd(grown)(*TWO), rtol=1e-14)
+    lanes = jnp.linspace(1.0, 5.0, 3)
+    expected = jax.vmap(grown, (0, None))(lanes, TWO[1])
+    np.testing.assert_allclose(jax.jit(jax.vmap(parts, (0, None)))(lanes, TWO[1]), expected, rtol=1e-14)
+
+
 def test_operands_that_are_not_needed():
     """An unused operand, and one that XLA finds to be unused: either would end the process if it were dropped."""
     never = jax.jit(lambda x, y: one_function(lambda x, y: 2 * x, x, y))

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.jaxtools import length
+from lagjax.mechanics.lagrangian import mass_and_forcing
+from lagjax.mechanics.saddle_point import linear_equations
+from lagjax.system import constraints, coordinates, model_of
 from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -21,6 +25,35 @@ def twice(factor):
     """The rod given again, in another scale."""
     again = lj.Holonomic(lambda t, q, params: factor * rod(t, q, params))
     return lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(rod), "again": again})
+
+
+def test_momenta_and_constraints_are_linearised_together():
+    """M, F, A and gamma are those of separate derivatives, in three quarters of the operations."""
+
+    def turning(t, q, v, params):
+        return 0.5 * jnp.sum(jnp.cos(q[1:] - t) * v[1:] ** 2) + 0.5 * v @ v * jnp.exp(jnp.sin(q[0] * q[1])) - q[2]
+
+    def bent(t, q, params):
+        return jnp.stack([jnp.sin(q[0] * q[1]) + t * q[2], jnp.exp(q[1]) - q[2] ** 3])
+
+    def slides(t, q, v, params):
+        return v[0] * jnp.cos(q[1]) - v[2] * jnp.tanh(q[0]) + t
+
+    system = lj.System(turning, {"bent": lj.Holonomic(bent), "slides": lj.Nonholonomic(slides)})
+    s = coordinates.state(0.3, np.array([0.4, -0.7, 0.2]), np.array([1.1, 0.5, -0.8]), None)
+    model = model_of(system, *s)
+
+    def separately(t, x, u):
+        return (*mass_and_forcing(model, t, x, u)[:2], *constraints.acceleration_rows(model, t, x, u))
+
+    def together(t, x, u):
+        linear, rows = linear_equations(model, t, x, u)
+        return (*linear[:2], *rows)
+
+    for found, expected in zip(jax.jit(together)(*s[:3]), jax.jit(separately)(*s[:3])):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    few, many = (length(jax.make_jaxpr(f)(*s[:3]).jaxpr) for f in (together, separately))
+    assert few < 0.8 * many
 
 
 def door_lagrangian(t, q, v, params):

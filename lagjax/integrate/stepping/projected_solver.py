@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.stepping.step_to_outputs import between_jumps
 from lagjax.integrate.stepping.tolerances import Tolerances
-from lagjax.jaxtools import kept_as_call
+from lagjax.jaxtools import kept_as_call, one_function
 from lagjax.mechanics import Equations, all_finite, to_manifold
 from lagjax.numerics import Interpolation, Quintic, Radau5
 
@@ -70,7 +70,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     The solver holds the equations, since diffrax gives an interpolation only times and states; `fast`: the same method,
     for steps with the written-out equations. `feedback`: the rate of Baumgarte's feedback. If `refused`, and if a step
     is not finite, its error is infinite: an adaptive solve ends within a few steps at the smallest step size, one with
-    fixed steps at once.
+    fixed steps at once. `in_parts`: the robust step and the return to the constraints are machine functions of their
+    own (`one_function`), which have no reverse mode.
     """
 
     solver: diffrax.AbstractSolver
@@ -84,6 +85,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     arriving: bool = eqx.field(static=True)
     between: bool = eqx.field(static=True)
     jump_ts: Float[Array, " J"] | None = None
+    in_parts: bool = eqx.field(static=True, default=False)
 
     @property
     def term_structure(self):
@@ -194,19 +196,25 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         return lax.cond(eqxi.unvmap_all(valid), lambda: (y1, error, rates, solver_state, result), again)
 
     def _robust_step(self, t0: Array, t1: Array, y0: PyTree, solver_state: PyTree, made_jump: Any):
+        call = one_function if self.in_parts else _called
         # The projection moves the state, so a derivative kept from the last step's end is stale.
         jumped = True if self.project else made_jump
-        terms, stages = self.terms, self._stages(t0, y0)
-        if solver_state is None:
-            solver_state = self.solver.init(terms, t0, t1, y0, stages)
-        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
+        moved = call(ProjectedSolver._unprojected, self, t0, t1, y0, solver_state, jumped)
+        y1, error, dense, solver_state, result = moved
         rates = self._rates(dense, t1 - t0)
         if self.project:
-            projected = to_manifold(self.equations, t1, *y1, *self.tolerances)
+            projected = call(to_manifold, self.equations, t1, *y1, *self.tolerances)
             y1 = (projected.q, projected.v)
             error = jtu.tree_map(lambda x: jnp.where(projected.holds, x, jnp.inf), error)
             result = diffrax.RESULTS.where(projected.holds, result, diffrax.RESULTS.nonlinear_divergence)
         return y1, error, rates, solver_state, result
+
+    def _unprojected(self, t0: Array, t1: Array, y0: PyTree, solver_state: PyTree, jumped: Any):
+        """The wrapped solver's step by the robust solve."""
+        terms, stages = self.terms, self._stages(t0, y0)
+        if solver_state is None:
+            solver_state = self.solver.init(terms, t0, t1, y0, stages)
+        return self.solver.step(terms, t0, t1, y0, stages, solver_state, jumped)
 
     def _rates(self, dense: dict, h: Array):
         """The accelerations at both ends of a step, which are its first and last stages; None if not needed."""
@@ -261,6 +269,10 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def _stages(self, t: Array, y: PyTree):
         threshold = None if self.project else DEPENDENT_BELOW_WHILE_DRIFTING
         return StageConstraints(self.equations.independent(t, *y, threshold))
+
+
+def _called(function: Callable, *args):
+    return function(*args)
 
 
 class Arrived(Interpolation):

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.solve import one_motion
+from lagjax.mechanics import equations_of
+from lagjax.system import coordinates, model_of
 from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
 
 
@@ -24,6 +27,41 @@ def test_event_is_located_by_the_method():
     np.testing.assert_allclose(traj.end.multipliers["rod"], -3 * PARAMS["g"] / PARAMS["l"] / 2, rtol=1e-9)
     assert np.isfinite(traj.q["x"]).tolist() == [True, True, False]
     assert bool(traj.result == lj.RESULTS.event_occurred)
+
+
+@pytest.mark.slow
+def test_a_long_loop_in_parts(monkeypatch):
+    """A mass on a rod whose angle has no mass of its own, 1e-9 from the elliptic function, its loop compiled in parts.
+
+    Twin: below the limit the same loop is one function.
+    """
+    special = pytest.importorskip("scipy.special")
+    in_parts, made = [], one_motion._solver
+
+    def seen(*given):
+        in_parts.append(made(*given).in_parts)
+        return made(*given)
+
+    def hangs(t, q, params):
+        return q["at"] - params["l"] * jnp.stack([jnp.sin(q["angle"]), -jnp.cos(q["angle"])])
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v["at"] @ v["at"] - params["g"] * q["at"][1]
+
+    hanging = lj.System(lagrangian, {"rod": lj.Holonomic(hangs)})
+    q0 = {"at": PARAMS["l"] * np.array([np.sin(0.9), -np.cos(0.9)]), "angle": np.array(0.9)}
+    v0 = {"at": np.zeros(2), "angle": np.array(0.0)}
+    ts, rate, k = np.linspace(0.0, 1.0, 4), np.sqrt(PARAMS["g"] / PARAMS["l"]), np.sin(0.45)
+    monkeypatch.setattr(one_motion, "_solver", seen)
+    monkeypatch.setattr(one_motion, "IN_PARTS_FROM", 0)
+    traj = lj.integrate(hanging, q0, v0, PARAMS, ts=ts, rtol=1e-11, atol=1e-11)
+    _, cn, dn, _ = special.ellipj(rate * ts, k**2)
+    np.testing.assert_allclose(traj.q["angle"], 2 * np.arcsin(k * cn / dn), atol=1e-9)
+    assert in_parts and all(in_parts)
+    equations = equations_of(model_of(hanging, *coordinates.state(0.0, q0, v0, PARAMS)), fast=True)
+    assert one_motion._is_long(equations)
+    monkeypatch.setattr(one_motion, "IN_PARTS_FROM", 1000)
+    assert not one_motion._is_long(equations)
 
 
 @pytest.mark.exhaustive

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lagjax.jaxtools import length
 from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
 
 rng = np.random.default_rng(11)
@@ -19,6 +20,16 @@ def test_rank_of_random_rows(m, n, rank):
         chosen = np.asarray(independent_rows(jnp.asarray(matrix)))
         assert chosen.sum() == rank
         assert np.linalg.matrix_rank(rows[chosen]) == np.linalg.matrix_rank(rows) == rank
+
+
+def test_the_program_does_not_grow_with_the_rows():
+    """Three rows and eight make one loop of the same length; twin: written out, each round is in the program."""
+
+    def operations(m: int) -> int:
+        return length(jax.make_jaxpr(independent_rows)(jnp.ones((m, 9))).jaxpr)
+
+    assert operations(3) == operations(8)
+    assert operations(2) != operations(3)
 
 
 def test_threshold_is_an_angle():
