@@ -12,7 +12,8 @@ from tests.system.test_hybrid import SPHERE, rolls, slides, throw
 from tests.tiers import exhaustive_but
 
 RTOL = 1e-9
-WITH_RUNS = [name for name, scene in SCENES.items() if scene.runs()]
+# Not by calling `runs`: their exact solutions would be computed whatever tests are run.
+WITH_RUNS = [name for name, scene in SCENES.items() if scene.runs is not tuple]
 
 
 def falling(t, q, v, params):
@@ -164,7 +165,9 @@ def test_friction_on_a_multiplier():
 @pytest.mark.parametrize("scene", exhaustive_but(("sliding_wedge", "cross_rails"), WITH_RUNS))
 def test_every_scene_closes(scene):
     """Every run of a scene closes to a hundred tolerances; twin: with flipped forces it does not."""
-    for run in SCENES[scene].runs():
+    runs = SCENES[scene].runs()
+    assert runs
+    for run in runs:
         traj = lj.integrate(run.system, run.q0, run.v0, run.params, ts=run.ts, events=run.events, estimate_error=False)
         ledger = lj.energy_ledger(traj)
         assert ledger.relative_closure < 100 * RTOL, run.name
