@@ -252,6 +252,11 @@ system, params = lj.multibody(rods, joints, [lj.weight(rods, lambda p: jnp.array
 poses = [lj.Pose.at((0.0, 0.0, 0.25 + 0.5 * i)) for i in range(count)]
 start = {rod.name: pose for rod, pose in zip(rods, poses)}, {rod.name: pose.moving() for rod, pose in zip(rods, poses)}
 """
+MOVING = """
+# All of it turns about the first hinge.
+spin = jnp.array([0.0, 0.5, 0.0])
+start = start[0], {name: pose.moving(jnp.cross(spin, pose.position), spin) for name, pose in start[0].items()}
+"""
 PIPE = """
 # A ball that rolls in a standing pipe: f is the distance to the wall, or its square.
 ball, radius = lj.Body("ball", mass=1.0, inertia=(0.004, 0.004, 0.004)), 0.1
@@ -302,6 +307,7 @@ CASES = {
     "free body": Case(BODY, None),
     "top": Case(TOP, None),
     "arm of seven bodies, accelerations": Case(ARM, None, ACCELERATIONS),
+    "arm of seven bodies, a motion": Case(ARM + MOVING, 60.0),
     "ball in a pipe, by its distance": Case(
         PIPE.format(f='lambda r, p: p["radius"] - across(r)', is_distance=True), None, ""),
     "ball in a pipe, by its square": Case(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Body, check_bodies, floats, kinetic_energy, together
+from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies, floats, kinetic_energy, together
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.shapes import usual_shapes
@@ -80,8 +80,20 @@ def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> 
     masses, inertias = zip(*(body.given(params, dtype) for body in bodies))
     of = numpy_of((masses, inertias))
     masses, inertias = of.asarray(masses, dtype), of.stack(inertias)
-    poses, rates = together([body.pose(q) for body in bodies]), together([body.rates(v) for body in bodies])
+    poses, rates = [body.pose(q) for body in bodies], [body.rates(v) for body in bodies]
+    for body, pose in zip((*bodies, *bodies), (*poses, *rates)):
+        _check_pose(body, pose)
+    poses, rates = together(poses), together(rates)
     return jnp.sum(jax.vmap(kinetic_energy)(masses, inertias, poses, rates))
+
+
+def _check_pose(body: Body, given: Pose | PoseOnTree):
+    if isinstance(given, PoseOnTree):
+        raise TypeError(
+            f"the entry '{body.name}' of q and v of lj.multibody must be a lj.Pose, and is that of a lj.Tree, with its "
+            "rotation matrix.\n"
+            "Fix: q = {name: lj.Pose(*pose[:2]) for name, pose in tree.poses(q).items()}, and v in the same way."
+        )
 
 
 def _check_joints(joints: Mapping | None):

@@ -261,30 +261,58 @@ def test_a_torsion_spring():
     assert lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0).dissipation is None
 
 
-@pytest.mark.exhaustive
-def test_an_arm_in_space():
-    """Five jointed bodies in maximal coordinates, 35 numbers and 30 equations: the accelerations of their tree."""
-    links = [lj.Body(f"link {i}", 1.0 + 0.1 * i, (0.1, 0.11, 0.05)) for i in range(5)]
-    axes = [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)] * 3
+def arm(count):
+    """Bodies on hinges in turn about y and z: bodies, hinges, weight, a position and a velocity of the hinges."""
+    links = [lj.Body(f"link {i}", 1.0 + 0.1 * i, (0.1, 0.11, 0.05)) for i in range(count)]
+    axes = [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)] * count
     places = [lj.ground.at(axis=axes[0])] + [link.at((0.0, 0.0, 0.5), axis) for link, axis in zip(links, axes[1:])]
     hinges = {
         f"hinge {i}": lj.revolute(place, link.at((0.0, 0.0, -0.5), axis))
         for i, (place, link, axis) in enumerate(zip(places, links, axes))
     }
-    weight = [lj.weight(links)]
-    tree = lj.Tree(links, hinges)
     q = {name: jnp.asarray(0.3 + 0.1 * i) for i, name in enumerate(hinges)}
     v = {name: jnp.asarray(0.2 - 0.1 * i) for i, name in enumerate(hinges)}
+    return links, hinges, [lj.weight(links)], q, v
+
+
+def on_bodies(tree, q, v):
+    """The poses of the bodies of a tree and their rates, q and v of `lj.multibody`."""
+    return [{name: lj.Pose(*x[:2]) for name, x in both.items()} for both in (tree.poses(q), tree.rates(q, v))]
+
+
+@pytest.mark.exhaustive
+def test_an_arm_in_space():
+    """Seven jointed bodies in maximal coordinates, 49 numbers and 42 equations: accelerations and motion of their tree.
+
+    Twin: without the velocities' terms.
+    """
+    links, hinges, weight, q, v = arm(7)
+    tree, system = lj.Tree(links, hinges), lj.multibody(links, hinges, weight)
     in_angles, _ = lj.accelerations(tree.system(weight), 0.0, q, v, None)
-
-    def rates(q, v):
-        return jax.jvp(tree.poses, (q,), (v,))[1]
-
-    expected = jax.jvp(rates, (q, v), (v, in_angles))[1]
-    a, _ = lj.accelerations(lj.multibody(links, hinges, weight), 0.0, tree.poses(q), tree.rates(q, v), None)
+    expected = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (v, in_angles))[1]
+    without = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (jax.tree.map(jnp.zeros_like, v), in_angles))[1]
+    a, multipliers = lj.accelerations(system, 0.0, *on_bodies(tree, q, v), None)
+    assert list(multipliers)[7:] == list(hinges) and all(multipliers[name].shape == (5,) for name in hinges)
     for link in links:
-        np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-12)
-        np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-12)
+        np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-11)
+        np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-11)
+    assert np.abs(a[links[6].name].position - without[links[6].name].position).max() > 0.01
+    ts, tolerances = np.linspace(0.0, 0.5, 3), {"rtol": 1e-12, "atol": 1e-12}
+    of_angles = lj.integrate(tree.system(weight), q, v, None, ts=ts, **tolerances)
+    traj = lj.integrate(system, *on_bodies(tree, q, v), None, ts=ts, **tolerances)
+    places = jax.vmap(tree.poses)(of_angles.q)
+    for link in links:
+        np.testing.assert_allclose(traj.q[link.name].position, places[link.name].position, atol=1e-10)
+
+
+def test_poses_of_a_tree_are_refused():
+    """Those of a tree have a matrix beside them, and are none of `lj.multibody`."""
+    links, hinges, weight, q, v = arm(2)
+    tree = lj.Tree(links, hinges)
+    with pytest.raises(
+        TypeError, match="'link 0' of q and v of lj.multibody must be a lj.Pose, and is that of a lj.Tree"
+    ):
+        lj.accelerations(lj.multibody(links, hinges, weight), 0.0, tree.poses(q), tree.rates(q, v), None)
 
 
 @pytest.mark.exhaustive
