@@ -5,6 +5,9 @@ articulated-body recursion. Measured are
 
 - an evaluation of the accelerations inside a compiled loop, beside MuJoCo's `mj_forward` (without contacts) and
   Pinocchio's `aba` on the same chain, and the exponent p of its cost N^p from 64 to 1,000 links;
+- a whole step, of RK4 in `lj.rollout`, beside MuJoCo's `mj_step` with its RK4 (four evaluations each; its Euler, one);
+- `lj.integrate` at 1e-9: in a new process the first answer and the memory, then a step, by two motions of which one is
+  twice as long, the time before the first step, in which M_ii is found for each coordinate, and the exponent of a step;
 - a motion of 60 rods, 0.1 s at 1e-9, beside SciPy's DOP853 with the equations in absolute angles by hand in NumPy, a
   full mass matrix, at the same tolerances, with the difference at the end;
 - the time to trace and compile an evaluation.
@@ -13,6 +16,8 @@ articulated-body recursion. Measured are
 """
 
 import os
+import time
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -22,7 +27,7 @@ import numpy as np  # noqa: E402
 from scipy.integrate import solve_ivp  # noqa: E402
 
 import lagjax as lj  # noqa: E402
-from benchmarks.measure import compiled, in_turn, main, row, skipped  # noqa: E402
+from benchmarks.measure import compiled, in_new_process, in_turn, main, row, skipped  # noqa: E402
 from lagjax.jaxtools import one_function  # noqa: E402
 
 try:
@@ -38,6 +43,8 @@ jax.config.update("jax_enable_x64", True)
 
 COUNTS, FITTED = (8, 64, 256, 1000), (64, 1000)
 EVALUATIONS, REPEATS = 20, 25
+# Steps of so many seconds; motions that take some fifty steps.
+STEP, SPANS = 1e-5, {64: 0.2, 256: 0.05, 1000: 0.005}
 G, RODS, TIME, TOLERANCE = 9.81, 60, 0.1, 1e-9
 
 
@@ -79,21 +86,45 @@ def evaluations(count):
     return (lambda: program(*arguments)), seconds
 
 
-def in_mujoco(count):
-    """`mj_forward` on the same chain."""
+def rollouts(count):
+    """The same number of steps of RK4."""
+    system, q = chain(count)
+    v = {"angles": 0.5 * jnp.cos(jnp.arange(float(count)))}
+    program = jax.jit(lambda q, v: lj.rollout(system, q, v, None, EVALUATIONS, STEP))
+    return lambda: program(q, v)
+
+
+def integrated(count, motions=2):
+    """Seconds and steps of motions over T, 2 T, ..., each a first and a second time, and the megabytes then."""
+    system, q = chain(count)
+    v, found = jax.tree.map(jnp.zeros_like, q), []
+    for i in range(1, motions + 1):
+        for _ in range(3):
+            ts, started = jnp.array([0.0, i * SPANS[count]]), time.process_time()
+            traj = lj.integrate(system, q, v, ts=ts, rtol=TOLERANCE, atol=TOLERANCE, estimate_error=False)
+            jax.block_until_ready(traj.q)
+            found.append((time.process_time() - started, int(traj.stats["num_steps"])))
+    # The peak of this process alone; that of `resource` is inherited.
+    (peak,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return {"motions": found, "megabytes": int(peak.split()[1]) / 1024}
+
+
+def in_mujoco(count, step=None):
+    """`mj_forward` on the same chain, or steps of a method."""
     xx, yy, zz = moments(count)
     joint = '<joint type="hinge" axis="0 1 0"/>'
     body = '<body pos="0 0 {at}">' + joint + '<inertial pos="0 0 {half}" mass="{mass}" diaginertia="{I}"/>'
     parts = dict(half=-0.5 / count, mass=1 / count, I=f"{xx} {yy} {zz}")
     inside = "".join(body.format(at=0.0 if i == 0 else -1 / count, **parts) for i in range(count)) + "</body>" * count
-    flags = '<option><flag contact="disable" constraint="disable"/></option>'
+    flags = f'<option integrator="{step or "Euler"}" timestep="{STEP}"><flag contact="disable" constraint="disable"/>'
+    flags += "</option>"
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{flags}<worldbody>{inside}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = relative_angles(count), 0.5 * np.cos(np.arange(count))
 
     def evaluate():
         for _ in range(EVALUATIONS):
-            mujoco.mj_forward(model, data)
+            (mujoco.mj_step if step else mujoco.mj_forward)(model, data)
 
     return evaluate
 
@@ -161,6 +192,32 @@ def rows(wanted):
         few = [count for count in COUNTS if FITTED[0] <= count <= FITTED[1]]
         slope = np.polyfit(np.log(few), np.log([found[count] for count in few]), 1)[0]
         yield row("exponent of an evaluation, N = 64 to 1000", slope, 1.1)
+    if mujoco and wanted("step of RK4 / mj_step with RK4, N = 64"):
+        others = [in_mujoco(64, method) for method in ("RK4", "Euler")]
+        times = in_turn(rollouts(64), *others, repeats=REPEATS, shortest=5e-3)
+        ratio, least = times.ratio(0, 1)
+        per = 1e6 / EVALUATIONS
+        yield row(
+            "step of RK4 / mj_step with RK4, N = 64", ratio, least=least, ours=times.minima[0] * per,
+            theirs=times.minima[1] * per, with_euler=times.minima[2] * per,
+        )  # fmt: skip
+    per_step = {}
+    for count in SPANS:
+        if not wanted(f"integrate, N = {count}"):
+            continue
+        source = f"import json; from benchmarks.speed.trees import integrated as i; print(json.dumps(i({count})))"
+        found = in_new_process(source)
+        (first, _), *_ = found["motions"]
+        (short, few), (long, many) = (min(map(tuple, found["motions"][i : i + 3])) for i in (0, 3))
+        per_step[count] = (long - short) / (many - few)
+        yield row(f"integrate, N = {count}: first answer, s", first, megabytes=found["megabytes"])
+        yield row(
+            f"integrate, N = {count}: a step, ms", 1e3 * per_step[count], steps=many,
+            before_the_first_ms=1e3 * (short - few * per_step[count]),
+        )  # fmt: skip
+    if len(per_step) == len(SPANS):
+        slope = np.polyfit(np.log(list(per_step)), np.log(list(per_step.values())), 1)[0]
+        yield row("exponent of a step of integrate, N = 64 to 1000", slope)
     if wanted("motion / SciPy, 60 rods"):
         system, q = chain(RODS)
         ts, zero = jnp.array([0.0, TIME]), jax.tree.map(jnp.zeros_like, q)

@@ -64,6 +64,8 @@ LARGE = 1024
 TOGETHER = 256
 # A matrix product of more multiplications is left to the library: that gains more than one function.
 PRODUCT = 4096
+# But not a vector of so few numbers times a matrix, as the sum of the stages of a step, which reads each number once.
+FEW_TERMS = 16
 AT_ANY_SIZE = ELEMENTWISE | MOVING | EQUINOX_PRIMITIVES | {
     "bessel_i0e", "bessel_i1e", "bitcast_convert_type", "dynamic_update_slice", "empty2", "reduce_precision", "sincos",
     "tile", "xla_metadata_value", "added",
@@ -156,7 +158,8 @@ def _equation_fits(equation):
     if name == "product":
         (contracted, _), _ = equation.params["dimension_numbers"]
         summed = math.prod(equation.invars[0].aval.shape[i] for i in contracted)
-        return equation.outvars[0].aval.size * summed <= PRODUCT
+        adds_up = summed <= FEW_TERMS and min(x.aval.ndim for x in equation.invars) == 1
+        return adds_up or equation.outvars[0].aval.size * summed <= PRODUCT
     if name in SMALL:
         return max(sizes) <= LARGE
     if name.startswith("scatter"):

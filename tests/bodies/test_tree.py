@@ -8,6 +8,8 @@ import pytest
 import lagjax as lj
 from lagjax.bodies.tree.links import slots_of
 from lagjax.display import InSpace
+from lagjax.jaxtools import equations
+from lagjax.system.traced_functions import TracedProgram
 
 Y = (0.0, 1.0, 0.0)
 
@@ -129,11 +131,11 @@ def test_the_recursion_solves_lagranges_equations():
     assert np.max([jnp.max(jnp.abs(x[6:])) for x in jax.tree.leaves(found)]) > 0.1
 
 
-def test_a_tree_beside_pinocchio():
+@pytest.mark.parametrize("parents", [[-1, 0, 1, 1, 3, 0, 5], [-1, 0, 0]], ids=["in a loop", "written out"])
+def test_a_tree_beside_pinocchio(parents):
     """Accelerations of a forked tree of hinges and slides, within 1e-10 of Pinocchio's."""
     pin = pytest.importorskip("pinocchio")
     rng = np.random.default_rng(4)
-    parents = [-1, 0, 1, 1, 3, 0, 5]
     bodies = [a_body(rng, f"b{i}") for i in range(len(parents))]
     model, joints, centres = pin.Model(), {}, rng.normal(size=(len(parents), 3))
     for i, parent in enumerate(parents):
@@ -156,6 +158,53 @@ def test_a_tree_beside_pinocchio():
     np.testing.assert_allclose([found[name] for name in joints], expected, rtol=1e-10, atol=1e-10)
     other = pin.aba(model, model.createData(), q, 0 * v, tau)
     assert np.abs(other - expected).max() > 0.1
+
+
+@pytest.mark.parametrize("count", [3, 6], ids=["written out", "in a loop"])
+def test_places_on_a_chain(count):
+    """Where the end of a chain of rods is, how fast it moves and turns, by sums over its absolute angles; in both forms
+    of a pose."""
+    rods = [lj.Body(f"rod {i}", 1.0, (1 / 12, 1 / 12, 0.0)) for i in range(count)]
+    above = [lj.ground.at(axis=Y), *(rod.at((0.0, 0.0, -0.5), Y) for rod in rods)]
+    tree = lj.Tree(rods, {"a": [lj.revolute(a, rod.at((0.0, 0.0, 0.5), Y)) for a, rod in zip(above, rods)]})
+    tip, rng = rods[-1].at((0.0, 0.0, -0.5)), np.random.default_rng(2)
+    relative, faster = rng.normal(size=(2, count))
+    angle, rate = np.cumsum(relative), np.cumsum(faster)
+
+    @jax.jit
+    def seen(q, v):
+        poses, rates = tree.poses(q), tree.rates(q, v)
+        bare = [{name: lj.Pose(x.position, x.quaternion) for name, x in of.items()} for of in (poses, rates)]
+        return [
+            [tip.position(q), tip.velocity(q, v), tip.body.spin(q, v), tip.body.spin_in_body(q, v)]
+            for q, v in ((poses, rates), bare)
+        ]
+
+    along = np.stack([-np.sin(angle), 0 * angle, -np.cos(angle)], axis=1)
+    across = np.stack([-np.cos(angle) * rate, 0 * angle, np.sin(angle) * rate], axis=1)
+    turning = np.array([0.0, rate[-1], 0.0])
+    for found in seen({"a": jnp.asarray(relative)}, {"a": jnp.asarray(faster)}):
+        for x, y in zip(found, (along.sum(axis=0), across.sum(axis=0), turning, turning)):
+            np.testing.assert_allclose(x, y, atol=1e-13)
+
+
+def test_a_gap_of_a_place_is_a_short_program():
+    """What a contact differentiates twice has no quaternion, unless it reads one, and no loop where links are few."""
+    rod = lj.Body("rod", 1.0, (1 / 12, 1 / 12, 0.0))
+    tree = lj.Tree([rod], {"a": lj.revolute(lj.ground.at(axis=Y), rod.at((0.0, 0.0, 0.5), Y))})
+    tip = rod.at((0.0, 0.0, -0.5))
+
+    def height(t, q, params):
+        return tip.position(tree.poses(q))[2]
+
+    def turned(t, q, params):
+        return tree.poses(q)["rod"].quaternion[0]
+
+    like = jnp.zeros(()), {"a": jnp.zeros(())}, None
+    found = [TracedProgram(f, ("t", "q", "params"), like).jaxpr for f in (height, turned)]
+    names = [[equation.primitive.name for equation in equations(jaxpr)] for jaxpr in found]
+    assert ["sqrt" in x for x in names] == [False, True]
+    assert "scan" not in names[0] and len(names[0]) < 80 < len(names[1])
 
 
 @pytest.mark.exhaustive
