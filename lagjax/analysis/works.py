@@ -38,6 +38,9 @@ from lagjax.system import (
 FORCE, DISSIPATION, STATES, TIME = "force", "dissipation", "states", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.
 HALVINGS, MOST_INTERVALS = 12, 10_000
+# The fewest outputs of a motion that is integrated again. A few hundred short steps are soon made, and a program of
+# another length, as for other parameters with more steps, compiles as long as that of the motion.
+ROOM = 256
 # The outer nodes of an interval are two thousandths of it from its ends.
 APART = 2e3
 
@@ -147,8 +150,12 @@ class Motion:
         return works, float(np.sum(errors))
 
     def _at_nodes(self, rows):
-        powers = self._powers(*rows)
-        return np.concatenate([powers[name] for name in self.sources], axis=1)
+        # As many as there are outputs, for which one program serves.
+        count = len(rows[1])
+        powers = self._powers(
+            *jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], self.room - count, 0)]), rows)
+        )
+        return np.concatenate([powers[name][:count] for name in self.sources], axis=1)
 
     def integrals(self, knots, at_nodes, allowed):
         """The ends (m,), integrals (m, k) and errors (m,) of the intervals between knots, halved until accurate.
@@ -224,7 +231,7 @@ class Motion:
 
     def _with_others(self, t):
         """These times in order, the first and last instant, and others: up to a length that one program serves."""
-        self.room = max(self.room, 2 ** (len(t) + 1).bit_length())
+        self.room = max(self.room, ROOM, 2 ** (len(t) + 1).bit_length())
         others = np.linspace(self.t[0], self.t[-1], self.room - len(t), dtype=self.t.dtype)
         return self.forward * np.unique(self.forward * np.concatenate([t, others]))
 

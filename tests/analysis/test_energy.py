@@ -8,6 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.scenes import SCENES, bead_on_hoop, sliding_wedge
 from lagjax.system.function_arguments import WITH_MULTIPLIERS, takes_of
+from tests.counting import compiles
 from tests.system.test_hybrid import SPHERE, rolls, slides, throw
 from tests.tiers import exhaustive_but
 
@@ -69,6 +70,19 @@ def test_drag_takes_what_the_closed_form_says():
     assert "NOT CLOSE" not in repr(ledger) and "gave" not in repr(ledger)
     axis = ledger.plot().axes[0]
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["dissipation", "change of h"]
+
+
+def test_a_motion_of_more_steps_needs_no_other_program():
+    """The nodes of a few more steps go into the same program."""
+    ts = np.array([0.0, 1.0])
+    ledgers = [lj.energy_ledger(lj.integrate(DRAGGED, 5.0, 0.0, ts=ts, max_step=h)) for h in (0.5, 0.1)]
+    assert all(ledger.closes for ledger in ledgers)
+    with compiles() as programs:
+        lj.energy_ledger(lj.integrate(DRAGGED, 5.0, 0.0, ts=ts, max_step=0.07))
+    assert not programs
+    with compiles() as programs:
+        lj.energy_ledger(lj.integrate(DRAGGED, 5.0, 0.0, ts=ts, max_step=1 / 50))
+    assert programs
 
 
 @pytest.mark.slow
