@@ -61,7 +61,8 @@ class Equations(eqx.Module):
         """How many operations the accelerations have; written out, with those of the return to the constraints."""
         if self.written is not None:
             return sum(numbers.length for numbers in (self.written.equations, self.written.project) if numbers)
-        return length(jax.make_jaxpr(self.accelerations)(t, q, v).jaxpr)
+        # JAX looks for what it traces among what it has traced: bound methods would compare traced arrays.
+        return length(jax.make_jaxpr(lambda *state: self.accelerations(*state))(t, q, v).jaxpr)
 
     def inside(self, y: Array):
         """Convert the user's position or velocity to the form that these equations take."""
