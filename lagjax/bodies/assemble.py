@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies, floats, kinetic_energy, together
+from lagjax.bodies.driven import Driven
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.shapes import usual_shapes
-from lagjax.display import Drawing
+from lagjax.display import Drawing, Shape
 from lagjax.jaxtools import numpy_of
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -40,8 +41,8 @@ def multibody(
 
     **Arguments:**
 
-    - `bodies`: `lj.Body`s of different names; q and v are dicts of `lj.Pose` by these names. That their quaternions are
-      unit ones is a constraint of the system, of the body's name.
+    - `bodies`: `lj.Body`s of different names; q and v are dicts of `lj.Pose` by these names, without those whose motion
+      is given. That their quaternions are unit ones is a constraint of the system, of the body's name.
     - `joints`: constraints by name, `lj.spherical(...)` and the like, or written by hand.
     - `loads`: `lj.weight`, `lj.spring`, `lj.motor`, `lj.applied`.
     - `lagrangian`: what L has besides, a function of (t, q, v, params); q may have further entries.
@@ -55,23 +56,33 @@ def multibody(
     bodies, loads = check_bodies("lj.multibody", bodies), check_loads("lj.multibody", loads)
     _check_joints(joints)
     _check_keywords(others)
+    driven, bodies = Driven.among(bodies), tuple(body for body in bodies if body.motion is None)
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
-    twice = {body.name for body in bodies if sum(body.name == other.name for other in bodies) > 1}
+    names = [body.name for body in (*bodies, *driven.bodies)]
+    twice = {name for name in names if names.count(name) > 1}
     if twice or units.keys() & joints.keys():
         name = sorted(twice or units.keys() & joints.keys())[0]
         raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")
-    beside = Acting(others.pop("force", None), others.pop("dissipation", None))
-    acting = beside.with_loads(loads, lambda q, v, params: (q, v))
+    beside = Acting(*(driven.seen_by_all(others.pop(name, None)) for name in ("force", "dissipation")))
+    acting = beside.with_loads(loads, driven.placed)
 
     def total(t, q, v, params):
+        q, v = driven.placed(t, q, v, params)
         kinetic = _kinetic(bodies, q, v, params)
         potential = sum(load.potential(t, q, v, params) for load in loads if load.potential is not None)
         return kinetic - potential + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
 
     looks_like = [*(joint.function for joint in joints.values()), *(load.potential for load in loads)]
-    setattr(total, "drawing", Drawing(lambda params: usual_shapes(bodies, looks_like, params)))
+    setattr(total, "drawing", Drawing(lambda params: _drawn(driven, usual_shapes(bodies, looks_like, params))))
+    joints = {name: driven.seen_by(joint) for name, joint in joints.items()}
     return System(total, units | joints, force=acting.force, dissipation=acting.dissipation, **others)
+
+
+def _drawn(driven: Driven, shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
+    """Without what is fixed in driven bodies, whose poses q does not have."""
+    names = {body.name for body in driven.bodies}
+    return tuple(shape for shape in shapes if not any(anchor.body in names for anchor in shape.anchors))
 
 
 def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:

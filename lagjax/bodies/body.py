@@ -152,7 +152,11 @@ class Body:
     principal moments, if the body's axes are the principal ones, or the symmetric (3, 3) matrix. Both may be functions
     of params.
 
-    Where all of them are zero it is a frame, as between two joints of a `lj.Tree`.
+    Where all of them are zero it is a frame, as between two joints of a `lj.Tree`. `motion`, a function of (t, params)
+    that returns a `lj.Pose`, is for a body of `lj.multibody` that moves as given, a turning table: it has no entry in
+    q, nor mass and inertia, and bodies are joined to it as to any other.
+
+    >>> table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
 
     **Raises:** `ValueError` for a mass or an inertia that no body has: each principal moment is at most the sum of the
     two others.
@@ -161,8 +165,9 @@ class Body:
     """
 
     name: str
-    mass: float | Callable
-    inertia: tuple | Callable
+    mass: float | Callable = 0.0
+    inertia: tuple | Callable = (0.0, 0.0, 0.0)
+    motion: Callable[[Any, Any], Pose] | None = None
 
     def __post_init__(self):
         check_takes_params("mass", f"'{self.name}'", self.mass)
@@ -172,6 +177,8 @@ class Body:
             object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
             _check_inertia(self.name, given)
         massless = not callable(self.inertia) and not np.any(self.inertia)
+        if self.motion is not None:
+            check_arguments(Call("motion", self.motion, ("t", "params"), f" of '{self.name}'"), "a pose in its place")
         if not callable(self.mass) and not (self.mass > 0 or massless and self.mass == 0):
             raise ValueError(
                 f"the mass of '{self.name}' must be positive, and is {self.mass}.\n"
@@ -247,6 +254,11 @@ class Body:
         entry: Any = None
         if isinstance(q, Mapping) and self.name not in q:
             given = f"missing beside {', '.join(map(repr, q)) or 'nothing'}"
+            if self.motion is not None:
+                raise TypeError(
+                    f"'{self.name}' moves as given, and has no entry in q and v.\n"
+                    f"Fix: its pose is {self.name}.motion(t, params); joints and loads of lj.multibody know it."
+                )
         else:
             entry = q[self.name]
             is_array = isinstance(entry, jax.Array | np.ndarray)

@@ -202,22 +202,22 @@ class Acting(NamedTuple):
     dissipation: Callable | None
 
     def with_loads(self, loads: Iterable[Load], placed: Callable) -> "Acting":
-        """The same with the powers and dissipations of loads, which read q and v as `placed(q, v, params)` has them."""
+        """The same with the powers and dissipations of loads, which read q and v as `placed(t, q, v, params)`."""
         powers = [load.power for load in loads if load.power is not None]
         losses = [load.dissipation for load in loads if load.dissipation is not None]
 
         def driven(t, q, v, params):
-            at, moving = placed(q, v, params)
+            at, moving = placed(t, q, v, params)
 
             def power(w):
-                rates = placed(q, w, params)[1]
+                rates = placed(t, q, w, params)[1]
                 return sum(of_load(t, at, rates, moving, params) for of_load in powers)
 
             given = jax.grad(power)(v)
             return given if self.force is None else jax.tree.map(jnp.add, given, self.force(t, q, v, params))
 
         def friction(t, q, v, params):
-            at, moving = placed(q, v, params)
+            at, moving = placed(t, q, v, params)
             lost = sum(of_load(t, at, moving, params) for of_load in losses)
             return jnp.asarray(lost if self.dissipation is None else lost + self.dissipation(t, q, v, params))
 

@@ -5,8 +5,8 @@ The point of contact is where f is least on the rim, or on the sphere. It lies f
     e = (e0 + x T)/|e0 + x T|,        ∂f/∂x = 0,
 
 where e0 leads down the gradient at the centre, and T are one direction (rim) or two (sphere) at right angles to e0.
-On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by Newton's method, with
-the derivatives of the implicit function.
+On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by a few steps of Newton's,
+without loops, so that the equations are written out in single numbers.
 
 Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4; Routh, *Advanced Rigid Dynamics*, §§ 214-224 (spheres on
 surfaces).
@@ -27,11 +27,13 @@ from lagjax.bodies.body import Ground, Marker, ground, valued
 from lagjax.bodies.joints import check_two
 from lagjax.bodies.shapes import disk, level, looks, sphere
 from lagjax.display import Shape
-from lagjax.numerics import dense, newton
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
-# The most steps of Newton's to the point of contact; from the one below the centre it takes some five.
-MOST = 20
+# Steps of Newton's to the point of contact from the one below the centre, of which the last turns the way there by less
+# than `SETTLED`: some 1e-6 is left, which each of those for derivatives multiplies by that.
+STEPS, SETTLED = 3, 1e-3
+# Derivatives of the point of contact are exact up to this order: two for accelerations and their derivatives.
+ORDERS = 2
 # By how much the slope of a distance may differ from one.
 NOT_ONE = 1e-3
 
@@ -62,7 +64,8 @@ class Surface:
     than the bowl.
 
     **Raises:** `TypeError` for an `f` that is not a function, and for an `on` that is no marker. Where `is_distance`
-    and |∇f| is not one, "touches" is NaN.
+    and |∇f| is not one, and where three steps of Newton's from straight below the centre do not reach the point of
+    contact (what rolls is nearly as large as the surface is curved, or far from it), "touches" is NaN.
     """
 
     f: Callable[[Float[Array, "3"], Any], Any]
@@ -117,11 +120,7 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
 
-    def ways(n: Array, a: Array):
-        along = jnp.cross(n, a)
-        return jnp.cross(a, along), along[None]
-
-    contact = _contact(wheel, floor, radius, ways)
+    contact = _contact(wheel, floor, radius, is_rim=True)
     looks(contact["touches"].function, disk(wheel, radius), *getattr(floor, "drawing", ()))
     return contact
 
@@ -137,93 +136,116 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    straight = isinstance(floor, Surface) and floor.is_distance
-
-    def ways(n: Array, a: Array):
-        return n, None if straight else tangents(n, np.eye(3, dtype=n.dtype))
-
-    contact = _contact(ball, floor, radius, ways)
+    contact = _contact(ball, floor, radius, is_rim=False)
     looks(contact["touches"].function, sphere(ball, radius), *getattr(floor, "drawing", ()))
     return contact
 
 
-def _contact(wheel: Marker, floor: Any, radius: Any, ways: Callable) -> dict[str, Holonomic | Nonholonomic]:
-    """`ways(n, a)`: the way up from the point of contact on a plane, and the directions in which it may move else.
-
-    There are no such directions (None) where it lies straight below on a surface too.
-    """
+def _contact(wheel: Marker, floor: Any, radius: Any, is_rim: bool) -> dict[str, Holonomic | Nonholonomic]:
     is_plane = not isinstance(floor, Surface)
     at = floor if is_plane else floor.on
     check_two(wheel, at)
+    is_straight = is_plane or floor.is_distance and not is_rim
 
-    def height(r: Array, q: PyTree, params: PyTree) -> Array:
-        """f at a point of space."""
-        place = r - at.position(q, params)
-        return jnp.dot(place, at.axis(q)) if is_plane else jnp.asarray(floor.f(at.axes(q) @ place, params))
+    def height(r: Array, params: PyTree) -> Array:
+        """f at a point that is given in the frame of the floor."""
+        return r[2] if is_plane else jnp.asarray(floor.f(r, params))
+
+    def normal(r: Array, params: PyTree) -> Array:
+        return _unit(jax.grad(height)(r, params))
 
     def meeting(q: PyTree, params: PyTree) -> tuple[Array, Array]:
-        """The way from the centre to the point of contact, and the surface's normal there."""
-        centre, size = wheel.position(q, params), valued(radius, params)
-        up = at.axis(q) if is_plane else _unit(jax.grad(height)(centre, q, params))
-        d, turns = ways(up, wheel.axis(q))
-        if is_plane or turns is None:
-            return -size * _unit(d), up
-
-        def arm_at(x: Array) -> Array:
-            return size * _unit(x @ turns - d)
-
-        arm = arm_at(_least(lambda x: height(centre + arm_at(x), q, params), len(turns), d.dtype))
-        return arm, _unit(jax.grad(height)(centre + arm, q, params))
+        """The point of contact and the way there from the centre, in the frame of the floor."""
+        size, axes = valued(radius, params), at.axes(q)
+        centre = axes @ (wheel.position(q, params) - at.position(q, params))
+        axis = axes @ wheel.axis(q) if is_rim else None
+        if is_straight:
+            e = -normal(centre, params)
+            arm = size * (e if axis is None else _unit(_off(axis, e)))
+        else:
+            arm = size * _towards(height, centre, axis, size, params)
+        return centre + arm, arm
 
     def touches(t, q, params):
-        arm, normal = meeting(q, params)
-        lowest = wheel.position(q, params) + arm
+        point, _ = meeting(q, params)
         if is_plane:
-            return height(lowest, q, params)
-        value, slope = jax.value_and_grad(height)(lowest, q, params)
-        length = jnp.dot(slope, normal)
+            return height(point, params)
+        value, gradient = jax.value_and_grad(height)(point, params)
+        length = jnp.sqrt(jnp.sum(gradient**2))
         if floor.is_distance:
             return jnp.where(jnp.abs(lax.stop_gradient(length) - 1) < NOT_ONE, value, jnp.nan)
         return value / length
 
     def rolls(t, q, v, params):
-        arm, normal = meeting(q, params)
-        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), arm)
-        from_floor = wheel.position(q, params) + arm - at.position(q, params)
-        of_floor = at.velocity(q, v, params) + jnp.cross(at.body.spin(q, v), from_floor)
-        across = at.axes(q)[:2] if is_plane else tangents(normal, at.axes(q))
-        return across @ (of_wheel - of_floor)
+        (point, arm), axes = meeting(q, params), at.axes(q)
+        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), arm @ axes)
+        of_floor = at.velocity(q, v, params) + jnp.cross(at.body.spin(q, v), point @ axes)
+        slip = axes @ (of_wheel - of_floor)
+        return slip[:2] if is_plane else tangents(normal(point, params)) @ slip
 
     return {"touches": Holonomic(touches), "rolls": Nonholonomic(rolls)}
 
 
-def tangents(normal: Float[Array, "3"], frame: Float[Array, "3 3"]) -> Float[Array, "2 3"]:
-    """The frame's first two vectors, turned by the shortest way that takes its axis, or where that is far, back, to n.
+def _towards(f: Callable, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
+    """The unit vector to the point of contact: where f is least on the rim about an axis or, without one, on a sphere.
 
-    >>> print(tangents(jnp.array([0.0, 0.0, -1.0]), jnp.eye(3)))
+    It is found for numbers alone. Its derivatives are those of further steps of Newton's from there with the matrix
+    held, each of which adds an order (the first is the implicit function theorem).
+    """
+
+    def on_it(e: Array, axis: Array | None) -> Array:
+        return _unit(e if axis is None else _off(axis, e))
+
+    def slope(e: Array, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
+        """∂f/∂x in the directions in which the point may move."""
+        across = _off(e, jax.grad(f)(centre + size * e, params))
+        return across if axis is None else _off(axis, across)
+
+    def inverse(e: Array, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
+        """The inverse of the derivative of `slope` by these directions."""
+        point = centre + size * e
+        gradient, hessian = jax.grad(f)(point, params), jax.jacfwd(jax.grad(f))(point, params)
+        turns = tangents(e) if axis is None else jnp.cross(axis, e)[None]
+        inner = size * turns @ hessian @ turns.T - jnp.dot(e, gradient) * np.eye(len(turns), dtype=e.dtype)
+        return turns.T @ _inverted(inner) @ turns
+
+    given = (centre, axis, size, params)
+    held = lax.stop_gradient(given)
+    found = before = on_it(-jax.grad(f)(held[0], held[3]), held[1])
+    for _ in range(STEPS):
+        before, found = found, on_it(found - inverse(found, *held) @ slope(found, *held), held[1])
+    found = jnp.where(jnp.sum((found - before) ** 2) < SETTLED**2, found, jnp.nan)
+    chord, e = inverse(found, *held), on_it(found, axis)
+    for _ in range(ORDERS):
+        e = on_it(e - chord @ slope(e, *given), axis)
+    return e
+
+
+def tangents(normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """The first two coordinate axes, turned by the shortest way that takes the third, or where that is far, back, to n.
+
+    >>> print(tangents(jnp.array([0.0, 0.0, -1.0])))
     [[1. 0. 0.]
      [0. 1. 0.]]
     """
-    axis = jnp.where(jnp.dot(frame[2], normal) < -0.9, -frame[2], frame[2])
-    along = frame[:2] @ normal / (1 + jnp.dot(axis, normal))
-    return frame[:2] - along[:, None] * (axis + normal)[None]
+    side = jnp.where(normal[2] < -0.9, -1.0, 1.0).astype(normal.dtype)
+    axis = jnp.stack([jnp.zeros_like(side), jnp.zeros_like(side), side])
+    along = normal[:2] / (1 + side * normal[2])
+    return np.eye(2, 3, dtype=normal.dtype) - along[:, None] * (axis + normal)[None]
 
 
 def _unit(x: Array) -> Array:
     return x / jnp.sqrt(jnp.sum(x**2))
 
 
-def _least(f: Callable[[Array], Array], count: int, dtype) -> Array:
-    """Where f of `count` numbers is stationary, near zero."""
-    slope = jax.grad(f)
+def _off(e: Array, x: Array) -> Array:
+    """The part of x at right angles to a unit vector."""
+    return x - jnp.dot(e, x) * e
 
-    def solve(slope: Callable, start: Array):
-        def step(x: Array, r: Array, i: Array) -> Array:
-            return dense.solve(jax.jacfwd(slope)(x), r)
 
-        return newton(slope, step, start, MOST, falls=0.9)
-
-    def tangent(push: Callable, known: Array):
-        return dense.solve(jax.jacfwd(push)(jnp.zeros_like(known)), known)
-
-    return lax.custom_root(slope, jnp.zeros(count, dtype), solve, tangent)
+def _inverted(a: Array) -> Array:
+    """The inverse of one number or of four: what has a rule of differentiation of its own is traced several times."""
+    if len(a) == 1:
+        return 1 / a
+    (p, q), (r, s) = a
+    return jnp.array([[s, -q], [-r, p]]) / (p * s - q * r)

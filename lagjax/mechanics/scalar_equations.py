@@ -27,7 +27,7 @@ from lagjax.jaxtools import TooLong, decided, is_array, is_plain
 from lagjax.mechanics.first_order import completed, resolved, without_mass
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
-from lagjax.mechanics.scalar_form import WRITTEN, Numbers
+from lagjax.mechanics.scalar_form import Numbers
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
@@ -38,9 +38,12 @@ UP_TO, CONSTRAINED_UP_TO = 8, 16
 # Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
 # thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
 MATRIX = 64
-# A program of more operations goes to arrays. The longest one below this that was measured, a rattleback's, takes 18 s
-# of processor time written out and 50 s in arrays (`benchmarks/speed/mechanisms.py`); none above it was.
-LONG = 3000
+# A program of more operations goes to arrays. With constraints, the longest ones below this that were measured are a
+# rattleback's, 18 s of processor time written out and 50 s in arrays, and that of a ball in a bowl (5,200 operations),
+# whose first answer takes 44 s written out and more than 140 s in arrays. None above it was.
+LONG, CONSTRAINED_LONG = 3000, 6000
+# What is not yet without its zeros may be so many times as long.
+ON_THE_WAY = 5
 # Two iterations are enough where the second one moves the state by less than this share of its size.
 SMALL_CORRECTION = 1e-7
 
@@ -84,11 +87,12 @@ def is_small(model: Model) -> bool:
 def write_out(model: Model) -> WrittenOut | None:
     """Write out the equations of a small system in single numbers. None if L makes them too long."""
     diagonal = model.m == 0 and is_diagonal(model)
+    most = CONSTRAINED_LONG if model.m else LONG
     try:
-        equations = Numbers(partial(_equations, diagonal), model, most=WRITTEN, has_more=True)
+        equations = Numbers(partial(_equations, diagonal), model, most=ON_THE_WAY * most, has_more=True)
     except TooLong:
         return None
-    if equations.length > LONG:
+    if equations.length > most:
         return None
     project = Numbers(partial(_projected, equations.more), model) if model.is_returned else None
     return WrittenOut(equations, project, may_fail=not diagonal)

@@ -77,7 +77,8 @@ class Tree:
     Bodies without mass and inertia are frames, for joints that follow on each other at one place.
 
     **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,
-    two things of one name, armature of no joint, and for a body without mass that moves and carries none.
+    two things of one name, armature of no joint, a body whose motion is given, and for a body without mass that moves
+    and carries none.
 
     `tree.bodies` and `tree.joints` are what it was made of.
 
@@ -92,6 +93,11 @@ class Tree:
     ):
         bodies = check_bodies("lj.Tree", bodies)
         names = [body.name for body in bodies]
+        if driven := [body.name for body in bodies if body.motion is not None]:
+            raise ValueError(
+                f"'{driven[0]}' moves as given, which is not there in lj.Tree.\n"
+                "Fix: lj.multibody, with the same bodies and joints."
+            )
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise ValueError(f"two bodies are called '{twice}'.\nFix: a name for each.")
@@ -157,7 +163,7 @@ class Tree:
         loads = check_loads("tree.system", loads)
         dynamics = Dynamics(self._geometry, loads, potential)
         beside = Acting(others.pop("force", None), others.pop("dissipation", None))
-        acting = beside.with_loads(loads, dynamics.placed)
+        acting = beside.with_loads(loads, lambda t, q, v, params: dynamics.placed(q, v, params))
 
         def total(t, q, v, params):
             return dynamics.lagrangian(t, q, v, params)
