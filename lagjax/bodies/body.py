@@ -178,7 +178,10 @@ class Body:
             _check_inertia(self.name, given)
         massless = not callable(self.inertia) and not np.any(self.inertia)
         if self.motion is not None:
-            check_arguments(Call("motion", self.motion, ("t", "params"), f" of '{self.name}'"), "a pose in its place")
+            check_arguments(
+                Call("motion", self.motion, ("t", "params"), f" of '{self.name}'"),
+                "an argument left out that is not needed",
+            )
         if not callable(self.mass) and not (self.mass > 0 or massless and self.mass == 0):
             raise ValueError(
                 f"the mass of '{self.name}' must be positive, and is {self.mass}.\n"

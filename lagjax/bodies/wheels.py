@@ -5,8 +5,8 @@ The point of contact is where f is least on the rim, or on the sphere. It lies f
     e = (e0 + x T)/|e0 + x T|,        ∂f/∂x = 0,
 
 where e0 leads down the gradient at the centre, and T are one direction (rim) or two (sphere) at right angles to e0.
-On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by a few steps of Newton's,
-without loops, so that the equations are written out in single numbers.
+On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by a few steps of
+Newton's, without loops, so that the equations are written out in single numbers.
 
 Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4; Routh, *Advanced Rigid Dynamics*, §§ 214-224 (spheres on
 surfaces).

@@ -108,8 +108,9 @@ def test_a_ball_on_a_turntable():
         a, multipliers = lj.accelerations(system, t, q, v, {"rate": 1.5})
         expected = SHARE / (1 + SHARE) * 1.5 * np.cross([0.0, 0.0, 1.0], velocity)
         np.testing.assert_allclose(a["ball"].position, expected, atol=1e-13)
-        np.testing.assert_allclose(multipliers["table rolls"] @ multipliers["table rolls"], (MASS * expected) @ (
-            MASS * expected), rtol=1e-12)  # fmt: skip
+        # Nothing but the table pushes it, along the table.
+        pushed = np.linalg.norm(multipliers["table rolls"])
+        np.testing.assert_allclose(pushed, MASS * np.linalg.norm(expected), rtol=1e-12)
     # Twin: the state of a ball on the turning table slips on one that stands.
     still = lj.constraint_residual(system, 0.0, q, v, {"rate": 0.0})["table rolls"]
     np.testing.assert_allclose(np.linalg.norm(still), 1.5 * np.hypot(0.7, 0.2), rtol=1e-13)
@@ -131,7 +132,7 @@ def test_circles_on_a_turntable():
 
 def test_bad_motions():
     """What is no motion, and coordinates of a body whose motion is given, are refused with the fix."""
-    with pytest.raises(TypeError, match="motion of 'table'"):
+    with pytest.raises(TypeError, match="motion.t, params. of 'table' is called with 2 arguments"):
         lj.Body("table", motion=lambda t: lj.Pose.at())
     ball, q, v = lj.Body("ball", 1.0, (1.0, 1.0, 1.0)), {"ball": lj.Pose.at()}, {"ball": lj.Pose.at().moving()}
     table = lj.Body("table", motion=lambda t, params: (0.0, 0.0, 0.0))
