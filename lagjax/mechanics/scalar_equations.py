@@ -40,7 +40,7 @@ UP_TO, CONSTRAINED_UP_TO = 8, 16
 MATRIX = 64
 # A program of more operations goes to arrays. With constraints, the longest ones below this that were measured are a
 # rattleback's, 18 s of processor time written out and 50 s in arrays, and that of a ball in a bowl (5,200 operations),
-# whose first answer takes 44 s written out and more than 140 s in arrays. None above it was.
+# whose first answer takes 33 s written out and more than 140 s in arrays. None above it was.
 LONG, CONSTRAINED_LONG = 3000, 6000
 # What is not yet without its zeros may be so many times as long.
 ON_THE_WAY = 5
