@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import PathCollection
 
 import lagjax as lj
-from lagjax.display import InSpace
+from lagjax.display import Anchor, InSpace, Shape
 from tests.systems import PARAMS, pendulum
 
 Y = (0.0, 1.0, 0.0)
@@ -98,6 +98,22 @@ def test_a_surface_on_a_body_that_moved():
     x, y, z = picture.points.corners(ground)[0][0].T
     np.testing.assert_allclose(z, 0.5 - 0.1 * (y - 2.0), atol=1e-12)
     assert x.min() < 1.0 < x.max() and y.min() < 2.1 < y.max()
+
+
+def test_a_surface_under_a_whole_motion():
+    """In a film the surface lies under all places of the ball, and is one and the same for all frames."""
+    f = lambda points, params: points[:, 2] - 0.1 * points[:, 0]
+    path = np.stack([np.linspace(0.0, 3.0, 5), np.zeros(5), np.linspace(0.1, 0.4, 5)], axis=1)
+    poses = {"ball": np.concatenate([path, np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))], axis=1)}
+    shapes = [
+        lj.sphere(lj.Body("ball", 1.0, (0.1, 0.1, 0.1)), 0.1),
+        Shape("level", (Anchor(None, np.zeros(3)),), level=f),
+    ]
+    motion = InSpace(tuple(shape.with_params(None) for shape in shapes), poses, {}).finished()
+    assert [shape.kind for shape in motion.shapes] == ["solid", "solid"]
+    x, y, z = motion.corners(motion.shapes[1])[0].T
+    np.testing.assert_allclose(z, 0.1 * x, atol=1e-14)
+    assert x.min() < -0.5 and x.max() > 3.5 and y.min() < -0.5
 
 
 def test_trees_and_their_closures():
