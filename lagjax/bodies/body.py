@@ -245,7 +245,7 @@ class Body:
         """The kinetic energy; `params` where mass or inertia are functions of them."""
         return kinetic_energy(*self.given(params, floats(q)), self.pose(q), self.rates(v))
 
-    def given(self, params: PyTree, dtype) -> tuple[ArrayLike, Float[Array, "3 3"]]:
+    def given(self, params: PyTree, dtype) -> tuple[Any, Float[Array, "3 3"]]:
         """Mass and inertia by the values of the parameters."""
         return valued(self.mass, params), self._inertia(params, dtype)
 
@@ -276,7 +276,7 @@ class Body:
 
     def _inertia(self, params: PyTree, dtype) -> Float[Array, "3 3"]:
         given = valued(self.inertia, params)
-        of = numpy_of(given)
+        of: Any = numpy_of(given)
         inertia = of.asarray(given, dtype)
         return of.diag(inertia) if inertia.ndim == 1 else inertia
 
@@ -286,7 +286,7 @@ def together(poses: Sequence[Pose]) -> Pose:
     return Pose(*(jnp.concatenate(x).reshape(len(poses), -1) for x in zip(*poses)))
 
 
-def kinetic_energy(mass: ArrayLike, inertia: Float[Array, "3 3"], pose: Pose, rates: Pose) -> Float[Array, ""]:
+def kinetic_energy(mass: Float[Array, ""], inertia: Float[Array, "3 3"], pose: Pose, rates: Pose) -> Float[Array, ""]:
     """The kinetic energy of one body."""
     spin = pose.spin_in_body(rates)
     growth = 2 * jnp.dot(pose.quaternion, rates.quaternion)

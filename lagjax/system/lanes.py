@@ -7,7 +7,7 @@ the same meaning are of one kind, and `vectors` computes all of a kind by one pr
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,8 +75,8 @@ def opened(jaxpr: Jaxpr) -> Opened | None:
             values.update(zip(e.outvars, results))
         return [jnp.asarray(written(x)) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
 
-    like = [(x.shape, x.dtype) for x in (*numbers, *(x.aval for x in (*jaxpr.constvars, *read)))]
-    program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(*x) for x in like))
+    avals: list[Any] = [*numbers, *(x.aval for x in (*jaxpr.constvars, *read))]
+    program = jax.make_jaxpr(run)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals))
     return Opened(program, Meaning(meaning_of(program.jaxpr)), numbers, tuple(map(jaxpr.invars.index, read)))
 
 
@@ -115,8 +115,8 @@ def _kind(function: Callable, args: tuple):
 
 def _in_lanes(programs: Sequence, arrays: Sequence[Array]) -> list[Float[Array, " m"]]:
     """The results of programs of one kind, given the arguments' arrays."""
-    kind = opened(programs[0].jaxpr)
-    lanes = [opened(program.jaxpr) for program in programs]
+    lanes = [found for found in (opened(program.jaxpr) for program in programs) if found is not None]
+    kind = lanes[0].program
     held = [[*lane.numbers, *program.constants] for lane, program in zip(lanes, programs)]
     operands = [_together(x) for x in zip(*held)] + [
         (arrays[i[0]], None) if len(set(i)) == 1 else (_stacked([arrays[k] for k in i]), 0)
@@ -124,13 +124,13 @@ def _in_lanes(programs: Sequence, arrays: Sequence[Array]) -> list[Float[Array, 
     ]
 
     def of_lane(*operands: Array) -> Array:
-        (value,) = eval_jaxpr(kind.program.jaxpr, kind.program.consts, *operands)
+        (value,) = eval_jaxpr(kind.jaxpr, kind.consts, *operands)
         return jnp.ravel(value)
 
     values, axes = zip(*operands)
     found = jax.vmap(of_lane, axes, axis_size=len(programs))(*values)
     size = found.shape[1]
-    return lax.split(found.reshape(-1), [size] * len(programs))
+    return list(lax.split(found.reshape(-1), [size] * len(programs)))
 
 
 def _together(values: Sequence[np.ndarray]) -> tuple[np.ndarray, int | None]:
