@@ -292,7 +292,7 @@ def test_an_arm_in_space():
     expected = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (v, in_angles))[1]
     without = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (jax.tree.map(jnp.zeros_like, v), in_angles))[1]
     a, multipliers = lj.accelerations(system, 0.0, *on_bodies(tree, q, v), None)
-    assert list(multipliers)[7:] == list(hinges) and all(multipliers[name].shape == (5,) for name in hinges)
+    assert all(multipliers[name].shape == (5,) for name in hinges)
     for link in links:
         np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-11)
         np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-11)
