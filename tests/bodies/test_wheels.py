@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.bodies import wheels
 from lagjax.bodies.wheels import tangents
 
 G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
@@ -197,6 +198,22 @@ def test_tangents():
         both = np.asarray(tangents(jnp.asarray(normal)))
         np.testing.assert_allclose(both @ both.T, np.eye(2), atol=1e-14)
         np.testing.assert_allclose(both @ normal, 0.0, atol=1e-14)
+
+
+def test_derivatives_of_the_point_of_contact(monkeypatch):
+    """In a spherical bowl it lies outwards, c/|c|: first and second derivatives, by two steps and not by one."""
+
+    def found(c):
+        return wheels._towards(lambda r, params: params - jnp.sum(r**2), c, None, SMALL, LARGE**2)
+
+    def twice(f):
+        return jax.jit(lambda c: (f(c), jax.jacfwd(f)(c), jax.jacfwd(jax.jacrev(f))(c)))(jnp.array([0.5, -1.2, 0.9]))
+
+    expected = twice(lambda c: c / jnp.sqrt(jnp.sum(c**2)))
+    for x, y in zip(twice(found), expected):
+        np.testing.assert_allclose(x, y, atol=1e-13)
+    monkeypatch.setattr(wheels, "ORDERS", 1)
+    assert np.max(np.abs(twice(found)[2] - expected[2])) > 1e-2
 
 
 def test_distances():
