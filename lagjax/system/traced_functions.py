@@ -103,8 +103,8 @@ class TracedProgram:
 
     @property
     def constants(self) -> list[np.ndarray]:
-        """The arrays in the program, where it reads none from outside."""
-        return self._fixed
+        """The arrays in the program; those that it reads from outside are not among them."""
+        return [x for x in self._fixed if x is not None]
 
     def function_with(self, arrays: Sequence) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
