@@ -7,7 +7,7 @@ articulated-body recursion. Measured are
   Pinocchio's `aba` on the same chain, and the exponent p of its cost N^p from 64 to 1,000 links;
 - a whole step, of RK4 in `lj.rollout`, beside MuJoCo's `mj_step` with its RK4 (four evaluations each; its Euler, one);
 - `lj.integrate` at 1e-9: in a new process the first answer and the memory, then a step, by two motions of which one is
-  twice as long, the time before the first step, in which M_ii is found for each coordinate, and the exponent of a step;
+  twice as long, without the time before the first step, in which M_ii is found for each coordinate, and its exponent;
 - a motion of 60 rods, 0.1 s at 1e-9, beside SciPy's DOP853 with the equations in absolute angles by hand in NumPy, a
   full mass matrix, at the same tolerances, with the difference at the end;
 - the time to trace and compile an evaluation.
@@ -211,10 +211,7 @@ def rows(wanted):
         (short, few), (long, many) = (min(map(tuple, found["motions"][i : i + 3])) for i in (0, 3))
         per_step[count] = (long - short) / (many - few)
         yield row(f"integrate, N = {count}: first answer, s", first, megabytes=found["megabytes"])
-        yield row(
-            f"integrate, N = {count}: a step, ms", 1e3 * per_step[count], steps=many,
-            before_the_first_ms=1e3 * (short - few * per_step[count]),
-        )  # fmt: skip
+        yield row(f"integrate, N = {count}: a step, ms", 1e3 * per_step[count], steps=many)
     if len(per_step) == len(SPANS):
         slope = np.polyfit(np.log(list(per_step)), np.log(list(per_step.values())), 1)[0]
         yield row("exponent of a step of integrate, N = 64 to 1000", slope)
