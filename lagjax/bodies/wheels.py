@@ -231,7 +231,7 @@ def tangents(normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
     side = jnp.where(normal[2] < -0.9, -1.0, 1.0).astype(normal.dtype)
     axis = jnp.stack([jnp.zeros_like(side), jnp.zeros_like(side), side])
     along = normal[:2] / (1 + side * normal[2])
-    return np.eye(2, 3, dtype=normal.dtype) - along[:, None] * (axis + normal)[None]
+    return jnp.eye(2, 3, dtype=normal.dtype) - along[:, None] * (axis + normal)[None]
 
 
 def _unit(x: Array) -> Array:
