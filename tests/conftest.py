@@ -31,6 +31,7 @@ import pytest  # noqa: E402
 from jax._src import compiler  # noqa: E402
 
 from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
+from lagjax.jaxtools.compiled import are_known  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -52,6 +53,8 @@ backend_compile: Any = getattr(compiler, "backend_compile_and_load", None)
 # The older loop emitter takes two thirds of the time of XLA; one module of LLVM's instead of up to 32, which share
 # helper functions and a pool of threads, another eighth less of the processors', all of which the workers use anyhow.
 COMPILED_FASTER = [("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)]
+# The XLA of jax 0.11 has no other emitters.
+COMPILED_FASTER = [(name, value) for name, value in COMPILED_FASTER if are_known({name: value})]
 
 
 def compile_faster(backend, module, devices, options, callbacks):
