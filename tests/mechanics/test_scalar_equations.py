@@ -149,7 +149,8 @@ def test_changed_numbers_do_not_compile_again():
 
 def test_a_long_program_is_not_written_out(monkeypatch):
     """Writing out a potential by quadrature of 500 nodes is given up before its end; a short one is written out."""
-    monkeypatch.setattr("lagjax.mechanics.scalar_equations.LONG", np.inf)
+    monkeypatch.setattr("lagjax.mechanics.scalar_equations.LONG", 1_000_000)
+    monkeypatch.setattr("lagjax.mechanics.scalar_equations.ON_THE_WAY", 6e-3)
     nodes = jnp.linspace(0.0, 6.0, 500)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + wire(q))
