@@ -32,8 +32,8 @@ from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 # Steps of Newton's to the point of contact from the one below the centre, of which the last turns the way there by less
 # than `SETTLED`: some 1e-6 is left, which each of those for derivatives multiplies by that.
 STEPS, SETTLED = 3, 1e-3
-# Derivatives of the point of contact are exact up to this order: two for accelerations and their derivatives.
-ORDERS = 2
+# Derivatives of the point of contact are exact up to this order: accelerations have the first, and so these leave two.
+ORDERS = 3
 # By how much the slope of a distance may differ from one.
 NOT_ONE = 1e-3
 
