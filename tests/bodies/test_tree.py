@@ -176,7 +176,7 @@ def test_places_on_a_chain(count):
         poses, rates = tree.poses(q), tree.rates(q, v)
         bare = [{name: lj.Pose(x.position, x.quaternion) for name, x in of.items()} for of in (poses, rates)]
         return [
-            [tip.position(q), tip.velocity(q, v), tip.body.spin(q, v), tip.body.spin_in_body(q, v)]
+            [tip.position(q), tip.velocity(q, v), rods[-1].spin(q, v), rods[-1].spin_in_body(q, v)]
             for q, v in ((poses, rates), bare)
         ]
 

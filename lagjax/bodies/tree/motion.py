@@ -278,8 +278,8 @@ def in_space(geometry: Geometry, fixed: FixedNumbers, joints: Joints) -> LinkMot
     link, beside = outward(geometry, fixed, link_of, ground, of_links)
     axes = beside[:, :, 2:]
     spin, slide = applied(axes, joints.turning), applied(axes, joints.sliding)
-    if joints.spin is not None:
-        spin, slide = spin + joints.spin, slide + joints.velocity
+    if free is not None:
+        spin, slide = spin + free[:, :, 0], slide + free[:, :, 1]
     return LinkMotion(
         link[:, :, :3], link[:, :, 3], link[:, :, 4], link[:, :, 5], beside[:, :, 1], beside[:, :, 0], spin, slide, axes
     )
