@@ -288,9 +288,12 @@ def reached(jaxpr: Jaxpr, inputs: Iterable) -> set:
 
 
 def depends(jaxpr: Jaxpr, inputs: Iterable) -> bool:
-    """Whether any result of a program depends on some of its variables."""
-    found = reached(jaxpr, inputs)
-    return any(not isinstance(x, Literal) and x in found for x in jaxpr.outvars)
+    """Whether any result of a program depends on some of its inputs; a call is looked into, and others are one node."""
+    chosen, closed = set(inputs), ClosedJaxpr(jaxpr, [None] * len(jaxpr.constvars))
+    found = interpreted(
+        closed, [x in chosen for x in jaxpr.invars], lambda e, read: [any(read)] * len(e.outvars), lambda *_: False
+    )  # fmt: skip
+    return any(found)
 
 
 def needed(jaxpr: Jaxpr) -> list:

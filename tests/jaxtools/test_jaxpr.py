@@ -13,7 +13,7 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 
 from lagjax.jaxtools import fuse_cpu, jaxpr, scalarize, sparsity
 from lagjax.jaxtools.fuse_cpu import STAYS_A_CALL, marked
-from lagjax.jaxtools.jaxpr import anywhere, applied, interpreted, length, without_chains
+from lagjax.jaxtools.jaxpr import anywhere, applied, depends, interpreted, length, without_chains
 
 # From jax 0.11.1 on there are none of these.
 UP_TO_0_11_0 = {"closed_call"}
@@ -226,3 +226,14 @@ def test_what_is_anywhere_in_a_program():
         assert has_sine(looped) and not has_sine(jax.make_jaxpr(jnp.cos)(1.0).jaxpr)
     seen = len(looked_at)
     assert seen >= 3 and has_sine(looped) and len(looked_at) == seen
+
+
+def test_what_depends_on_an_input():
+    """A call is looked into: it may take an input that its results do not need; twin: a call that needs it."""
+    first, both = (jax.jit(f) for f in (lambda x, t: 2 * x, lambda x, t: x + t))
+
+    def seen(function):
+        program = jax.make_jaxpr(lambda x, t: function(x, t)[None])(1.0, 2.0).jaxpr
+        return [depends(program, [x]) for x in program.invars]
+
+    assert seen(first) == [True, False] and seen(both) == [True, True]

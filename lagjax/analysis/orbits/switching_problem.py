@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from lagjax.analysis.orbits.flow import independent_rows_of
 from lagjax.analysis.orbits.monodromy import OrbitProblem, Reasons, check_freedom, problem_of, refuse_singular
 from lagjax.integrate import InElements, integrate, phases_in, traced_phases
-from lagjax.jaxtools import interpreted, is_traced
+from lagjax.jaxtools import depends, is_traced
 from lagjax.mechanics import invariance
 from lagjax.system import Hybrid, State, System, check_system, coordinates, model_of, replace_fields, with_rates
 
@@ -76,12 +76,7 @@ def _seen(switch, reset, multipliers: PyTree, s: State) -> tuple[bool, np.ndarra
         q_after, *after = reset(t, q, v, multipliers, s.params)
         return switch.value(t, q, v, multipliers, s.params), after, q_after if whole else None
 
-    program = jax.make_jaxpr(happens)(*s[:3])
-    sizes, nothing = [np.size(x) for x in jtu.tree_leaves(s.q)], frozenset()
-    inputs = [frozenset([i]) if i <= len(sizes) else nothing for i in range(len(program.in_avals))]
-    # Inside of calls too: a function that takes t need not depend on it.
-    results = interpreted(
-        program, inputs, lambda e, read: [nothing.union(*read)] * len(e.outvars), lambda *_: nothing
-    )  # fmt: skip
-    found = nothing.union(*results)
-    return 0 in found, np.repeat([1 + i in found for i in range(len(sizes))], sizes)
+    leaves = jtu.tree_leaves(s.q)
+    jaxpr = jax.make_jaxpr(happens)(*s[:3]).jaxpr
+    t, *of_q = jaxpr.invars[: 1 + len(leaves)]
+    return depends(jaxpr, [t]), np.repeat([depends(jaxpr, [x]) for x in of_q], [np.size(x) for x in leaves])
