@@ -274,6 +274,22 @@ def pixels(page, tmp_path):
     return image.imread(tmp_path / "seen.png")[:, :, :3]
 
 
+def canvas_beside(svg: str, browser, tmp_path, text: str, *keys: str):
+    """How far a page's canvas, after these keys, is from an SVG: the mean of the pixels; and the canvas' label."""
+    size = {"width": 560, "height": 520}
+    by_python = pixels(opened(browser, tmp_path, f"<body style='margin:0'>{svg}", **size), tmp_path)
+    page = opened(browser, tmp_path, whole("In space", text), **size)
+    label = page.run("document.querySelector('canvas').ariaLabel")
+    page.run("document.body.replaceChildren(document.querySelector('canvas')); document.body.style.margin = 0")
+    page.run("document.querySelector('canvas').focus({focusVisible: false})")
+    for key in keys:
+        page.press(key)
+    page.run("document.querySelector('canvas').blur()")
+    page.run("new Promise(done => setTimeout(done, 50))")
+    assert page.complaints() == []
+    return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250])), label
+
+
 def test_the_canvas_shows_what_the_first_frame_does(browser, tmp_path):
     """Painted by the script, a frame has the pixels of the SVG that Python paints, but for edges.
 
@@ -283,19 +299,9 @@ def test_the_canvas_shows_what_the_first_frame_does(browser, tmp_path):
     text = Animation(t[40:], motion.at(slice(40, None)), 25.0, 0)._repr_html_()
     svg = re.search(r"<svg.*?</svg>", text, re.DOTALL)
     assert svg is not None
-    size = {"width": 560, "height": 520}
-    by_python = pixels(opened(browser, tmp_path, f"<body style='margin:0'>{svg[0]}", **size), tmp_path)
 
     def differ(text: str, *keys: str):
-        page = opened(browser, tmp_path, whole("Film", text), **size)
-        page.run("document.body.replaceChildren(document.querySelector('canvas')); document.body.style.margin = 0")
-        page.run("document.querySelector('canvas').focus({focusVisible: false})")
-        for key in keys:
-            page.press(key)
-        page.run("document.querySelector('canvas').blur()")
-        page.run("new Promise(done => setTimeout(done, 50))")
-        assert page.complaints() == []
-        return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250]))
+        return canvas_beside(svg[0], browser, tmp_path, text, *keys)[0]
 
     near, sign = differ(text), "2 * (x * y + w * z)"
     assert near < 0.002 and text.count(sign) == 1
@@ -310,23 +316,13 @@ def test_a_still(browser, tmp_path):
     _, motion = tumbling()
     frame = motion.at(slice(40, 41))
     text = Still(frame.finished(frames=True), (-60.0, 22.0))._repr_html_()
-    svg, size = re.search(r"<svg.*?</svg>", text, re.DOTALL), {"width": 560, "height": 520}
+    svg = re.search(r"<svg.*?</svg>", text, re.DOTALL)
     assert svg is not None and "<button" not in text
-    by_python = pixels(opened(browser, tmp_path, f"<body style='margin:0'>{svg[0]}", **size), tmp_path)
 
     def differ(text: str, *keys: str):
-        page = opened(browser, tmp_path, whole("Still", text), **size)
-        assert page.run("document.querySelector('canvas').ariaLabel").startswith(
-            "Picture in space of box, ball, wire. "
-        )
-        page.run("document.body.replaceChildren(document.querySelector('canvas')); document.body.style.margin = 0")
-        page.run("document.querySelector('canvas').focus({focusVisible: false})")
-        for key in keys:
-            page.press(key)
-        page.run("document.querySelector('canvas').blur()")
-        page.run("new Promise(done => setTimeout(done, 50))")
-        assert page.complaints() == []
-        return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250]))
+        difference, label = canvas_beside(svg[0], browser, tmp_path, text, *keys)
+        assert label.startswith("Picture in space of box, ball, wire. ")
+        return difference
 
     near, ahead = differ(text), '["mark", "gap"].includes(shape.kind)'
     assert near < 0.002 and text.count(ahead) == 1
