@@ -94,6 +94,14 @@ def skipped(what, why):
     return {"what": what, "value": None, "target": None, "met": None, "skipped": why}
 
 
+def small():
+    """Whether `--small` is asked for, few lanes for a machine without a GPU; takes it from the command line."""
+    own = argparse.ArgumentParser(add_help=False)
+    own.add_argument("--small", action="store_true")
+    asked, sys.argv[1:] = own.parse_known_args()
+    return asked.small
+
+
 def main(rows, doc, draw=None):
     """Run a benchmark from the command line: print its rows as they come, and write them to the file of `--json`.
 

@@ -9,10 +9,8 @@ host      operations of these programs that need the host (`host_operations.py`)
 python -m benchmarks.gpu.loops [--small] [--json FILE] [--only TEXT]
 """
 
-import argparse
 import functools
 import os
-import sys
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
@@ -23,7 +21,7 @@ import numpy as np  # noqa: E402
 import lagjax as lj  # noqa: E402
 from benchmarks.gpu import on_gpu  # noqa: E402
 from benchmarks.gpu.host_operations import host_operations  # noqa: E402
-from benchmarks.measure import compiled, in_turn, main, row  # noqa: E402
+from benchmarks.measure import compiled, in_turn, main, row, small  # noqa: E402
 from benchmarks.speed import steps  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
@@ -101,8 +99,5 @@ def rows(wanted):
 
 
 if __name__ == "__main__":
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--small", action="store_true", help="few lanes, for a machine without a GPU")
-    asked, sys.argv[1:] = own.parse_known_args()
-    OPTIONS.update(vars(asked))
+    OPTIONS["small"] = small()
     main(rows, __doc__)

@@ -25,10 +25,8 @@ enabled: the arrays select float32.
     python -m benchmarks.gpu.on_gpu [--small] [--json FILE] [--only TEXT]
 """
 
-import argparse
 import functools
 import os
-import sys
 import time
 import warnings
 from typing import NamedTuple
@@ -43,7 +41,7 @@ import numpy as np  # noqa: E402
 
 import lagjax as lj  # noqa: E402
 from benchmarks.gpu.host_operations import host_operations, with_a_look  # noqa: E402
-from benchmarks.measure import CLOCK, in_new_process, main, row, skipped  # noqa: E402
+from benchmarks.measure import CLOCK, in_new_process, main, row, skipped, small  # noqa: E402
 from lagjax.integrate.trajectory.error_report import EXPECTED  # noqa: E402
 from lagjax.scenes import bead_on_hoop  # noqa: E402
 
@@ -343,8 +341,5 @@ def beside(title, ours, theirs):
 
 
 if __name__ == "__main__":
-    own = argparse.ArgumentParser(add_help=False)
-    own.add_argument("--small", action="store_true", help="few lanes, for a machine without a GPU")
-    asked, sys.argv[1:] = own.parse_known_args()
-    OPTIONS.update(vars(asked))
+    OPTIONS["small"] = small()
     main(rows, __doc__)
