@@ -36,7 +36,7 @@ if WAY == "arrays":
     equations.is_small = lambda model: False
 if WAY == "written":
     equations.is_small = lambda model: not scalar_equations.is_plain()
-    scalar_equations.LONG = scalar_equations.WRITTEN = 1_000_000
+    scalar_equations.LONG = scalar_equations.CONSTRAINED_LONG = 1_000_000
 # The first operation of a process starts JAX's backend.
 jax.block_until_ready(jnp.arange(3.0) + 1.0)
 xla = []
