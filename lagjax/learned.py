@@ -206,8 +206,19 @@ def same_motion(
 
     Source: Goldstein, §1.4 and derivation 8 of chapter 1 (total derivatives).
     """
-    a, m = _at_states(system, t, q, v, params)
-    b, other_m = _at_states(other, t, q, v, other_params)
+    q, v = jax.tree.map(jnp.asarray, (q, v))
+    times = _times(t, q)
+
+    def at_states(system: System | Hybrid, params: PyTree):
+        """Accelerations (N, n) and mass matrices (N, n, n)."""
+
+        def at(t: ArrayLike, q: PyTree, v: PyTree):
+            a, _ = accelerations(system, t, q, v, params)
+            return coordinates.flatten(a)[0], mass_matrix(system, t, q, v, params)
+
+        return map(np.asarray, jax.vmap(at)(times, q, v))
+
+    (a, m), (b, other_m) = at_states(system, params), at_states(other, other_params)
     size = np.sqrt(np.mean(a**2, axis=0))
     size = np.where(size > 0, size, np.maximum(np.sqrt(np.mean(b**2, axis=0)), np.finfo(a.dtype).tiny))
     differences = np.max(np.abs(a - b) / size, axis=1)
@@ -242,7 +253,7 @@ def disagreement(
         raise ValueError(
             "a single model has nothing to disagree with.\nFix: several fits, with different keys of their networks."
         )
-    times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jnp.shape(jax.tree.leaves(q)[0])[0],))
+    times = _times(t, q)
 
     def at_states(params: PyTree):
         return jax.vmap(lambda t, q, v: accelerations(system, t, q, v, params)[0])(times, q, v)
@@ -250,16 +261,9 @@ def disagreement(
     return jax.tree.map(lambda *a: jnp.std(jnp.stack(a), axis=0, ddof=1), *map(at_states, members))
 
 
-def _at_states(system: System | Hybrid, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree):
-    """Accelerations (N, n) and mass matrices (N, n, n)."""
-    q, v = jax.tree.map(jnp.asarray, (q, v))
-    times = jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), (jax.tree.leaves(q)[0].shape[0],))
-
-    def at(t: ArrayLike, q: PyTree, v: PyTree):
-        a, _ = accelerations(system, t, q, v, params)
-        return coordinates.flatten(a)[0], mass_matrix(system, t, q, v, params)
-
-    return tuple(map(np.asarray, jax.vmap(at)(times, q, v)))
+def _times(t: ArrayLike, q: PyTree) -> Array:
+    """The time of each state."""
+    return jnp.broadcast_to(jnp.asarray(t, jnp.result_type(float)), jnp.shape(jax.tree.leaves(q)[0])[:1])
 
 
 def _check_activation(activation: Callable):

@@ -43,7 +43,8 @@ def write(path: str | os.PathLike, kind: str, description: dict, arrays: dict[st
         raise IsADirectoryError(f'{path} is a folder.\nFix: give the name of a file in it, "{path / (kind + ".npz")}".')
     if not path.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {path.parent}.\nFix: make it first: os.makedirs(...).")
-    header = {"format": FORMAT, "kind": kind, "versions": _versions(), **description}
+    versions = {name: version(name) for name in ("lagjax", "jax", "diffrax")}
+    header = {"format": FORMAT, "kind": kind, "versions": versions, **description}
     said = json.dumps(header, allow_nan=False)
     if len(said) > MOST_DESCRIPTION:
         raise ValueError(
@@ -189,7 +190,3 @@ def _damaged(path, why):
         "Usual cause: a copy that was cut short, or a disk that failed.\n"
         "Fix: copy it again, or compute it again."
     )
-
-
-def _versions():
-    return {name: version(name) for name in ("lagjax", "jax", "diffrax")}

@@ -245,7 +245,7 @@ def jumps(jump_ts: Any, dtype: np.dtype):
     """Return the times at which a force jumps, (J,) of `dtype`, or None without any; raise unless they are a vector."""
     if jump_ts is None:
         return None
-    jump_ts = jnp.stack([*jump_ts]) if _holds_traced(jump_ts) else jump_ts
+    jump_ts = jnp.stack([*jump_ts]) if isinstance(jump_ts, (list, tuple)) and is_traced(jump_ts) else jump_ts
     kind, shape = (jump_ts if hasattr(jump_ts, "dtype") else np.asarray(jump_ts)).dtype, np.shape(jump_ts)
     if len(shape) > 1 or not np.issubdtype(kind, np.number) or np.issubdtype(kind, np.complexfloating):
         raise ValueError(
@@ -259,10 +259,6 @@ def jumps(jump_ts: Any, dtype: np.dtype):
 
 def _is_number(value: Any):
     return isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.ndim(value) == 0
-
-
-def _holds_traced(times):
-    return isinstance(times, (list, tuple)) and is_traced(times)
 
 
 def tolerance(value: Any, name: str, dtype: np.dtype):

@@ -89,7 +89,7 @@ class Steps(NamedTuple):
         return np.flatnonzero(self.accepted)[1:]
 
 
-def stopped_early(trajectory: Trajectory, settings: Settings, guards: str = "") -> str:
+def stopped_early(trajectory: Trajectory, settings: Settings, guards: str) -> str:
     """Say where and why an integration stopped before its last output; `guards`: these, in words."""
     end, t0, t1 = trajectory.end, float(trajectory.t[0]), float(trajectory.t[-1])
     share = 100 * (float(end.t) - t0) / (t1 - t0)

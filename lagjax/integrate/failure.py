@@ -59,7 +59,7 @@ ENOUGH = 12
 STILL = 1e-12
 
 
-def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guards=None) -> NoReturn:
+def raise_failure(trajectory: Trajectory, start: State, settings: Settings, guards) -> NoReturn:
     """Raise the error of a failed motion; `start` is its first state, `guards` those of each phase."""
     # The guards of elements take modes, and are said in words of their own.
     elements = trajectory.in_phases and trajectory.system.elements is not None

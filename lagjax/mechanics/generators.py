@@ -247,9 +247,9 @@ class _Shift(eqx.Module):
 
     def __call__(self, t: Array, q: PyTree, params: PyTree):
         x, unflatten = coordinates.flatten(q)
-        known, moved = coordinates.names(q), jnp.zeros_like(x)
+        moved = jnp.zeros_like(x)
         for name, amount in zip(self.names, self.amounts):
-            moved = moved.at[np.asarray(places_of(name, q, known))].add(amount)
+            moved = moved.at[np.asarray(places_of(name, q))].add(amount)
         return unflatten(moved)
 
 
@@ -309,9 +309,9 @@ def _combined(first, second, name: str):
     return Generator(*moved, name=name)
 
 
-def places_of(name: str, q: PyTree, known=None) -> list[int]:
+def places_of(name: str, q: PyTree) -> list[int]:
     """The places of the named coordinate in the vector of all; a leaf's name stands for all its entries."""
-    known = coordinates.names(q) if known is None else known
+    known = coordinates.names(q)
     found = [i for i, other in enumerate(known) if other == name]
     if not found and name in leaf_names(q):
         found = [i for i, other in enumerate(known) if other.startswith(f"{name}[")]

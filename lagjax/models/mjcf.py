@@ -11,9 +11,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
-from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink, merged
+from lagjax.models.parts import (
+    LinkShape,
+    Loop,
+    MergedLinks,
+    NotTaken,
+    Placement,
+    RobotJoint,
+    RobotLink,
+    file_of,
+    merged,
+)
 from lagjax.models.robot_model import RobotModel
-from lagjax.models.source import file_of
 
 KIND = {"mjJNT_HINGE": "revolute", "mjJNT_SLIDE": "prismatic", "mjJNT_BALL": "spherical", "mjJNT_FREE": "floating"}
 # What is listed as not taken, by the names of MuJoCo's lists.
@@ -24,12 +33,12 @@ WHOLE = {"box": (2.0, 2.0, 2.0), "cylinder": (1.0, 2.0, 0.0), "capsule": (1.0, 2
 COUNT = {"sphere": 1, "cylinder": 2, "capsule": 2}
 
 
-def mujoco_itself(user: str = "lj.read_mjcf") -> Any:
-    """Import MuJoCo, or say how to get it; `user` is the function that needs it."""
+def mujoco_itself() -> Any:
+    """Import MuJoCo, or say how to get it."""
     try:
         import mujoco
     except ImportError as error:
-        raise ImportError(f"{user} needs MuJoCo.\nFix: pip install 'lagjax[models]'.") from error
+        raise ImportError("lj.read_mjcf needs MuJoCo.\nFix: pip install 'lagjax[models]'.") from error
     return mujoco
 
 

@@ -10,6 +10,7 @@ Source: Featherstone, *Rigid Body Dynamics Algorithms* (2008), §2.13 and Ch. 4.
 """
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -176,3 +177,18 @@ def fault_of_inertia(link: RobotLink) -> str:
         listed = ", ".join(f"{x:.6g}" for x in moments)
         return f"has the principal moments {listed}, of which the last is more than the sum of the others"
     return ""
+
+
+def file_of(source: str | Path, user: str) -> Path | None:
+    """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
+    if isinstance(source, str) and source.strip().startswith("<"):
+        return None
+    if not isinstance(source, (str, Path)):
+        raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
+    path = Path(source).expanduser()
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there is no file '{source}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
+            f'package:// name, which ROS alone knows.\nFix: {user}("/path/to/the/file"), or the text itself.'
+        )
+    return path

@@ -20,11 +20,11 @@ from lagjax.models.parts import (
     RobotJoint,
     RobotLink,
     fault_of_inertia,
+    file_of,
     merged,
     unmoved,
 )
 from lagjax.models.robot_model import RobotModel
-from lagjax.models.source import file_of
 
 # What stands in a file beside links and joints without being mechanics, and parts of joints that the model leaves out.
 BESIDE = {"gazebo", "transmission", "material", "sensor", "ros2_control", "mujoco", "plugin", "force_torque"}

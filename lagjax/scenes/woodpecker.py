@@ -119,9 +119,9 @@ hybrid = Hybrid(
 SLIPS = 7
 
 
-def jammed_at(params: PyTree, bird, y=0.0):
+def jammed_at(params: PyTree, bird):
     """A state at rest, jammed at the lower edge, with the bird at the angle `bird`."""
-    q = {"y": y, "sleeve": -(params["r_M"] - params["r_0"]) / params["h_M"], "bird": bird}
+    q = {"y": 0.0, "sleeve": -(params["r_M"] - params["r_0"]) / params["h_M"], "bird": bird}
     return q, {"y": 0.0, "sleeve": 0.0, "bird": 0.0}
 
 

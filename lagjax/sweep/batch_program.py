@@ -127,9 +127,7 @@ def _explained(run: Callable, axes: Axes, patience: int | None, robust: bool):
 
 
 @as_usual
-def traced_point(
-    run: Callable, axes: Axes, patience: int | None = None, robust: bool = True
-) -> tuple[ClosedJaxpr, PyTree]:
+def traced_point(run: Callable, axes: Axes, patience: int | None, robust: bool) -> tuple[ClosedJaxpr, PyTree]:
     """What the user's function computes at one point, and the structure in which it does."""
     shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
     with _explained(run, axes, patience, robust):
@@ -143,8 +141,8 @@ def compiled(
     chunk: int,
     devices: Sequence,
     layout: str,
-    patience: int | None = None,
-    robust: bool = True,
+    patience: int | None,
+    robust: bool,
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
@@ -177,7 +175,8 @@ def compiled(
         return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
 
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
-    return Program(call, chunk, one, working, program_digest(traced.jaxpr), threading.Event(), settled is not None)
+    identity = digest(_text(traced.jaxpr).encode())
+    return Program(call, chunk, one, working, identity, threading.Event(), settled is not None)
 
 
 def program_for(
@@ -239,11 +238,6 @@ def not_run(program: Program, count: int) -> tuple[PyTree, Status]:
 def digest(data: bytes) -> str:
     """The first 64 bits of a SHA-256 hash, as text."""
     return hashlib.sha256(data).hexdigest()[:16]
-
-
-def program_digest(closed: ClosedJaxpr) -> str:
-    """A digest of what a program computes."""
-    return digest(_text(closed).encode())
 
 
 def _text(closed: ClosedJaxpr):

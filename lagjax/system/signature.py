@@ -57,11 +57,11 @@ class UnknownSystem(eqx.Module):
 def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
     """What each function of a system returns at a state, by role."""
     if isinstance(system, System):
-        return _signature(system, *state)
+        return _signature(system, state)
     found = {}
     for name, phase in zip(system.names, system.systems):
         for case, params in system.cases(state.params).items():
-            of_phase = _signature(phase, *state[:3], params)
+            of_phase = _signature(phase, state._replace(params=params))
             found |= {f"{role} of phase '{name}'{case}": x for role, x in of_phase.items()}
     names = [f"{i}: {switch.phase} -> {switch.to}, {switch.rest}" for i, switch in enumerate(system.switches)]
     return found | {f"switch {name}": np.zeros(0) for name in names} | system.laws_in_numbers(state)
@@ -91,11 +91,11 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 
 @partial(compiled, in_numpy=True)
-def _signature(system, t: Array, q: PyTree, v: PyTree, params: PyTree):
-    s, found = State(t, q, v, params), {}
+def _signature(system: System, s: State):
+    found = {}
 
     def flat(*trees) -> Array:
-        return jnp.concatenate([jnp.ravel(jnp.asarray(x, t.dtype)) for x in jax.tree.leaves(trees)])
+        return jnp.concatenate([jnp.ravel(jnp.asarray(x, s.t.dtype)) for x in jax.tree.leaves(trees)])
 
     def values_and_slopes(function: Callable, *args, slopes):
         return flat(function(*args), jax.jacfwd(function, argnums=slopes)(*args))

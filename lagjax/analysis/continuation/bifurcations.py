@@ -142,7 +142,7 @@ def _directions(tracer, big):
     basis = np.linalg.svd(jacobian)[2][-2:]
 
     def form(i: int, j: int) -> float:
-        return float(psi @ np.asarray(_curvature(tracer, z, basis[i], basis[j])))
+        return float(psi @ np.asarray(curvature(tracer.frame, *tracer.cast(z, basis[i], basis[j]))))
 
     a, b, c = form(0, 0), form(0, 1), form(1, 1)
     disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
@@ -156,10 +156,6 @@ def _directions(tracer, big):
         t = alpha * basis[0] + beta * basis[1]
         tangents.append(t / np.sqrt(tracer.weights @ t**2))
     return tangents
-
-
-def _curvature(tracer, z, a, b):
-    return curvature(tracer.frame, *tracer.cast(z, a, b))
 
 
 def _fold(tracer, a, b):
@@ -350,13 +346,8 @@ def _derivative(tracer, kind, big, guide):
     leaves, structure = jax.tree.flatten(by_params)
     if not leaves:
         return by_params
-    flat = np.concatenate([np.asarray(x, float).reshape(big_rows(x), -1) for x in leaves], axis=1)
+    flat = np.concatenate([np.asarray(x, float).reshape(np.shape(x)[0], -1) for x in leaves], axis=1)
     slopes = -unit * _least_squares(np.asarray(jacobian, float), flat)[n]
     places = np.cumsum([0, *(np.asarray(x)[0].size for x in leaves)])
     parts = [slopes[i:j].reshape(np.shape(x)[1:]) for i, j, x in zip(places, places[1:], leaves)]
     return jax.tree.unflatten(structure, parts)
-
-
-def big_rows(x) -> int:
-    """The number of equations of a derivative."""
-    return np.shape(x)[0]

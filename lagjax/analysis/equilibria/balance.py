@@ -240,7 +240,7 @@ def _solved(matrix, rhs):
     return dense.refined(lapack.solve(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype)), matrix, rhs)
 
 
-def characteristic_roots(s: Steady, y, jacobian, derivatives=True):
+def characteristic_roots(s: Steady, y, jacobian, derivatives: bool):
     """All roots s of departures e^(st), (2n,), with NaN in place of the roots that constraints remove.
 
     Departures along the symmetry are left out: they lead to the same motion. All roots are NaN where the equations of

@@ -60,7 +60,7 @@ class _Reduced(NamedTuple):
     with_rate: Float[Array, "c d"]
 
 
-def motions_of(linear: Linearisation, definite: bool = True) -> Motions:
+def motions_of(linear: Linearisation, definite: bool) -> Motions:
     """The motions of a linearisation; `definite`: assume that the mass matrix is positive definite."""
     if not linear.kind.conservative:
         return _judged(linear, _general(linear))

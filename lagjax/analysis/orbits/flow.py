@@ -217,10 +217,10 @@ class Flow(eqx.Module):
         return jnp.concatenate([path[::substeps], last[None]])
 
 
-def flow_of(model: Model, rtol, rows=None, in_a_loop=True) -> Flow:
-    """The flow of a system; `rows` come from `independent_rows_of`, by default all."""
-    rtol, rows = jnp.asarray(rtol, model.form.dtype), all_rows(model) if rows is None else rows
-    return Flow(with_first_order(model), rtol, rows, in_a_loop)
+def flow_of(model: Model, rtol, rows, in_a_loop=True) -> Flow:
+    """The flow of a system; `rows` come from `independent_rows_of`; None: all, of positions and of velocities."""
+    rows = tuple(range(int(model.holonomic.sum()) + model.m)) if rows is None else rows
+    return Flow(with_first_order(model), jnp.asarray(rtol, model.form.dtype), rows, in_a_loop)
 
 
 def scale_of(z, period):
@@ -255,11 +255,6 @@ def independent_rows_of(model: Model, s: coordinates.State) -> tuple[int, ...] |
 @compiled
 def _normals(model: Model, s):
     return jax.jacfwd(lambda z: _residual(model, s.t, z))(jnp.concatenate(model.vectors(s.q, s.v)))
-
-
-def all_rows(model: Model) -> tuple[int, ...]:
-    """The indices of all constraint equations, of positions and of velocities."""
-    return tuple(range(int(model.holonomic.sum()) + model.m))
 
 
 def _residual(model: Model, t, z):

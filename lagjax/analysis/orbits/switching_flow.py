@@ -165,7 +165,7 @@ def _pushed(
     return jax.vmap(along, (1, 0, 0), (None, 1, None))(moved, later, changes)
 
 
-def any_flow(system: System | Hybrid, s: State, rtol, rows=None, in_a_loop=True) -> Flow | SwitchingFlow:
+def any_flow(system: System | Hybrid, s: State, rtol, rows, in_a_loop=True) -> Flow | SwitchingFlow:
     """The flow of a prepared system for states like s; `rows` as for `flow_of`."""
     flow = flow_of(model_of(system.first_phase, *s), rtol, rows, in_a_loop)
     return SwitchingFlow(system, flow) if system.in_phases else flow

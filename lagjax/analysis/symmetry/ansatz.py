@@ -47,7 +47,7 @@ def motions(q: PyTree) -> Basis:
     all_points, n = points(q), len(coordinates.names(q))
     elements = [*_shifts(q, all_points, n), _element(TIME, "time", n, clock=-1.0), *_rotations(all_points, n)]
     elements += [
-        _element(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and _is_shift(e)
+        _element(f"t {e.name}", "boost", n, drift=e.shift) for e in elements if e.kind == "space" and e.shift.any()
     ]
     if n > EACH_UP_TO:
         elements = [e for e in elements if e.kind != "boost" or e.name.startswith("t P_")]
@@ -95,10 +95,6 @@ def _element(name: str, kind, n, shift=None, matrix=None, drift=None, clock=0.0,
     matrix = np.zeros((n, n)) if matrix is None else matrix
     shift, drift = (zero if x is None else x for x in (shift, drift))
     return Element(name, kind, shift, matrix, drift, clock, clock_rate)
-
-
-def _is_shift(element):
-    return bool(np.any(element.shift != 0))
 
 
 def _ones_at(places, n):

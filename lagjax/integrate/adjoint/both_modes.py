@@ -52,7 +52,7 @@ from lagjax.jaxtools import (
 PUSH_UP_TO = 24
 
 
-def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool = True) -> PyTree:
+def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool) -> PyTree:
     """Return the result of `solve(x, fixed, adjoint, differentiated)`, differentiable in both modes in `x`.
 
     `solve` returns its result and a record of the motion, to be used by a later `Replay`, or None if the adjoint is not

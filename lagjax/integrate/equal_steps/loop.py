@@ -1,4 +1,4 @@
-"""The steps of a motion, all of one length between two outputs, or following a pace (`pace.py`).
+"""The steps of a motion, all of one length between two outputs, or following a pace (`pace.py`); and for which systems.
 
 An interval between two outputs is divided into the fewest equal steps that are no longer than `dt0`. Only outputs are
 kept. In reverse mode an interval is run again, from the state at its start, with the states of some of its steps.
@@ -21,6 +21,7 @@ from lagjax.integrate.equal_steps.rattle_step import RattleStep
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
 from lagjax.integrate.settings import Settings
 from lagjax.jaxtools import one_function, where
+from lagjax.mechanics import sees_velocities, structure, with_first_order
 from lagjax.numerics import EqualSteps, Gauss, Splitting, tableau
 from lagjax.system import Model
 
@@ -151,3 +152,44 @@ def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, dif
         return SplittingStep.of(model, method.order, t, x, u)
     assert isinstance(method, Gauss)
     return GaussStep(model, tableau(method.stages), method.newton, differentiated)
+
+
+def check_can_be_stepped(method: EqualSteps, model: Model):
+    """Raise unless the method is made for systems like this one."""
+    first = with_first_order(model).form.first_order
+    if first is not None and isinstance(method, Splitting):
+        names = ", ".join(f"'{name}'" for name, is_first in zip(model.names, first.mask(model.n)) if is_first)
+        raise ValueError(
+            f"lj.{method.label} steps coordinates with a mass, and {names} have none: they are of first order.\n"
+            "Fix: method=lj.Gauss(3)."
+        )
+    if model.reacts:
+        raise ValueError(f"lj.{method.label} does not solve for forces that take multipliers.\nFix: leave method out.")
+    if isinstance(method, Splitting):
+        _check_can_be_split(model)
+
+
+def is_suited(method: EqualSteps, model: Model) -> bool:
+    """Whether the method is made for systems like this one."""
+    try:
+        check_can_be_stepped(method, model)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_can_be_split(model: Model):
+    """Raise unless L = T(v) - V(q), forces do not depend on velocities, and constraints restrict positions."""
+    found = structure(model)
+    depends = "" if found is None else ", ".join(found.mass_depends_on)
+    rolling = [f"'{residual.name}'" for residual in model.form.residuals if not residual.of_positions]
+    if rolling or depends or sees_velocities(model):
+        why = "they do"
+        if rolling or depends:
+            why = f"{', '.join(rolling)} restricts velocities" if rolling else f"the mass matrix depends on {depends}"
+        raise ValueError(
+            "lj.Splitting is for L = T(v) - V(q) with a constant mass matrix, forces that do not depend on velocities "
+            f"and constraints on positions, and {why}.\n"
+            "Usual cause: polar coordinates, joint angles, friction, a magnetic field, a rotating frame, rolling.\n"
+            "Fix: method=lj.Gauss(3), which takes any L."
+        )

@@ -26,7 +26,7 @@ class SplitWay(NamedTuple):
 
 
 class SplittingStep(NamedTuple):
-    """Steps of a model whose mass matrix is constant, with its inverse; `suits.py` says whether it is one."""
+    """Steps of a model whose mass matrix is constant, with its inverse."""
 
     model: Model
     order: int

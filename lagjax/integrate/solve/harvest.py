@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.settings import PATIENCE
 from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import (
@@ -131,6 +132,28 @@ def watched(function: Callable, *args) -> tuple[ClosedJaxpr, PyTree]:
             with REGULAR_FIRST(False):
                 program = jax.make_jaxpr(of_leaves)(*leaves)
     return program, rest[-1]
+
+
+def in_turn(function: Callable, *args) -> PyTree:
+    """`function(*args)`; on a CPU lanes of a `vmap` run one after the other, which compiles once and wastes no steps.
+
+    Motions that a search tries do not report to a surrounding sweep.
+
+    >>> print(jax.vmap(lambda x: in_turn(jnp.sqrt, x))(jnp.array([1.0, 4.0])))
+    [1. 2.]
+    """
+    live, static = eqx.partition(args, eqx.is_array)
+    rest = []
+
+    def run(live: PyTree):
+        with WATCHED(False), PATIENCE(None):
+            found, others = eqx.partition(function(*eqx.combine(live, static)), eqx.is_array)
+        rest.append(others)
+        return found
+
+    if jax.default_backend() == "cpu":
+        run = jax.custom_batching.sequential_vmap(run)
+    return eqx.combine(run(jax.tree.map(jnp.asarray, live)), rest[-1])
 
 
 _has_report = anywhere(lambda equation: equation.primitive is _report_p)

@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.display import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
-from lagjax.integrate.equal_steps.suits import check_can_be_stepped
+from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings

@@ -236,7 +236,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     )  # fmt: skip
 
 
-def switches_before_any(hybrid: Hybrid, q: PyTree, v: PyTree, laws: Any = None) -> Switches:
+def switches_before_any(hybrid: Hybrid, q: PyTree, v: PyTree, laws: Any) -> Switches:
     """The switches of a motion before the first one; `laws`: those of elements, if there are any."""
     room = hybrid.most_switches
     none, (of_q, of_v) = jnp.full(room, NO_PHASE, jnp.int32), unknown((q, v), room)

@@ -1,14 +1,15 @@
-"""What a film or a figure shows of a motion: points that a function gives, and shapes fixed in bodies."""
+"""What a picture of a state, a film or a figure of a motion shows: points that a function gives, and shapes fixed in
+bodies."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import ArrayLike, PyTree
 
-from lagjax.display import Drawing, InSpace, Shape, poses_in_q
-from lagjax.system import Call, Traced, UnknownSystem, check_arguments
+from lagjax.display import Drawing, InSpace, Shape, Still, poses_in_q
+from lagjax.system import Call, Traced, UnknownSystem, check_arguments, check_system, coordinates, is_traced
 
 # States whose poses are computed together.
 BLOCK = 256
@@ -169,3 +170,49 @@ def _points(name: str, value):
 
 def _of(name: str):
     return f" for '{name}'" if name else ""
+
+
+def draw(
+    system: Any, q: PyTree, params: PyTree = None, what: Any = None, *, t: ArrayLike = 0.0, frames: bool = False,
+    view: tuple[float, float] = (-60.0, 22.0),
+) -> Still:  # fmt: skip
+    """Draw one state, before anything moves: bodies and joints, or points, in the plane or in space.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + 9.81 * jnp.cos(q))
+    >>> draw(pendulum, 0.3, what=lambda t, q, params: {"rod": [(0.0, 0.0), (jnp.sin(q), -jnp.cos(q))]})
+    Picture of 'rod': shown in a notebook, and with .save("picture.html") in a browser; .figure() is for papers
+
+    **Arguments:** `system`, of which `q` is a state, `params` its parameters.
+
+    - `what`: as in `traj.animate`, a function `positions(t, q, params)`, shapes, or a `lj.Drawing`; nothing for systems
+      of `lj.multibody`, `lj.Tree` and models from files.
+    - `t`: the time that `positions` is given.
+    - `frames`: whether each body's axes are drawn from its centre of mass (x red, y green, z blue), and the axes of
+      joints in black.
+    - `view`: from where it is seen first, in space: azimuth and elevation of the eye, in degrees.
+
+    Two points that a joint should hold together and that are apart in this state are joined by a magenta line, and
+    `print` says how far they are apart: so a drawing is checked before `lj.consistent_state` mends it.
+
+    **Returns:** a `lj.Still`.
+
+    **Raises:** `TypeError` for what cannot be drawn, and inside of a JAX transformation; `ValueError` for positions
+    that are not points, and bodies whose pose is not known.
+    """
+    check_system(system, phases=True, elements=True)
+    if is_traced((q, params, t)):
+        raise TypeError(
+            "a picture needs numbers, and this state is being traced.\n"
+            "Usual cause: lj.draw inside of jax.jit, jax.vmap or jax.grad.\nFix: draw what the function returns."
+        )
+    given = coordinates.state(t, q, q, params)
+    return still(subject_of(what, system, given.params), given.t, given.q, frames, view)
+
+
+def still(subject: Subject, t: ArrayLike, q: PyTree, frames: bool, view: tuple[float, float]) -> Still:
+    """A subject at one state."""
+    now, at = np.asarray(t, float)[None], jax.tree.map(lambda x: np.asarray(x)[None], q)
+    found = subject.frames(now, at)
+    return Still(found.finished(frames) if isinstance(found, InSpace) else found, view)

@@ -66,7 +66,7 @@ def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
     return found
 
 
-def dims_of(trajectory, dims: Sequence[str] | None = None) -> tuple[str, ...]:
+def dims_of(trajectory, dims: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of the axes of a batch."""
     count = np.ndim(trajectory.t) - 1
     if dims is None:
