@@ -22,7 +22,6 @@ from lagjax.mechanics.saddle_point import SINGULAR_BELOW, examined, solve_saddle
 from lagjax.mechanics.scalar_equations import has_networks
 from lagjax.mechanics.structure import (
     Structure,
-    angles,
     are_angles,
     conserved_momenta,
     conserves_jacobi_integral,

@@ -122,34 +122,22 @@ def invariance(model: Model) -> Invariance:
     """What is known to change nothing; of a large system less is known."""
 
     def values(model: Model, t: Array, q: PyTree, v: PyTree):
-        at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
-        momentum = jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
-        return [f(t, q, v, model.params) for f in functions_of(model)], momentum
+        return [f(t, q, v, model.params) for f in functions_of(model)], _momentum_at_rest(model, t, q, v)
 
     try:
         if model.n + model.m > UP_TO:
             raise TooLong
         numbers = Numbers(values, in_numbers(model), most=WRITTEN)
     except TooLong:
-        return Invariance(_unseen_leaves(model), is_autonomous(model), False)
+        # By whole leaves of q.
+        unseen = np.repeat([kinds == {Depends.NOT} for kinds in _by_leaf(model)], model.form.sizes)
+        return Invariance(tuple(unseen.tolist()), is_autonomous(model), False)
     jaxpr, (t, *state) = numbers.program.jaxpr, numbers.state_variables
     return Invariance(
         tuple(not depends(jaxpr, [y]) for y in state[: model.n]),
         not depends(jaxpr, [t]),
         all(is_zero(x) for x in jaxpr.outvars[-model.n :]),
     )
-
-
-def _unseen_leaves(model: Model) -> tuple[bool, ...]:
-    """The coordinates that are known to occur nowhere, by whole leaves of q."""
-    unseen: list[bool] = []
-    for i, shape in enumerate(model.form.shapes):
-        leaf = slice(i, i + 1)
-        kinds = {
-            _dependence(f, model, lambda args, leaf=leaf: jtu.tree_leaves(args[1])[leaf]) for f in functions_of(model)
-        }
-        unseen += [kinds == {Depends.NOT}] * int(np.prod(shape))
-    return tuple(unseen)
 
 
 def is_diagonal(model: Model) -> bool:
@@ -227,22 +215,19 @@ class Depends(IntEnum):
     OTHERWISE = 3
 
 
-def angles(model: Model) -> PyTree[bool]:
-    """Which leaves of q are angles, in the structure of q."""
-    found = []
-    for i in range(len(model.form.shapes)):
-        leaf = slice(i, i + 1)
-        kinds = {
-            _dependence(f, model, lambda args, leaf=leaf: jtu.tree_leaves(args[1])[leaf]) for f in functions_of(model)
-        }
-        found.append(kinds - {Depends.NOT} == {Depends.PERIODICALLY})
-    return jtu.tree_unflatten(model.form.structure, found)
-
-
 def are_angles(model: Model) -> np.ndarray:
-    """Which coordinates are angles, (n,) booleans."""
-    leaves = zip(jtu.tree_leaves(angles(model)), model.form.shapes)
-    return np.array([angle for angle, shape in leaves for _ in range(int(np.prod(shape)))], bool)
+    """Which coordinates are angles, (n,) booleans, by whole leaves of q."""
+    leaves = [kinds - {Depends.NOT} == {Depends.PERIODICALLY} for kinds in _by_leaf(model)]
+    return np.repeat(leaves, model.form.sizes)
+
+
+def _by_leaf(model: Model) -> list[set[Depends]]:
+    """How the functions of the motion depend on each leaf of q."""
+
+    def on_leaf(i: int) -> set[Depends]:
+        return {_dependence(f, model, lambda args: jtu.tree_leaves(args[1])[i : i + 1]) for f in functions_of(model)}
+
+    return [on_leaf(i) for i in range(len(model.form.shapes))]
 
 
 def conserved_momenta(model: Model) -> list[str]:
@@ -297,7 +282,7 @@ def _pushes(model: Model, name: str) -> bool:
 
 def _contains(function: Callable, name: str, model: Model, argument=1) -> bool:
     """Whether a function depends on a coordinate, or with `argument` 2 on a velocity; also True if not known."""
-    sizes, known = [int(np.prod(shape)) for shape in model.form.shapes], model.names
+    sizes, known = model.form.sizes, model.names
     leaf = int(np.searchsorted(np.cumsum(sizes), known.index(name), side="right"))
     if sizes[leaf] == 1:
         return (

@@ -63,9 +63,14 @@ class Form(NamedTuple):
     first_order: FirstOrder | None = None
 
     @property
+    def sizes(self) -> np.ndarray:
+        """How many coordinates each leaf of q has."""
+        return np.array([np.prod(shape) for shape in self.shapes], int)
+
+    @property
     def n(self) -> int:
         """The number of coordinates."""
-        return sum(int(np.prod(shape)) for shape in self.shapes)
+        return int(self.sizes.sum())
 
     @property
     def m(self) -> int:
@@ -83,12 +88,11 @@ class Form(NamedTuple):
         """A vector (..., n) in the structure of q."""
         if len(self.shapes) == 1:
             return jtu.tree_unflatten(self.structure, [x.reshape(x.shape[:-1] + self.shapes[0])])
-        sizes = [int(np.prod(shape)) for shape in self.shapes]
         if isinstance(x, np.ndarray):
-            parts = np.split(x, np.cumsum(sizes)[:-1], -1)
+            parts = np.split(x, np.cumsum(self.sizes)[:-1], -1)
         else:
             # One operation, whose transpose is one: slices become paddings and sums.
-            parts = lax.split(x, sizes, x.ndim - 1)
+            parts = lax.split(x, self.sizes.tolist(), x.ndim - 1)
         leaves = [part.reshape(x.shape[:-1] + shape) for part, shape in zip(parts, self.shapes)]
         return jtu.tree_unflatten(self.structure, leaves)
 

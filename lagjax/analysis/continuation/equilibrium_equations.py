@@ -165,10 +165,7 @@ def dynamic(frame: Frame, z):
     return stiffness, damping, mass
 
 
-@compiled
-def dynamic_at(frame: Frame, z):
-    """`dynamic`, compiled."""
-    return dynamic(frame, z)
+dynamic_at = compiled(dynamic)
 
 
 def extended(kind: str, frame: Frame, big, guide):

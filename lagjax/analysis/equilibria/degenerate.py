@@ -100,12 +100,13 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
     damping, mass = (np.asarray(x) for x in _velocity_terms(steady, y.astype(dtype), jacobian))
     phi, psi = (bordered.columns * bordered.right[:, 0])[:n], (bordered.left[:, 0] / bordered.rows)[:n]
     inertia, friction = float(psi @ mass @ phi), float(psi @ damping @ phi)
-    scale = np.sqrt(np.abs(psi) @ np.abs(mass) @ np.abs(phi)) * np.max(np.abs(roots), initial=0.0, where=_known(roots))
+    largest = np.max(np.abs(roots), initial=0.0, where=np.isfinite(roots))
+    scale = np.sqrt(np.abs(psi) @ np.abs(mass) @ np.abs(phi)) * largest
     rubs = abs(friction) > 1e-8 * max(np.abs(psi) @ np.abs(damping) @ np.abs(phi), scale * abs(inertia) ** 0.5 * 1e-4)
     pushes_back = ahead.sign > 0 > behind.sign
     if np.sign(friction if rubs else inertia) < 0:
         pushes_back = ahead.sign < 0 < behind.sign
-    rest = np.sort_complex(roots[_known(roots)])
+    rest = np.sort_complex(roots[np.isfinite(roots)])
     rest = rest[np.argsort(np.abs(rest), kind="stable")]
     # Without the roots of the zero modes, of unseen coordinates, and of other speeds along the symmetries.
     rest = rest[min(rest.size, (1 if rubs else 2) + 2 * (zeros - 1 + int(np.sum(unseen))) + k) :]
@@ -132,7 +133,7 @@ def decide(steady: Steady, y, size: float, roots, unseen: np.ndarray) -> Decisio
 
 def without_zeros(roots: np.ndarray, decision: Decision) -> np.ndarray:
     """The characteristic roots, with that of the zero mode nearest to zero set to zero."""
-    known = np.flatnonzero(_known(roots))
+    known = np.flatnonzero(np.isfinite(roots))
     order = known[np.argsort(np.abs(roots[known]), kind="stable")]
     cleaned, largest = np.array(roots), np.max(np.abs(roots[known]), initial=0.0)
     tiny = order[: 2 * decision.zero_modes]
@@ -142,10 +143,6 @@ def without_zeros(roots: np.ndarray, decision: Decision) -> np.ndarray:
         small = np.array([True, False])
     cleaned[tiny[small]] = 0.0
     return cleaned
-
-
-def _known(roots):
-    return np.isfinite(roots)
 
 
 def _is_flat(bordered) -> bool:

@@ -35,7 +35,7 @@ from lagjax.analysis.equilibria.result import (
     merged,
 )
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
-from lagjax.mechanics import angles, invariance, listed, structure
+from lagjax.mechanics import are_angles, invariance, listed, structure
 from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
@@ -250,7 +250,7 @@ def equilibria(
         return searched(steady, q, v, lasting, expected, True)
 
     rows, radii = _decided(steady, rows, q, lasting, unseen, search)
-    return merged(as_table(rows), angles(model), radii)
+    return merged(as_table(rows), are_angles(model), radii)
 
 
 def _decided(

@@ -115,15 +115,14 @@ class Equilibria(eqx.Module):
         return by_line("\n".join(_lines(self)))
 
 
-def merged(rows: Equilibria, is_angle: PyTree[bool], radii: np.ndarray) -> Equilibria:
+def merged(rows: Equilibria, angle: np.ndarray, radii: np.ndarray) -> Equilibria:
     """Merge duplicates; equilibria keep the order in which starts led to them.
 
-    `radii` (S,): how far from each other searches may end at the same multiple root; 0 at simple ones.
+    `angle` (n,): which coordinates are angles. `radii` (S,): how far from each other searches may end at the same
+    multiple root; 0 at simple ones.
     """
     found_rows = np.flatnonzero(np.asarray(rows.found))
-    first = jax.tree.map(lambda x: x[0], rows.q)
-    angle = np.concatenate([np.full(np.size(x), yes) for yes, x in zip(*map(jax.tree.leaves, (is_angle, first)))])
-    angle[list(rows.symmetries.places)] = False
+    angle = angle & ~np.isin(np.arange(angle.size), rows.symmetries.places)
     x, u = _columns(rows.q), _columns(rows.v)
     x[:, list(rows.symmetries.places)] = 0.0
     other = np.concatenate([u, _columns(rows.multipliers)], axis=1) if rows.multipliers else u

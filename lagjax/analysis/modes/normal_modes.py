@@ -533,9 +533,7 @@ def _by_first_term(system, linearisation) -> int:
     return degenerate.decide(steady, y, float(np.max(np.abs(x), initial=0.0)), roots, unseen).verdict
 
 
-@compiled
-def _motions(linearisation: Linearisation, definite: bool) -> Motions:
-    return motions_of(linearisation, definite)
+_motions = compiled(motions_of)
 
 
 def _collected(linearisation, motions: Motions, zero_words=()) -> NormalModes:

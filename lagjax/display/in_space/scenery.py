@@ -58,18 +58,15 @@ class InSpace(NamedTuple):
 
     def _faces_of(self, shape: Shape) -> Shape:
         """The part of a surface f = 0 about everything else, as that is seen from its body."""
-        anchor, all_frames = shape.anchors[0], [*self.points.values()]
-        all_frames += [x for other in self.shapes for x in self.corners(other)]
+        anchor = shape.anchors[0]
         axes = np.asarray(anchor.axes)
         found = []
-        for x in all_frames:
+        for x in self._everything():
             if anchor.body is not None:
                 pose = self.poses[anchor.body]
                 x = (x - pose[..., None, :3]) @ rotations(pose[..., 3:])
-            found.append(((x - anchor.point) @ axes.T).reshape(-1, 3))
-        x = np.concatenate(found)
-        x = x[np.isfinite(x).all(axis=1)]
-        low, high = x.min(axis=0), x.max(axis=0)
+            found.append((x - anchor.point) @ axes.T)
+        low, high = _box(found)
         more = BEYOND * np.max(high - low)
         assert shape.level is not None
         return Shape("solid", shape.anchors, level_set(shape.level, low - more, high + more), np.ones(3), shape.color)
@@ -85,13 +82,10 @@ class InSpace(NamedTuple):
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and the largest coordinates of everything that is drawn, (3,) each."""
-        found = [x.reshape(-1, 3) for x in self.points.values()]
-        for shape in self.shapes:
-            for x in self.corners(shape):
-                found.append(x.reshape(-1, 3))
-        x = np.concatenate(found)
-        x = x[np.isfinite(x).all(axis=1)]
-        return x.min(axis=0), x.max(axis=0)
+        return _box(self._everything())
+
+    def _everything(self) -> list[np.ndarray]:
+        return [*self.points.values(), *(x for shape in self.shapes for x in self.corners(shape))]
 
     def corners(self, shape: Shape) -> list[np.ndarray]:
         """The vertices of a solid, or the anchors of anything else, in space, (..., F, k, 3)."""
@@ -139,6 +133,13 @@ def along(d: np.ndarray) -> np.ndarray:
     first = near - np.sum(near * last, axis=-1, keepdims=True) * last
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(last, first), last], axis=-2)
+
+
+def _box(places: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest coordinates, (3,) each, of what is finite."""
+    x = np.concatenate([x.reshape(-1, 3) for x in places])
+    x = x[np.isfinite(x).all(axis=1)]
+    return x.min(axis=0), x.max(axis=0)
 
 
 def _mark(start: Anchor, way: np.ndarray, color: str) -> Shape:

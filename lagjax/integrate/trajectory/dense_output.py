@@ -169,9 +169,7 @@ def _traced(trajectory, t):
     return jax.vmap(lambda lane: _traced(lane, t))(trajectory)
 
 
-@compiled
-def _of_batch(trajectory, t):
-    return _traced(trajectory, t)
+_of_batch = compiled(_traced)
 
 
 def _at_one(trajectory, t):

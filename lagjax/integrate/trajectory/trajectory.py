@@ -312,14 +312,7 @@ def worst_drift(model: Model, t: Array, q: PyTree, v: PyTree):
     return jnp.nanmax(jnp.abs(h - h[0])) / jnp.where(largest > 0, largest, 1.0)
 
 
-@compiled
-def _worst_drift(model: Model, t: Array, q: PyTree, v: PyTree):
-    return worst_drift(model, t, q, v)
-
-
-@compiled
-def _worst_residual(model: Model, t: Array, q: PyTree, v: PyTree):
-    return worst_residual(model, t, q, v)
+_worst_drift, _worst_residual = compiled(worst_drift), compiled(worst_residual)
 
 
 def _lines(traj) -> list[str]:
