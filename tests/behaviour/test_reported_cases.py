@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 import lagjax as lj
 
@@ -234,27 +233,6 @@ def test_a_massless_point_between_springs():
     balanced = lj.Holonomic(lambda t, q, p: 6.0 * (q["x"] - q["s"]) - 3.0 * q["s"])
     motion = lj.integrate(lj.System(springs, {"balanced": balanced}), *BETWEEN, ts=ONE)
     np.testing.assert_allclose(motion.q["x"][-1], np.cos(np.sqrt(2.0)), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_massless_point_on_a_damper():
-    """2 s' = 6 (x - s) - 3 s: a linear system's exponential. Twin: without the damper."""
-    damped = lj.System(springs, dissipation=lambda t, q, v, p: v["s"] ** 2)
-    motion = lj.integrate(damped, *BETWEEN, ts=ONE)
-    right = expm(np.array([[0.0, 1.0, 0.0], [-6.0, 0.0, 6.0], [3.0, 0.0, -4.5]])) @ [1.0, 0.0, 2 / 3]
-    np.testing.assert_allclose([motion.q["x"][-1], motion.q["s"][-1]], right[[0, 2]], rtol=1e-9)
-    assert abs(right[0] - np.cos(np.sqrt(2.0))) > 1e-2
-
-
-@pytest.mark.slow
-def test_a_running_cost_ends_a_motion():
-    """c' = v² of a fall is g² t³/3, which is 1 at t = (3/g²)^(1/3), with the derivative -2 t/(3 g)."""
-    cost = {"c": lambda t, q, v, g: v["x"] ** 2}
-    fall = lj.System(lambda t, q, v, g: 0.5 * v["x"] ** 2 + g * q["x"], states=cost)
-    at, spent = {"x": 0.0, "c": 0.0}, {"spent": lj.Crossing(lambda t, q, v, g: q["c"] - 1.0)}
-    when = lambda g: lj.integrate(fall, at, {"x": 0.0}, g, ts=5 * ONE, events=spent).end.t
-    right = (3 / 9.81**2) ** (1 / 3)
-    np.testing.assert_allclose(jax.value_and_grad(when)(9.81), [right, -2 * right / (3 * 9.81)], rtol=1e-8)
 
 
 STIFF, VISCOUS, SLIDING, HOLDING, STRIBECK, SPRING, PULLED = 1e5, 0.4, 1.0, 1.5, 1e-3, 2.0, 0.1

@@ -55,13 +55,12 @@ OTHER = PARAMS | {"g": 9.0}
 LOW = {"low": lj.Crossing(lambda t, q, v, params: q)}
 # The function and two calls of it.
 CASES = {
-    "angle": (lambda *state: swing(*state), (1.0, 0.0, PARAMS), (1.0, 0.5, OTHER)),
     "rod": (
         lambda q, v, params: lj.integrate(rod_pendulum, q, v, params, ts=TS),
         (*HORIZONTAL, PARAMS),
         ({"x": 0.75, "y": -1.0}, HORIZONTAL[1], PARAMS),
     ),
-    "event": (lambda *state: swing(*state, events=LOW), (1.0, 0.0, PARAMS), (0.5, 0.0, PARAMS)),
+    "event": (lambda *state: swing(*state, events=LOW), (1.0, 0.0, PARAMS), (0.5, 0.5, OTHER)),
     "slope": (slope, (1.0, PARAMS), (1.0, OTHER)),
 }
 
