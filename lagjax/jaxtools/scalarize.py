@@ -3,7 +3,8 @@
 The mechanics is written with vectors and matrices. For a few coordinates these are mostly zeros and ones: the rows of a
 unit matrix along which a momentum is differentiated, a diagonal mass matrix. `written_out` splits a program into
 operations on single numbers: products with a known zero are dropped, products with a known one are not computed, and
-neither are unused numbers. XLA keeps the rest in registers.
+neither are unused numbers. What is the same operation on the same numbers is written once, as are numbers that differ
+by their sign: of a rattleback's 4,100 operations that leaves 2,700. XLA keeps the rest in registers.
 
 A product with a known zero is zero, even if the other factor turns out to be infinity or NaN: so it is where a known
 zero is the derivative of what does not matter. Two exceptions keep the meaning of what the user writes: a factor that
@@ -12,9 +13,9 @@ is known to be infinity or NaN gives NaN; and in a program that asks whether a n
 more than `LARGE` entries are left unchanged.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -47,7 +48,8 @@ def written_out(closed: ClosedJaxpr, *args, most: float = math.inf) -> list:
     with np.errstate(all="ignore"):
         inputs = [_split(x) if _small(x.aval) else x for x in map(_Value, args)]
         ledger = _Ledger(most, not asks_for_nan(closed))
-        results = interpreted(closed, inputs, partial(_apply, closed.jaxpr, ledger), _constant, _is_plain_call)
+        rule = functools.partial(_apply, closed.jaxpr, ledger)
+        results = interpreted(closed, inputs, rule, _constant, _is_plain_call)
     return [_joined(x, aval) for x, aval in zip(results, closed.out_avals)]
 
 
@@ -64,18 +66,96 @@ def asks_for_nan(closed: ClosedJaxpr) -> bool:
     return any(asks(equation) for equation in equations(closed.jaxpr))
 
 
+# Of these the order of the operands does not matter.
+COMMUTE = {"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or", "xor"}
+
+
 class _Ledger:
-    """The sines and cosines computed so far by their argument, how many operations are still allowed, and whether
-    products with known zeros are dropped."""
+    """What has been written so far: an operation on the same numbers is written once, and a sign is moved outwards.
+
+    `most`: how many operations are allowed. `drops_zeros`: whether products with known zeros are dropped.
+    """
 
     def __init__(self, most, drops_zeros: bool = True):
-        self.pairs, self.left, self.drops_zeros = {}, most, drops_zeros
+        self.left, self.drops_zeros = most, drops_zeros
+        self.results: dict[tuple, tuple] = {}
+        self.negated: dict[int, Any] = {}
 
     def count(self, entries: Sequence):
         """Count the entries that are not known numbers."""
         self.left -= sum(not isinstance(x, np.generic) for x in entries)
         if self.left < 0:
             raise TooLong
+
+    def once(self, name: str, operation: Callable, *x, **params):
+        """The result of an operation: the earlier one if it has been applied to the same numbers."""
+        of = [(y.dtype, y.tobytes()) if isinstance(y, np.generic) else id(y) for y in x]
+        key = name, frozenset(of) if name in COMMUTE else tuple(of), tuple(params.items())
+        if key not in self.results:
+            # With the operands, so that none is deleted and another number takes its `id`.
+            self.results[key] = operation(*x, **params), x
+        return self.results[key][0]
+
+    def negative(self, x):
+        """-x."""
+        if isinstance(x, np.generic):
+            return np.negative(x)
+        if id(x) in self.negated:
+            return self.negated[id(x)]
+        result = self.once("neg", jax.lax.neg, x)
+        self.negated[id(result)] = x
+        return result
+
+    def is_negative(self, x) -> bool:
+        """Whether x was written as the negative of another number."""
+        return id(x) in self.negated
+
+    def add(self, x, y):
+        """x + y."""
+        if _is_known(x, 0):
+            return y
+        if _is_known(y, 0):
+            return x
+        if isinstance(x, np.generic) and isinstance(y, np.generic):
+            return np.add(x, y)
+        if self.is_negative(y):
+            return self.subtract(x, self.negative(y))
+        if self.is_negative(x):
+            return self.subtract(y, self.negative(x))
+        return self.once("add", jax.lax.add, *_arrays(x, y))
+
+    def subtract(self, x, y):
+        """x - y."""
+        if _is_known(y, 0):
+            return x
+        if _is_known(x, 0):
+            return self.negative(y)
+        if isinstance(x, np.generic) and isinstance(y, np.generic):
+            return np.subtract(x, y)
+        if self.is_negative(y):
+            return self.add(x, self.negative(y))
+        return self.once("sub", jax.lax.sub, *_arrays(x, y))
+
+    def multiply(self, x, y):
+        """x y."""
+        for a, b in ((x, y), (y, x)):
+            # A known factor may be infinite: the product is computed below.
+            if _is_known(a, 0) and self.drops_zeros and not isinstance(b, np.generic):
+                return a
+            if _is_known(a, 1):
+                return b
+            if _is_known(a, -1):
+                return self.negative(b)
+        if isinstance(x, np.generic) and isinstance(y, np.generic):
+            return np.multiply(x, y)
+        for a, b in ((x, y), (y, x)):
+            if self.is_negative(a):
+                return self.negative(self.multiply(self.negative(a), b))
+        return self.once("mul", jax.lax.mul, *_arrays(x, y))
+
+    def total(self, entries: Sequence, zero):
+        """The sum of the entries."""
+        return functools.reduce(self.add, entries, zero)
 
 
 class _Value:
@@ -136,21 +216,13 @@ def _apply(jaxpr: Jaxpr, ledger, equation: JaxprEqn, operands: Sequence):
     splittable = all(isinstance(x, np.ndarray) for x in operands) and all(_small(x.aval) for x in equation.outvars)
     if splittable and name in ELEMENTWISE:
         return [_elementwise(equation, operands, ledger)]
-    if splittable and name == "dot_general":
-        return _product(params, equation.outvars, *operands, ledger.drops_zeros)
-    if splittable and name in MOVES:
-        found = MOVES[name](params, equation.outvars, *operands)
+    if splittable and name in SUMS | MOVES:
+        write = functools.partial(SUMS[name], ledger) if name in SUMS else MOVES[name]
+        found = write(params, equation.outvars, *operands)
         if found is not None:
             return found
     results = applied(jaxpr, equation, [_joined(x, v.aval) for x, v in zip(operands, equation.invars)])
     return [_split(x) if _small(v.aval) else x for x, v in zip(map(_Value, results), equation.outvars)]
-
-
-def _pair(x, pairs):
-    """Sine and cosine of a number, computed together and only once."""
-    if id(x) not in pairs:
-        pairs[id(x)] = (x, *sincos_in_lanes(x))
-    return pairs[id(x)][1:]
 
 
 def _elementwise(equation, operands: Sequence, ledger):
@@ -170,15 +242,13 @@ def _simplified(equation: JaxprEqn, dtype: DTypeLike, ledger, *x):
     """The result of a primitive for one number, simplified if operands are known."""
     name = equation.primitive.name
     if name in ("add", "add_any"):
-        return _add(*x)
-    if name == "sub" and _is_known(x[1], 0):
-        return x[0]
-    if name == "sub" and _is_known(x[0], 0):
-        return _negative(x[1])
+        return ledger.add(*x)
+    if name == "sub":
+        return ledger.subtract(*x)
     if name == "mul":
-        return _multiply(*x, ledger.drops_zeros)
+        return ledger.multiply(*x)
     if name == "neg":
-        return _negative(x[0])
+        return ledger.negative(x[0])
     if name == "div" and _is_known(x[1], 1):
         return x[0]
     if name == "div" and ledger.drops_zeros and _is_known(x[0], 0) and not isinstance(x[1], np.generic):
@@ -193,40 +263,12 @@ def _simplified(equation: JaxprEqn, dtype: DTypeLike, ledger, *x):
         if x[0].dtype == dtype and not getattr(x[0], "weak_type", False):
             return x[0]
     if name in ("sin", "cos") and not isinstance(x[0], np.generic):
-        return _pair(x[0], ledger.pairs)[name == "cos"]
+        return ledger.once("sincos", sincos_in_lanes, x[0])[name == "cos"]
     if name == "div" and jnp.issubdtype(dtype, jnp.floating) and all(isinstance(y, np.generic) for y in x):
         return np.divide(*x)
     if name in IN_NUMPY and all(isinstance(y, np.generic) for y in x):
         return np.asarray(IN_NUMPY[name](*x), dtype)[()]
-    return equation.primitive.bind(*x, **equation.params)
-
-
-def _add(x, y):
-    if _is_known(x, 0):
-        return y
-    if _is_known(y, 0):
-        return x
-    if isinstance(x, np.generic) and isinstance(y, np.generic):
-        return np.add(x, y)
-    return jax.lax.add(*_arrays(x, y))
-
-
-def _multiply(x, y, drops_zeros: bool):
-    for a, b in ((x, y), (y, x)):
-        # A known factor may be infinite: the product is computed below.
-        if _is_known(a, 0) and drops_zeros and not isinstance(b, np.generic):
-            return a
-        if _is_known(a, 1):
-            return b
-        if _is_known(a, -1):
-            return _negative(b)
-    if isinstance(x, np.generic) and isinstance(y, np.generic):
-        return np.multiply(x, y)
-    return jax.lax.mul(*_arrays(x, y))
-
-
-def _negative(x):
-    return np.negative(x) if isinstance(x, np.generic) else jax.lax.neg(x)
+    return ledger.once(name, equation.primitive.bind, *x, **equation.params)
 
 
 def _arrays(x, y):
@@ -239,13 +281,6 @@ def _converted(entries, dtype: DTypeLike):
         return x.astype(dtype) if isinstance(x, np.generic) else jax.lax.convert_element_type(x, dtype)
 
     return _filled(entries.shape, [x if x.dtype == dtype else one(x) for x in entries.reshape(-1)])
-
-
-def _total(entries: Sequence, zero):
-    total = zero
-    for entry in entries:
-        total = _add(total, entry)
-    return total
 
 
 def _zero(variables: Sequence):
@@ -282,27 +317,27 @@ def _padded(params: dict, variables: Sequence, x, filling):
     return [result]
 
 
-def _sum(params: dict, variables: Sequence, x):
+def _sum(ledger, params: dict, variables: Sequence, x):
     axes = params["axes"]
     kept = [i for i in range(x.ndim) if i not in axes]
     rows = x.transpose([*kept, *axes]).reshape([x.shape[i] for i in kept] + [-1])
     shape = rows.shape[:-1]
     rows = rows.reshape(-1, rows.shape[-1]) if rows.size else np.empty((int(np.prod(shape)), 0), object)
-    return [_filled(shape, [_total(row, _zero(variables)) for row in rows])]
+    return [_filled(shape, [ledger.total(row, _zero(variables)) for row in rows])]
 
 
-def _cumulative_sum(params: dict, variables: Sequence, x):
+def _cumulative_sum(ledger, params: dict, variables: Sequence, x):
     axis, result = params["axis"], x.copy()
     if params["reverse"]:
         return None
     result = np.moveaxis(result, axis, 0)
     for i in range(1, len(result)):
-        flat = [_add(a, b) for a, b in zip(result[i - 1].reshape(-1), result[i].reshape(-1))]
+        flat = [ledger.add(a, b) for a, b in zip(result[i - 1].reshape(-1), result[i].reshape(-1))]
         result[i] = _filled(result[i].shape, flat) if result[i : i + 1].ndim > 1 else flat[0]
     return [np.moveaxis(result, 0, axis)]
 
 
-def _product(params: dict, variables: Sequence, x, y, drops_zeros: bool):
+def _product(ledger, params: dict, variables: Sequence, x, y):
     (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
     free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
     free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
@@ -317,7 +352,7 @@ def _product(params: dict, variables: Sequence, x, y, drops_zeros: bool):
     y = y.transpose([*batch_y, *free_y, *contract_y]).reshape(batch, -1, inner)
     zero = _zero(variables)
     entries = [
-        _total([_multiply(p, q, drops_zeros) for p, q in zip(row, column)], zero)
+        ledger.total(map(ledger.multiply, row, column), zero)
         for rows, columns in zip(x, y)
         for row in rows
         for column in columns
@@ -341,15 +376,14 @@ def _counted(params: dict, variables: Sequence):
     return [_known(np.broadcast_to(np.arange(aval.shape[axis], dtype=aval.dtype).reshape(shape), aval.shape))]
 
 
+SUMS: dict[str, Callable] = {"cumsum": _cumulative_sum, "dot_general": _product, "reduce_sum": _sum}
 MOVES: dict[str, Callable] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda params, variables, *x: [np.concatenate(x, params["dimension"])],
     "copy": lambda params, variables, x: [x],
-    "cumsum": _cumulative_sum,
     "dynamic_slice": _dynamic_slice,
     "iota": _counted,
     "pad": _padded,
-    "reduce_sum": _sum,
     "reshape": lambda params, variables, x: [x.reshape(variables[0].aval.shape)],
     "rev": lambda params, variables, x: [np.flip(x, params["dimensions"])],
     "slice": _sliced,

@@ -23,6 +23,7 @@ from lagjax.jaxtools import (
     one_by_one,
     outputs_of,
     poisoned,
+    run,
     staged,
     varies,
     written_out,
@@ -122,7 +123,8 @@ class Numbers:
 
     def more(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """What else the function returns."""
-        return self.with_more_at(self.prepare(model), t, q, v)[1]
+        alone = outputs_of(self.program, range(self.shapes[0].num_leaves, len(self.program.out_avals)))
+        return jtu.tree_unflatten(self.shapes[1], run(alone, jtu.tree_leaves(eqx.filter((model, t, q, v), varies))))
 
     def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""

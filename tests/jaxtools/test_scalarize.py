@@ -74,6 +74,24 @@ def test_zeros_and_ones_leave_no_trace():
     assert full["mul"] == 12 and full["add"] == 9
 
 
+def test_the_same_is_written_once():
+    """x y, y x and -x (-y) are one product; twins: other operands, the other order of a quotient."""
+
+    def arithmetic(function):
+        counts = operations(numbers(function, X))
+        return {name: counts[name] for name in ("add", "sub", "mul", "div", "neg") if counts[name]}
+
+    same = lambda x: jnp.stack([x[0] * x[1], x[1] * x[0], -x[0] * -x[1], x[2] - x[0] * -x[1], -x[0] * x[1] + x[3]])
+    assert arithmetic(same) == {"mul": 1, "add": 1, "sub": 1}
+    np.testing.assert_array_equal(jaxpr_as_fun(numbers(same, X))(X)[0], same(X))
+    other = lambda x: jnp.stack([x[0] * x[1], x[0] * x[2], x[0] / x[1], x[1] / x[0], x[0] / x[1]])
+    assert arithmetic(other) == {"mul": 2, "div": 2}
+    # Not the same: a difference and its negative are zeros of different sign.
+    opposite = lambda x: jnp.stack([x[0] - x[1], x[1] - x[0], 0.0, 0.0, 0.0])
+    equal = jnp.ones(4)
+    np.testing.assert_array_equal(jnp.signbit(jaxpr_as_fun(numbers(opposite, equal))(equal)[0]), np.zeros(5, bool))
+
+
 def test_two_stages():
     """Operations independent of the second argument are computed first, including inverses of divisors."""
 
