@@ -90,6 +90,11 @@ class Program(NamedTuple):
         return of_status + sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(self.values))
 
 
+def is_motion(x: Any) -> bool:
+    """Whether it is a trajectory, which is not taken apart."""
+    return isinstance(x, Trajectory)
+
+
 def point_of(run: Callable) -> Callable:
     """A function of one point that returns (values, `Status`, settled); `reporting` explains `settled`.
 
@@ -109,11 +114,11 @@ def point_of(run: Callable) -> Callable:
 
         def masked(x: Any):
             # A trajectory records itself how far it got, and is NaN from there on.
-            if isinstance(x, Trajectory) or not jnp.issubdtype(x.dtype, jnp.inexact):
+            if is_motion(x) or not jnp.issubdtype(x.dtype, jnp.inexact):
                 return x
             return jnp.where(well, x, jnp.nan)
 
-        return jax.tree.map(masked, values, is_leaf=lambda x: isinstance(x, Trajectory)), status, settled
+        return jax.tree.map(masked, values, is_leaf=is_motion), status, settled
 
     return point
 
@@ -220,11 +225,11 @@ def raised(program: Program) -> tuple[PyTree, Status]:
     code = RESULTS.raised._value
 
     def with_result(x: Any):
-        if not isinstance(x, Trajectory):
+        if not is_motion(x):
             return x
         return eqx.tree_at(lambda traj: traj.result._value, x, np.full_like(x.result._value, code))
 
-    values = jax.tree.map(with_result, values, is_leaf=lambda x: isinstance(x, Trajectory))
+    values = jax.tree.map(with_result, values, is_leaf=is_motion)
     return values, status._replace(result=np.full(1, code, STATUS_TYPES.result))
 
 

@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate import RESULTS, Trajectory, in_words
 from lagjax.sweep.axes import POINT, Axes
-from lagjax.sweep.batch_program import LOST, NOT_RUN, Status
+from lagjax.sweep.batch_program import LOST, NOT_RUN, Status, is_motion
 
 # The name of a store's own group, not available to arrays.
 STORE_GROUP = "lagjax"
@@ -112,9 +112,9 @@ class _ShownArray(NamedTuple):
 
 
 def _shown_arrays(like: PyTree) -> Iterable[_ShownArray]:
-    for path, part in _with_path(like):
+    for path, part in with_path(like):
         key = key_of(path) or "value"
-        if isinstance(part, Trajectory):
+        if is_motion(part):
             yield from _of_motion(part, f"{key}." if key_of(path) else "")
         else:
             yield _ShownArray(key, _flat(key), (), len(part.shape))
@@ -132,7 +132,7 @@ def _of_motion(motion: Any, prefix: str):
     yield part("t", "times", dims, motion.t, times=True)
     errors = {} if motion.error is None else {f"error.{name}": getattr(motion.error, name) for name in ("q", "v")}
     for which, tree in {"q": motion.q, "v": motion.v, **errors}.items():
-        for path, x in _with_path(tree):
+        for path, x in with_path(tree):
             inner = key_of(path)
             yield part(_joined(which, inner), _joined(which, inner), dims, x, inner or "q")
     for name, x in motion.multipliers.items():
@@ -144,7 +144,7 @@ def _of_motion(motion: Any, prefix: str):
     yield part("end.t", "end", batch, motion.end.t)
     for name, found in motion.events.items():
         yield part(f"events.{name}.t", f"events.{name}", (*batch, f"{prefix}crossing_of_{name}"), found.t)
-    for path, x in _with_path(motion.arrays[PARAMS]):
+    for path, x in with_path(motion.arrays[PARAMS]):
         inner = key_of(path)
         yield part(_joined(f"arrays.{PARAMS}", inner), _joined("params", inner), batch, x)
 
@@ -158,8 +158,14 @@ def _flat(name: str):
     return name.replace("/", "_")
 
 
-def _with_path(tree: PyTree):
-    return jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda x: isinstance(x, Trajectory))
+def with_path(tree: PyTree) -> list[tuple[Any, Any]]:
+    """The paths and leaves of values, each trajectory as one."""
+    return jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_motion)
+
+
+def motions_in(tree: PyTree) -> list[Trajectory]:
+    """The trajectories among values."""
+    return [x for _, x in with_path(tree) if is_motion(x)]
 
 
 def key_of(path: tuple[Any, ...]) -> str:

@@ -16,9 +16,9 @@ from lagjax.files import Table
 from lagjax.integrate import Trajectory
 from lagjax.sweep import structure, tables
 from lagjax.sweep.axes import POINT, Axes
-from lagjax.sweep.batch_program import LOST, TRUSTED, Status
+from lagjax.sweep.batch_program import LOST, TRUSTED, Status, is_motion
 from lagjax.sweep.chunks import nothing
-from lagjax.sweep.labels import named_leaves, words_of
+from lagjax.sweep.labels import key_of, named_leaves, with_path, words_of
 from lagjax.sweep.metadata import damaged, versions
 from lagjax.sweep.metadata import in_words as versions_in_words
 from lagjax.sweep.store import Store, warn_of_damage
@@ -223,7 +223,7 @@ class Sweep:
         if callable(value):
             chosen = {"value": np.asarray(value(values))}
         else:
-            without_motions = jax.tree.map(_without_motion, values, is_leaf=lambda x: isinstance(x, Trajectory))
+            without_motions = jax.tree.map(lambda x: None if is_motion(x) else x, values, is_leaf=is_motion)
             candidates = named_leaves(without_motions if value is None else values)
             chosen = {name: x for name, x in candidates if value is None or name == value}
         numbers = {name: x for name, x in chosen.items() if x.shape == self.axes.shape}
@@ -262,17 +262,13 @@ class Sweep:
     def _shapes(self):
         shown = []
         leaves = self._values.like if isinstance(self._values, Stored) else jax.tree.map(lambda x: x[0], self._values)
-        for path, part in jax.tree_util.tree_leaves_with_path(leaves, is_leaf=lambda x: isinstance(x, Trajectory)):
-            name = jax.tree_util.keystr(path, simple=True, separator=".")
-            if isinstance(part, Trajectory):
+        for path, part in with_path(leaves):
+            name = key_of(path)
+            if is_motion(part):
                 shown.append(f"{name or 'value'} Trajectory at {part.t.shape[-1]} times")
             else:
                 shown.append(f"{name or 'value'} {part.dtype}{list(part.shape) if part.shape else ''}")
         return shown
-
-
-def _without_motion(part: Any):
-    return None if isinstance(part, Trajectory) else part
 
 
 def open_sweep(

@@ -19,7 +19,6 @@ from jaxtyping import PyTree
 from lagjax.display import by_line, printable
 from lagjax.files import KINDS_OF_ARRAY, MALFORMED, NotWritable, Reader, Table, Writer
 from lagjax.integrate import (
-    Trajectory,
     check_is_system,
     described,
     described_system,
@@ -28,7 +27,8 @@ from lagjax.integrate import (
     trajectory_from,
 )
 from lagjax.sweep.axes import Axes
-from lagjax.sweep.labels import named_leaves, shapes_of
+from lagjax.sweep.batch_program import is_motion
+from lagjax.sweep.labels import motions_in, named_leaves, shapes_of
 from lagjax.sweep.store import Store
 from lagjax.system import UnknownSystem
 
@@ -46,12 +46,11 @@ def description_of(like: PyTree, one: PyTree | None) -> dict[str, Any] | None:
     """The description of values like these, or None. Systems are described from `one`, a point with numbers."""
     names = iter([name for name, _ in named_leaves(like)])
     named = jax.tree.map(lambda x: _Marker(f"{LEAF} {next(names)}"), like)
-    motions, found = jax.tree.leaves(named, is_leaf=_is_motion), []
-    motions = [x for x in motions if _is_motion(x)]
-    examples = [x for x in jax.tree.leaves(one, is_leaf=_is_motion) if _is_motion(x)] if one is not None else motions
+    motions, found = motions_in(named), []
+    examples = motions if one is None else motions_in(one)
     writer = Writer(lambda value: value.role if isinstance(value, _Marker) else None)
     count = iter(range(len(motions)))
-    tree = jax.tree.map(lambda x: _Marker(f"{MOTION} {next(count)}") if _is_motion(x) else x, named, is_leaf=_is_motion)
+    tree = jax.tree.map(lambda x: _Marker(f"{MOTION} {next(count)}") if is_motion(x) else x, named, is_leaf=is_motion)
     try:
         for motion, numbered in zip(motions, examples):
             system = described(numbered) if one is not None else UnknownSystem(repr(motion.any_system), (), {}, None)
@@ -149,10 +148,6 @@ def as_run_returns(run: Callable, axes: Axes, store: Store) -> PyTree:
             f"run returns {here}, but {store.path} has {stored}.\nFix: the function that was swept; or leave run out."
         )
     return like
-
-
-def _is_motion(x: Any):
-    return isinstance(x, Trajectory)
 
 
 def _in_numpy(x: Any):

@@ -7,9 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.integrate import Trajectory
 from lagjax.sweep.batch_program import Status
-from lagjax.sweep.labels import Labels, labels_of, named_leaves, shared_times, status_attributes, words_of
+from lagjax.sweep.labels import Labels, labels_of, motions_in, named_leaves, shared_times, status_attributes, words_of
 
 # The largest number of columns for one array of a point.
 MOST_COLUMNS = 100
@@ -80,7 +79,7 @@ def _columns(name: str, x: np.ndarray):
 def _check_rows(swept: Any, values: PyTree):
     """Raise `ValueError` unless each value has the sweep's axes in front and fits into a row."""
     lead, advice = swept.axes.shape, 'swept.to_pandas(lambda values: {"end": values.q[..., -1]})'
-    motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
+    motions = motions_in(values)
     if motions:
         raise ValueError(
             f"each point has a whole trajectory, at {motions[0].t.shape[-1]} times, which does not fit into a row.\n"
@@ -97,7 +96,3 @@ def _check_rows(swept: Any, values: PyTree):
                 f"each point has '{name}' {np.shape(x)[len(lead) :]}, which does not fit into a row.\n"
                 f"Fix: choose what to show: {advice}; or swept.to_xarray().to_dataframe()."
             )
-
-
-def _is_motion(x: Any):
-    return isinstance(x, Trajectory)

@@ -15,7 +15,7 @@ from lagjax.display import COLOURS, Page, encoded, film, film_scripts, fragment,
 from lagjax.integrate import RESULTS, Trajectory, film_of_lanes
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import NOT_RUN, TRUSTED
-from lagjax.sweep.labels import words_of
+from lagjax.sweep.labels import key_of, motions_in, with_path, words_of
 from lagjax.system import Call, check_arguments, coordinates
 
 # More curves than this in one panel cannot be told apart.
@@ -47,8 +47,7 @@ def drawn(values: PyTree, of_motion: tuple[str, ...] = ("q", "v", "multipliers")
     gives one curve per column, against the array `t` in the same dictionary if there is one, else against its index.
     """
     found = Drawn({}, [], [])
-    leaves = jax.tree_util.tree_leaves_with_path(values, is_leaf=lambda x: isinstance(x, Trajectory))
-    named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    named = {key_of(path): leaf for path, leaf in with_path(values)}
     for name, x in named.items():
         if isinstance(x, Trajectory) and np.ndim(x.t) > 2:
             found.left_out.append(f"{name or 'value'}, a batch of trajectories")
@@ -214,7 +213,7 @@ def _film(
     trail: float,
 ):
     check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
-    motions = [x for x in jax.tree.leaves(values, is_leaf=_is_motion) if _is_motion(x)]
+    motions = motions_in(values)
     if len(motions) != 1:
         raise ValueError(
             f"positions(t, q, params) draws a motion, and run returned {len(motions)} trajectories.\n"
@@ -236,7 +235,3 @@ def _film(
             "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds; or a larger megabytes=..."
         )
     return film(at, points, rate, kept)
-
-
-def _is_motion(x: Any):
-    return isinstance(x, Trajectory)
