@@ -20,15 +20,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
@@ -36,10 +32,11 @@ from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import resolution, solved
 from lagjax.integrate.solve.segments import (
     AT_ONCE,
-    NOT_BELOW,
     ROWS,
-    if_any,
+    is_below,
     nothing,
+    outputs_ahead,
+    over_legs,
     reached,
     sizes_of,
     unknown,
@@ -177,12 +174,7 @@ def solved_over_jumps(
         return _leg(piecewise, both, guards, way, params, ts, settings, adjoint)
 
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
-    if isinstance(adjoint, diffrax.ForwardMode):
-        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
-        # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
-        way = lax.while_loop(lambda way: eqxi.unvmap_any(way.continues & (way.count <= MOST_JUMPS)), next_leg, first)
-    else:
-        way, _ = lax.scan(partial(if_any, next_leg), first, None, length=turns)
+    way = over_legs(next_leg, lambda way: way.count <= MOST_JUMPS, first, turns, adjoint)
     return {
         **way.rows,
         "end": way.end,
@@ -230,9 +222,7 @@ def _leg(
     adjoint: Any,
 ) -> ModeWay:  # fmt: skip
     """Return the way after one more leg."""
-    # Past outputs would cost a step each: those ahead come first, padded with the last.
-    place, past, here = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t), way.continues
-    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    (ahead, place), here = outputs_ahead(ts, way.t), way.continues
     times = jnp.where(here, ahead, way.t)
     if piecewise.pauses and settings.jump_ts is not None:
         # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
@@ -251,7 +241,7 @@ def _leg(
     moves = onward | paused
     # What a leg found whose mode was wrong does not count.
     counts = here & ~ending.wrong
-    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], {name: found[name] for name in ROWS})
+    rows = jax.tree.map(lambda x: x[place], {name: found[name] for name in ROWS})
     known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
     rows = jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), way.rows, rows)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
@@ -302,20 +292,13 @@ def _ending(
     end = Snapshot(t, q, v, end.multipliers)
     # Where a force jumps in time, the side of which a guard is belongs to the next leg.
     whole = end.t >= last
-    below = ended_well(result) & ~onward & whole & _is_below(end, given, guards, count, settings.rtol)
+    below = ended_well(result) & ~onward & whole & is_below(end, given, guards, count, settings.rtol)
     wrong = ~way.free & (
         below | ~ended_well(result) & (result != RESULTS.max_steps_reached) & (result != RESULTS.no_progress)
     )
     result = RESULTS.where(onward, RESULTS.successful, result)
     first = jnp.argmax(when <= jnp.min(when) + at_one_time)
     return ModeEnding(onward, wrong, first, end, result)
-
-
-def _is_below(end: Snapshot, given, guards: Guards, count: int, rtol: Array):
-    """Whether one of the first `count` guards is below zero by more than errors can cause."""
-    state = stop_gradient(tuple(end))
-    g, terms = jax.jvp(lambda *state: jnp.stack(guards(*state, stop_gradient(given))[:count]), state, uneven(state))
-    return jnp.any(g < -NOT_BELOW * rtol[0] * jnp.abs(terms))
 
 
 def _beyond(piecewise: Piecewise, first: Array, end: Snapshot, given: Given):

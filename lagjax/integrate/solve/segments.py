@@ -173,16 +173,9 @@ def solved_in_legs(
             way = leg(way) if len(hybrid.systems) == 1 else lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
         return way
 
-    if isinstance(adjoint, diffrax.ForwardMode):
-        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
-        most = hybrid.most_switches
-        # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
-        way = lax.while_loop(
-            lambda way: eqxi.unvmap_any(way.continues & (way.switches.count <= most)), next_legs, first
-        )
-    else:
-        # Each turn takes every lane at least one leg further.
-        way, _ = lax.scan(partial(if_any, next_legs), first, None, length=hybrid.most_switches + 1)
+    # Each turn takes every lane at least one leg further.
+    most = hybrid.most_switches
+    way = over_legs(next_legs, lambda way: way.switches.count <= most, first, most + 1, adjoint)
     rows = way.rows
     return {
         "q": rows.q,
@@ -201,9 +194,24 @@ def solved_in_legs(
     }
 
 
-def if_any(next_leg: Callable, way: Any, _: None) -> tuple[Any, None]:
-    """A turn of `scan`: the next leg, if any lane continues."""
-    return lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None
+def over_legs(next_leg: Callable, has_room: Callable, first: Any, turns: int, adjoint: Any) -> Any:
+    """The way after all legs: while it continues and has room, or in as many turns, for reverse mode."""
+    if isinstance(adjoint, diffrax.ForwardMode):
+        # On one number alone XLA would try to count the turns, in a copy of all that is inside, at each of its passes.
+        # One question for all lanes: if each had its own, JAX would copy the results of all legs in each turn.
+        return lax.while_loop(lambda way: eqxi.unvmap_any(way.continues & has_room(way)), next_leg, first)
+
+    def turn(way: Any, _: None):
+        return lax.cond(eqxi.unvmap_any(way.continues), next_leg, lambda way: way, way), None
+
+    return lax.scan(turn, first, None, length=turns)[0]
+
+
+def outputs_ahead(ts: Array, t: Array) -> tuple[Array, Array]:
+    """t and the outputs after it, padded with the last: past ones would cost a step each; and where each output is."""
+    place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= t)
+    ahead = jnp.where(place == 0, t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    return ahead, jnp.maximum(place - past + 1, 0)
 
 
 def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phase, settings: Settings):
@@ -256,10 +264,8 @@ def _leg(
     """Return the way after one more leg in phase i, for the lanes in `in_phase`."""
     until = phase.until(way.modes, ts, params)
     system, params = hybrid.systems[i], phase.given(params, way.modes)
-    # Past outputs would cost a step each: those ahead come first, padded with the last. Lanes in other phases stand
-    # still.
-    place, past = jnp.arange(ts.shape[0]), jnp.sum(ts <= way.t)
-    ahead = jnp.where(place == 0, way.t, ts[jnp.minimum(place + past - 1, ts.shape[0] - 1)])
+    ahead, place = outputs_ahead(ts, way.t)
+    # Lanes in other phases stand still.
     times = jnp.where(in_phase, jnp.minimum(ahead, until), way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
@@ -294,7 +300,7 @@ def _leg(
             onward = onward & after.found
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
-    rows = jax.tree.map(lambda x: x[jnp.maximum(place - past + 1, 0)], rows)
+    rows = jax.tree.map(lambda x: x[place], rows)
     known = known | (way.switches.count == 0) & (ts <= way.t)
     of_modes = None if way.modes is None else way.modes.modes[None]
     if phase.has_instants:
@@ -345,9 +351,9 @@ def _ending(
     # A switch at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
-    is_below = _is_below(end, params, phase.guards, len(phase.switches), rtol)
-    refused, full = at_once & at_start & is_below, way.switches.count >= way.switches.t.shape[0]
-    missed = (result == RESULTS.successful) & is_below
+    below = is_below(end, params, phase.guards, len(phase.switches), rtol)
+    refused, full = at_once & at_start & below, way.switches.count >= way.switches.t.shape[0]
+    missed = (result == RESULTS.successful) & below
     onward = switched & ~refused & ~full & ~missed
     failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
@@ -356,7 +362,7 @@ def _ending(
     return PhaseEnding(onward, first, end, result)
 
 
-def _is_below(end: Snapshot, params: PyTree, guards: Guards | None, count: int, rtol: Array):
+def is_below(end: Snapshot, params: PyTree, guards: Guards | None, count: int, rtol: Array):
     """Whether one of the first `count` guards is below zero by more than errors can cause."""
     if guards is None or not count:
         return jnp.asarray(False)
