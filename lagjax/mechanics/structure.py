@@ -17,6 +17,7 @@ operands.
 
 from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -89,7 +90,7 @@ def _structure(model: Model, names: Sequence[str]):
     mass = _numbers(_mass, model)
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
     lagrangian = _numbers(_of(system.lagrangian), model)
-    linear = _numbers(_momentum_at_rest, model)
+    linear = _numbers(_of(partial(_momentum_at_rest, system.lagrangian)), model)
     programs = [_numbers(_of(f), model) for f in functions_of(model)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
@@ -122,7 +123,8 @@ def invariance(model: Model) -> Invariance:
     """What is known to change nothing; of a large system less is known."""
 
     def values(model: Model, t: Array, q: PyTree, v: PyTree):
-        return [f(t, q, v, model.params) for f in functions_of(model)], _momentum_at_rest(model, t, q, v)
+        momentum = _momentum_at_rest(model.system.lagrangian, t, q, v, model.params)
+        return [f(t, q, v, model.params) for f in functions_of(model)], momentum
 
     try:
         if model.n + model.m > UP_TO:
@@ -186,9 +188,9 @@ def _mass(model: Model, t: Array, q: PyTree, v: PyTree):
     return [mass[i, j] for i in range(model.n) for j in range(model.n)]
 
 
-def _momentum_at_rest(model: Model, t: Array, q: PyTree, v: PyTree):
+def _momentum_at_rest(lagrangian: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
     at_rest = tuple(np.zeros(x.shape, x.dtype) for x in v)
-    return jax.grad(model.system.lagrangian, argnums=2)(t, q, at_rest, model.params)
+    return jax.grad(lagrangian, argnums=2)(t, q, at_rest, params)
 
 
 def _depends_on(numbers, names: Sequence[str]):
