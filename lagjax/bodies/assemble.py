@@ -1,12 +1,13 @@
 """A system of bodies: the sum of their kinetic energies, and the constraints of their joints."""
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies, floats, kinetic_energy, together
+from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies, floats, kinetic_energy, together
 from lagjax.bodies.driven import Driven
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
@@ -67,22 +68,48 @@ def multibody(
     beside = Acting(*(driven.seen_by_all(others.pop(name, None)) for name in ("force", "dissipation")))
     acting = beside.with_loads(loads, driven.placed)
 
-    def total(t, q, v, params):
-        q, v = driven.placed(t, q, v, params)
-        kinetic = _kinetic(bodies, q, v, params)
-        potential = sum(load.potential(t, q, v, params) for load in loads if load.potential is not None)
-        return kinetic - potential + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
-
-    looks_like = [*(joint.function for joint in joints.values()), *(load.potential for load in loads)]
-    setattr(total, "drawing", Drawing(lambda params: _drawn(driven, usual_shapes(bodies, looks_like, params))))
+    looks_like = (*(joint.function for joint in joints.values()), *(load.potential for load in loads))
+    potentials = tuple(load.potential for load in loads if load.potential is not None)
     joints = {name: driven.seen_by(joint) for name, joint in joints.items()}
+    total = BodiesLagrangian(bodies, driven, potentials, lagrangian, looks_like)
     return System(total, units | joints, force=acting.force, dissipation=acting.dissipation, **others)
 
 
-def _drawn(driven: Driven, shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
-    """Without what is fixed in driven bodies, whose poses q does not have."""
-    names = {body.name for body in driven.bodies}
-    return tuple(shape for shape in shapes if not any(anchor.body in names for anchor in shape.anchors))
+@dataclass(frozen=True, eq=False)
+class BodiesLagrangian(SystemFunction):
+    """The kinetic energy of bodies less the potentials of loads, and what L has `beside`.
+
+    `looks_like`: functions whose `drawing` says what joints and loads look like.
+
+    >>> import lagjax as lj
+    >>> bob, pose = lj.Body("bob", 2.0, (1.0, 1.0, 1.0)), lj.Pose.at()
+    >>> free = BodiesLagrangian((bob,), Driven(()), (), None, ())
+    >>> print(free(0.0, {"bob": pose}, {"bob": pose.moving((3.0, 0.0, 0.0))}, None))
+    9.0
+    """
+
+    bodies: tuple[Body, ...]
+    driven: Driven
+    potentials: tuple[Callable, ...]
+    beside: Callable | None
+    looks_like: tuple[Callable | None, ...]
+    drawn: Drawing | None = None
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        q, v = self.driven.placed(t, q, v, params)
+        total = _kinetic(self.bodies, q, v, params) - sum(x(t, q, v, params) for x in self.potentials)
+        return total + (0.0 if self.beside is None else self.beside(t, q, v, params))
+
+    @property
+    def drawing(self) -> Drawing:
+        """How the system is drawn: as given, or bodies as boxes between their joints."""
+        return self.drawn or Drawing(self._shapes)
+
+    def _shapes(self, params: PyTree) -> tuple[Shape, ...]:
+        # Without what is fixed in driven bodies, whose poses q does not have.
+        names = {body.name for body in self.driven.bodies}
+        found = usual_shapes(self.bodies, self.looks_like, params)
+        return tuple(shape for shape in found if not any(anchor.body in names for anchor in shape.anchors))
 
 
 def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:

@@ -191,17 +191,7 @@ class Body:
     @property
     def unit(self) -> Holonomic:
         """The constraint |e|² = 1 of its quaternion, which `lj.multibody` puts into the system."""
-
-        def unit_quaternion(t, q, params):
-            return (jnp.sum(self.pose(q).quaternion ** 2) - 1) / 2
-
-        def restored(q: PyTree) -> PyTree:
-            pose = self.pose(q)
-            return {**q, self.name: pose._replace(quaternion=pose.quaternion / jnp.sqrt(jnp.sum(pose.quaternion**2)))}
-
-        # How `lj.consistent_state` looks for a state if none was found otherwise.
-        setattr(unit_quaternion, "restored", restored)
-        return Holonomic(unit_quaternion)
+        return Holonomic(UnitQuaternion(self))
 
     def pose(self, q: PyTree) -> Pose:
         """Where it is."""
@@ -279,6 +269,41 @@ class Body:
         of: Any = numpy_of(given)
         inertia = of.asarray(given, dtype)
         return of.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+class SystemFunction:
+    """A function of a system that is an object and no closure, so that it can be pickled.
+
+    As a function is, it is equal to itself alone, and its own copy.
+
+    >>> import copy
+    >>> halved = SystemFunction()
+    >>> copy.deepcopy(halved) == halved
+    True
+    """
+
+    def __deepcopy__(self, memo: dict) -> "SystemFunction":
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class UnitQuaternion(SystemFunction):
+    """(|e|² - 1)/2 of a body's quaternion, as a function of (t, q, params).
+
+    >>> UnitQuaternion(Body("bob", 1.0, (1.0, 1.0, 1.0)))(0.0, {"bob": Pose.at()}, None).tolist()
+    0.0
+    """
+
+    body: Body
+
+    def __call__(self, t, q: PyTree, params: PyTree) -> Float[Array, ""]:
+        return (jnp.sum(self.body.pose(q).quaternion ** 2) - 1) / 2
+
+    def restored(self, q: PyTree) -> PyTree:
+        """How `lj.consistent_state` looks for a state if none was found otherwise."""
+        pose = self.body.pose(q)
+        unit = pose._replace(quaternion=pose.quaternion / jnp.sqrt(jnp.sum(pose.quaternion**2)))
+        return {**q, self.body.name: unit}
 
 
 def together(poses: Sequence[Pose]) -> Pose:

@@ -9,13 +9,14 @@ Derivatives by q and v are those of the coordinates alone, and derivatives by ti
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from lagjax.bodies.body import Body, Pose, floats
+from lagjax.bodies.body import Body, Pose, SystemFunction, floats
 from lagjax.system import Holonomic, Nonholonomic
 
 
@@ -59,15 +60,34 @@ class Driven(NamedTuple):
         """A constraint that reads these bodies' poses, as one of the coordinates."""
         if not self.bodies:
             return joint
-        if isinstance(joint, Holonomic):
-            return Holonomic(lambda t, q, params: joint.g(t, self.placed(t, q, {}, params)[0], params))
-        return Nonholonomic(lambda t, q, v, params: joint.phi(t, *self.placed(t, q, v, params), params))
+        seen = Seen(joint.function, self.placed)
+        return Holonomic(seen.of_positions) if isinstance(joint, Holonomic) else Nonholonomic(seen)
 
     def seen_by_all(self, function: Callable | None) -> Callable | None:
         """A function of (t, q, v, params) that reads these bodies' poses and rates, as one of the coordinates."""
         if function is None or not self.bodies:
             return function
-        return lambda t, q, v, params: function(t, *self.placed(t, q, v, params), params)
+        return Seen(function, self.placed)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen(SystemFunction):
+    """A function of the poses and rates that `placed(t, q, v, params)` gives, as one of q and v.
+
+    >>> height = Seen(lambda t, q, params: q["bob"], lambda t, q, v, params: ({"bob": 2.0 * q}, v))
+    >>> height.of_positions(0.0, 3.0, None)
+    6.0
+    """
+
+    function: Callable
+    placed: Callable
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree) -> Any:
+        return self.function(t, *self.placed(t, q, v, params), params)
+
+    def of_positions(self, t, q: PyTree, params: PyTree) -> Any:
+        """The same for a function of (t, q, params)."""
+        return self.function(t, self.placed(t, q, {}, params)[0], params)
 
 
 def _pose(body: Body, t, params: PyTree, dtype) -> Pose:

@@ -5,23 +5,26 @@ the generalized force is its derivative by these (Goldstein, §1.4, Eq. 1.49).
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import (
     Body,
     Marker,
+    SystemFunction,
     check_bodies,
     check_markers,
     check_takes_params,
     check_takes_state,
     valued,
 )
-from lagjax.bodies.shapes import line, looks
+from lagjax.bodies.shapes import line
+from lagjax.display import Shape
 from lagjax.jaxtools import numpy_of
 
 
@@ -94,20 +97,47 @@ def spring(
     for role, given in {"stiffness": stiffness, "length": length, "damping": damping}.items():
         check_takes_params(role, "lj.spring", given)
 
-    def potential(t, q, v, params):
-        gap = b.position(q, params) - a.position(q, params)
-        k, squared = valued(stiffness, params), jnp.sum(gap**2)
-        if _is_zero(length):
+    pull = Spring(a, b, stiffness, length, damping)
+    return Load(pull, None if _is_zero(damping) else pull.dissipation)
+
+
+@dataclass(frozen=True, eq=False)
+class Spring(SystemFunction):
+    """The potential energy of a spring between two points, a function of (t, q, v, params); `dissipation` another one.
+
+    >>> import lagjax as lj
+    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> pull = Spring(lj.ground.at(), stone.at(), 10.0, 1.0, 0.0)
+    >>> print(pull(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
+    20.0
+    """
+
+    a: Marker
+    b: Marker
+    stiffness: ArrayLike | Callable
+    length: ArrayLike | Callable
+    damping: ArrayLike | Callable
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        k, squared = valued(self.stiffness, params), jnp.sum(self._gap(q, params) ** 2)
+        if _is_zero(self.length):
             return k * squared / 2
-        return k * (jnp.sqrt(squared) - valued(length, params)) ** 2 / 2
+        return k * (jnp.sqrt(squared) - valued(self.length, params)) ** 2 / 2
 
-    def dissipation(t, q, v, params):
-        gap = b.position(q, params) - a.position(q, params)
-        rate = jnp.dot(gap, b.velocity(q, v, params) - a.velocity(q, v, params)) / jnp.sqrt(jnp.sum(gap**2))
-        return valued(damping, params) * rate**2 / 2
+    def dissipation(self, t, q: PyTree, v: PyTree, params: PyTree):
+        """What the damper adds to Rayleigh's function."""
+        gap = self._gap(q, params)
+        moving = self.b.velocity(q, v, params) - self.a.velocity(q, v, params)
+        rate = jnp.dot(gap, moving) / jnp.sqrt(jnp.sum(gap**2))
+        return valued(self.damping, params) * rate**2 / 2
 
-    looks(potential, line(a, b))
-    return Load(potential, None if _is_zero(damping) else dissipation)
+    def _gap(self, q: PyTree, params: PyTree) -> Float[Array, "3"]:
+        return self.b.position(q, params) - self.a.position(q, params)
+
+    @property
+    def drawing(self) -> tuple[Shape]:
+        """What it looks like: a line."""
+        return (line(self.a, self.b),)
 
 
 def torsion(
@@ -134,17 +164,36 @@ def torsion(
     for role, given in {"stiffness": stiffness, "angle": angle, "damping": damping}.items():
         check_takes_params(role, "lj.torsion", given)
 
-    def potential(t, q, v, params):
-        along, across, _ = a.axes(q)
-        first = b.axes(q)[0]
+    turns = Torsion(a, b, stiffness, angle, damping)
+    return Load(turns, None if _is_zero(damping) else turns.dissipation)
+
+
+@dataclass(frozen=True, eq=False)
+class Torsion(SystemFunction):
+    """The potential energy of a spring about an axis, a function of (t, q, v, params); `dissipation` another one.
+
+    >>> import lagjax as lj
+    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> closer = Torsion(lj.ground.at(), door.at(), 3.0, 0.5, 0.0)
+    >>> print(closer(0.0, {"door": lj.Pose.at(angle=2.5)}, None, None))
+    6.0
+    """
+
+    a: Marker
+    b: Marker
+    stiffness: ArrayLike | Callable
+    angle: ArrayLike | Callable
+    damping: ArrayLike | Callable
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        along, across, _ = self.a.axes(q)
+        first = self.b.axes(q)[0]
         turned = jnp.arctan2(jnp.dot(across, first), jnp.dot(along, first))
-        return valued(stiffness, params) * (turned - valued(angle, params)) ** 2 / 2
+        return valued(self.stiffness, params) * (turned - valued(self.angle, params)) ** 2 / 2
 
-    def dissipation(t, q, v, params):
-        rate = jnp.dot(a.axis(q), b.body.spin(q, v) - a.body.spin(q, v))
-        return valued(damping, params) * rate**2 / 2
-
-    return Load(potential, None if _is_zero(damping) else dissipation)
+    def dissipation(self, t, q: PyTree, v: PyTree, params: PyTree):
+        """What the damper adds to Rayleigh's function."""
+        return valued(self.damping, params) * _turning(self.a, self.b, q, v) ** 2 / 2
 
 
 def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
@@ -161,11 +210,32 @@ def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
     check_markers("a motor is held at two places on bodies", a, b)
     check_takes_state("torque", "lj.motor", torque)
 
-    def power(t, q, w, v, params):
-        turning = torque(t, q, v, params) if callable(torque) else torque
-        return turning * jnp.dot(a.axis(q), b.body.spin(q, w) - a.body.spin(q, w))
+    return Load(power=TurningPower(a, b, torque))
 
-    return Load(power=power)
+
+@dataclass(frozen=True, eq=False)
+class TurningPower(SystemFunction):
+    """The power of a torque about the axis of a, a function of (t, q, w, v, params).
+
+    >>> import lagjax as lj
+    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
+    >>> print(TurningPower(lj.ground.at(), wheel.at(), 5.0)(0.0, {"wheel": pose}, turning, turning, None))
+    15.0
+    """
+
+    a: Marker
+    b: Marker
+    torque: ArrayLike | Callable
+
+    def __call__(self, t, q: PyTree, w: PyTree, v: PyTree, params: PyTree):
+        torque = self.torque(t, q, v, params) if callable(self.torque) else self.torque
+        return torque * _turning(self.a, self.b, q, w)
+
+
+def _turning(a: Marker, b: Marker, q: PyTree, v: PyTree) -> Float[Array, ""]:
+    """The rate at which b turns about the axis of a."""
+    return jnp.dot(a.axis(q), b.body.spin(q, v) - a.body.spin(q, v))
 
 
 def applied(at: Marker, force: ArrayLike | Callable) -> Load:
@@ -183,12 +253,27 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     check_markers("a force acts at a place on a body", at)
     check_takes_state("force", "lj.applied", force)
 
-    def power(t, q, w, v, params):
-        given = force(t, q, v, params) if callable(force) else force
-        velocity = at.velocity(q, w, params)
-        return jnp.dot(jnp.asarray(given, velocity.dtype), velocity)
+    return Load(power=PointPower(at, force))
 
-    return Load(power=power)
+
+@dataclass(frozen=True, eq=False)
+class PointPower(SystemFunction):
+    """The power of a force on a point, a function of (t, q, w, v, params).
+
+    >>> import lagjax as lj
+    >>> cart, pose = lj.Body("cart", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> moving = {"cart": pose.moving((0.0, 3.0, 0.0))}
+    >>> print(PointPower(cart.at(), (0.0, 2.0, 0.0))(0.0, {"cart": pose}, moving, moving, None))
+    6.0
+    """
+
+    at: Marker
+    force: ArrayLike | Callable
+
+    def __call__(self, t, q: PyTree, w: PyTree, v: PyTree, params: PyTree):
+        given = self.force(t, q, v, params) if callable(self.force) else self.force
+        velocity = self.at.velocity(q, w, params)
+        return jnp.dot(jnp.asarray(given, velocity.dtype), velocity)
 
 
 class Acting(NamedTuple):
@@ -203,25 +288,52 @@ class Acting(NamedTuple):
 
     def with_loads(self, loads: Iterable[Load], placed: Callable) -> "Acting":
         """The same with the powers and dissipations of loads, which read q and v as `placed(t, q, v, params)`."""
-        powers = [load.power for load in loads if load.power is not None]
-        losses = [load.dissipation for load in loads if load.dissipation is not None]
+        powers = tuple(load.power for load in loads if load.power is not None)
+        losses = tuple(load.dissipation for load in loads if load.dissipation is not None)
+        force = Driving(powers, self.force, placed) if powers else self.force
+        return Acting(force, Losing(losses, self.dissipation, placed) if losses else self.dissipation)
 
-        def driven(t, q, v, params):
-            at, moving = placed(t, q, v, params)
 
-            def power(w):
-                rates = placed(t, q, w, params)[1]
-                return sum(of_load(t, at, rates, moving, params) for of_load in powers)
+@dataclass(frozen=True, eq=False)
+class Driving(SystemFunction):
+    """The generalized force of some powers, and of what else acts.
 
-            given = jax.grad(power)(v)
-            return given if self.force is None else jax.tree.map(jnp.add, given, self.force(t, q, v, params))
+    >>> pulling = Driving((lambda t, q, w, v, params: 3.0 * w,), None, lambda t, q, v, params: (q, v))
+    >>> print(pulling(0.0, 1.0, 2.0, None))
+    3.0
+    """
 
-        def friction(t, q, v, params):
-            at, moving = placed(t, q, v, params)
-            lost = sum(of_load(t, at, moving, params) for of_load in losses)
-            return jnp.asarray(lost if self.dissipation is None else lost + self.dissipation(t, q, v, params))
+    powers: tuple[Callable, ...]
+    beside: Callable | None
+    placed: Callable
 
-        return Acting(driven if powers else self.force, friction if losses else self.dissipation)
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        at, moving = self.placed(t, q, v, params)
+
+        def power(w):
+            rates = self.placed(t, q, w, params)[1]
+            return sum(of_load(t, at, rates, moving, params) for of_load in self.powers)
+
+        given = jax.grad(power)(v)
+        return given if self.beside is None else jax.tree.map(jnp.add, given, self.beside(t, q, v, params))
+
+
+@dataclass(frozen=True, eq=False)
+class Losing(SystemFunction):
+    """Rayleigh's function of some dampers, and of what else takes energy.
+
+    >>> print(Losing((lambda t, q, v, params: 3.0 * v**2,), None, lambda t, q, v, params: (q, v))(0.0, 1.0, 2.0, None))
+    12.0
+    """
+
+    losses: tuple[Callable, ...]
+    beside: Callable | None
+    placed: Callable
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        at, moving = self.placed(t, q, v, params)
+        lost = sum(of_load(t, at, moving, params) for of_load in self.losses)
+        return jnp.asarray(lost if self.beside is None else lost + self.beside(t, q, v, params))
 
 
 def check_loads(whose: str, loads: Iterable[Load]) -> tuple[Load, ...]:

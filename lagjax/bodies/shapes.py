@@ -151,11 +151,6 @@ def _values(f: Callable, points: np.ndarray, params: PyTree) -> np.ndarray:
     return np.asarray(jax.vmap(lambda r: jnp.asarray(f(r, params), float))(jnp.asarray(points)))
 
 
-def looks(function: Callable, *shapes: Shape) -> None:
-    """Say what a joint or a load looks like, if nothing is given: at the function of its constraint or potential."""
-    setattr(function, "drawing", shapes)
-
-
 def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:
     """What is drawn of a system if nothing is given: what its functions look like, and bodies as boxes.
 

@@ -23,9 +23,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Ground, Marker, ground, valued
+from lagjax.bodies.body import Ground, Marker, SystemFunction, ground, valued
 from lagjax.bodies.joints import check_two
-from lagjax.bodies.shapes import disk, level, looks, sphere
+from lagjax.bodies.shapes import disk, level, sphere
 from lagjax.display import Shape
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
@@ -119,10 +119,7 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
-
-    contact = _contact(wheel, floor, radius, is_rim=True)
-    looks(contact["touches"].function, disk(wheel, radius), *getattr(floor, "drawing", ()))
-    return contact
+    return _contact(wheel, floor, radius, is_rim=True)
 
 
 def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str, Holonomic | Nonholonomic]:
@@ -136,54 +133,82 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    contact = _contact(ball, floor, radius, is_rim=False)
-    looks(contact["touches"].function, sphere(ball, radius), *getattr(floor, "drawing", ()))
-    return contact
+    return _contact(ball, floor, radius, is_rim=False)
 
 
-def _contact(wheel: Marker, floor: Any, radius: Any, is_rim: bool) -> dict[str, Holonomic | Nonholonomic]:
-    is_plane = not isinstance(floor, Surface)
-    at = floor if is_plane else floor.on
-    check_two(wheel, at)
-    is_straight = is_plane or floor.is_distance and not is_rim
+def _contact(wheel: Marker, floor: "Marker | Surface", radius: Any, is_rim: bool):
+    touches = Touching(wheel, floor, radius, is_rim)
+    check_two(wheel, touches.at)
+    return {"touches": Holonomic(touches), "rolls": Nonholonomic(touches.slip)}
 
-    def height(r: Array, params: PyTree) -> Array:
-        """f at a point that is given in the frame of the floor."""
-        return r[2] if is_plane else jnp.asarray(floor.f(r, params))
 
-    def normal(r: Array, params: PyTree) -> Array:
-        return _unit(jax.grad(height)(r, params))
+@dataclass(frozen=True, eq=False)
+class Touching(SystemFunction):
+    """The gap between a wheel, or a ball, and the floor, a function of (t, q, params); `slip` one of (t, q, v, params).
 
-    def meeting(q: PyTree, params: PyTree) -> tuple[Array, Array]:
-        """The point of contact and the way there from the centre, in the frame of the floor."""
-        size, axes = valued(radius, params), at.axes(q)
-        centre = axes @ (wheel.position(q, params) - at.position(q, params))
-        axis = axes @ wheel.axis(q) if is_rim else None
-        if is_straight:
-            e = -normal(centre, params)
-            arm = size * (e if axis is None else _unit(_off(axis, e)))
-        else:
-            arm = size * _towards(height, centre, axis, size, params)
-        return centre + arm, arm
+    >>> import lagjax as lj
+    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> print(Touching(ball.at(), lj.ground.at(), 1.0, False)(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
+    0.25
+    """
 
-    def touches(t, q, params):
-        point, _ = meeting(q, params)
-        if is_plane:
-            return height(point, params)
-        value, gradient = jax.value_and_grad(height)(point, params)
+    wheel: Marker
+    floor: Any
+    radius: Any
+    is_rim: bool
+
+    def __call__(self, t, q: PyTree, params: PyTree) -> Float[Array, ""]:
+        point, _ = self._meeting(q, params)
+        if self._is_plane:
+            return self._height(point, params)
+        value, gradient = jax.value_and_grad(self._height)(point, params)
         length = jnp.sqrt(jnp.sum(gradient**2))
-        if floor.is_distance:
+        if self.floor.is_distance:
             return jnp.where(jnp.abs(lax.stop_gradient(length) - 1) < NOT_ONE, value, jnp.nan)
         return value / length
 
-    def rolls(t, q, v, params):
-        (point, arm), axes = meeting(q, params), at.axes(q)
+    def slip(self, t, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, "2"]:
+        """The velocity of the wheel at the point of contact, less that of the floor there, along the floor."""
+        (point, arm), at, wheel = self._meeting(q, params), self.at, self.wheel
+        axes = at.axes(q)
         of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), arm @ axes)
         of_floor = at.velocity(q, v, params) + jnp.cross(at.body.spin(q, v), point @ axes)
         slip = axes @ (of_wheel - of_floor)
-        return slip[:2] if is_plane else tangents(normal(point, params)) @ slip
+        return slip[:2] if self._is_plane else tangents(self._normal(point, params)) @ slip
 
-    return {"touches": Holonomic(touches), "rolls": Nonholonomic(rolls)}
+    @property
+    def at(self) -> Marker:
+        """The place in whose frame the floor is given."""
+        return self.floor if self._is_plane else self.floor.on
+
+    @property
+    def drawing(self) -> tuple[Shape, ...]:
+        """What it looks like: a disk or a sphere, and the surface."""
+        solid = disk if self.is_rim else sphere
+        return solid(self.wheel, self.radius), *getattr(self.floor, "drawing", ())
+
+    @property
+    def _is_plane(self) -> bool:
+        return not isinstance(self.floor, Surface)
+
+    def _height(self, r: Array, params: PyTree) -> Array:
+        """f at a point that is given in the frame of the floor."""
+        return r[2] if self._is_plane else jnp.asarray(self.floor.f(r, params))
+
+    def _normal(self, r: Array, params: PyTree) -> Array:
+        return _unit(jax.grad(self._height)(r, params))
+
+    def _meeting(self, q: PyTree, params: PyTree) -> tuple[Array, Array]:
+        """The point of contact and the way there from the centre, in the frame of the floor."""
+        size, axes = valued(self.radius, params), self.at.axes(q)
+        centre = axes @ (self.wheel.position(q, params) - self.at.position(q, params))
+        axis = axes @ self.wheel.axis(q) if self.is_rim else None
+        if self._is_plane or self.floor.is_distance and not self.is_rim:
+            e = -self._normal(centre, params)
+            arm = size * (e if axis is None else _unit(_off(axis, e)))
+        else:
+            arm = size * _towards(self._height, centre, axis, size, params)
+        return centre + arm, arm
 
 
 def _towards(f: Callable, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:

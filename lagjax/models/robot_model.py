@@ -1,8 +1,8 @@
 """A mechanism from a file: bodies and joints, its system in either kind of coordinates, and the way between them."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +108,10 @@ class RobotModel:
             )
         return cls(name, *merged, placed, tuple(loops), tuple(field.tolist()), tuple(not_taken))
 
+    def __reduce__(self):
+        # Without what is kept, which has compiled programs.
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
+
     @cached_property
     def bodies(self) -> dict[str, Body]:
         """The bodies by name; links without mass are none."""
@@ -163,17 +167,12 @@ class RobotModel:
         own |= self._loops()
         if both := own.keys() & (joints or {}).keys():
             raise ValueError(f"the file has a joint '{sorted(both)[0]}' already.\nFix: another name.")
-        bodies, rotors = list(self.bodies.values()), [joint for joint in self.joints.values() if joint.armature]
-        lagrangian = others.pop("lagrangian", None)
-
-        def besides(t, q, v, params):
-            energies = [x.armature * rate_squared(self._of(x), x.name, q, v) / 2 for x in rotors]
-            return sum(energies) + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
-
+        bodies, lagrangian = list(self.bodies.values()), others.pop("lagrangian", None)
+        if any(joint.armature for joint in self.joints.values()):
+            lagrangian = partial(self._with_rotors, lagrangian)
         every = [weight(bodies, self.gravity), *self._loads(), *loads]
-        system = multibody(bodies, own | dict(joints or {}), every, besides if rotors else lagrangian, **others)
-        setattr(system.lagrangian, "drawing", Drawing(self._looks))
-        return system
+        system = multibody(bodies, own | dict(joints or {}), every, lagrangian, **others)
+        return _drawn(system, Drawing(self._looks))
 
     def joint_system(self, loads: Iterable[Load] = (), closures: Mapping | None = None, **others) -> System:
         """Return the system in joint coordinates: q and v are positions and rates of joints by name.
@@ -184,26 +183,17 @@ class RobotModel:
         position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
         `states` and `elements` of `lj.System`, in joint coordinates.
         """
-        springs = [joint for joint in self.joints.values() if joint.stiffness]
-        dampers = [joint for joint in self.joints.values() if joint.damping]
-        dissipation = others.pop("dissipation", None)
-
-        def of_springs(t, q, params):
-            return sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
-
-        def of_dampers(t, q, v, params):
-            own = sum(x.damping * _squared(x, q, v) / 2 for x in dampers)
-            return own if dissipation is None else own + dissipation(t, q, v, params)
-
+        dissipation, joints = others.pop("dissipation", None), self.joints.values()
+        if any(joint.damping for joint in joints):
+            dissipation = partial(self._of_dampers, dissipation)
         system = self.tree().system(
             [weight(self.bodies.values(), self.gravity), *loads],
             self._loops() | dict(closures or {}),
-            of_springs if springs else None,
-            dissipation=of_dampers if dampers else dissipation,
+            self._of_springs if any(joint.stiffness for joint in joints) else None,
+            dissipation=dissipation,
             **others,
         )
-        setattr(system.lagrangian, "drawing", Drawing(self._looks, self._drawn_poses))
-        return system
+        return _drawn(system, Drawing(self._looks, self._drawn_poses))
 
     def draw(self, positions: Mapping | None = None, *, frames: bool = False,
              view: tuple[float, float] = (-60.0, 22.0)) -> Still:  # fmt: skip
@@ -271,16 +261,28 @@ class RobotModel:
 
     def _loads(self) -> list[Load]:
         """Springs and dampers of joints, by the poses of bodies."""
+        springs = [Load(potential=partial(self._spring, x)) for x in self.joints.values() if x.stiffness]
+        return springs + [Load(dissipation=partial(self._damper, x)) for x in self.joints.values() if x.damping]
 
-        def spring(joint: RobotJoint) -> Callable:
-            of = self._of(joint)
-            return lambda t, q, v, p: joint.stiffness * (all_positions([of], q)[joint.name] - joint.rest) ** 2 / 2
+    # Functions of systems are methods, which can be pickled, and no closures.
+    def _spring(self, joint: RobotJoint, t, q: PyTree, v: PyTree, params: PyTree):
+        return joint.stiffness * (all_positions([self._of(joint)], q)[joint.name] - joint.rest) ** 2 / 2
 
-        def damper(joint: RobotJoint) -> Callable:
-            return lambda t, q, v, p: joint.damping * rate_squared(self._of(joint), joint.name, q, v) / 2
+    def _damper(self, joint: RobotJoint, t, q: PyTree, v: PyTree, params: PyTree):
+        return joint.damping * rate_squared(self._of(joint), joint.name, q, v) / 2
 
-        springs = [Load(potential=spring(x)) for x in self.joints.values() if x.stiffness]
-        return springs + [Load(dissipation=damper(x)) for x in self.joints.values() if x.damping]
+    def _with_rotors(self, lagrangian: Callable | None, t, q: PyTree, v: PyTree, params: PyTree):
+        rotors = [joint for joint in self.joints.values() if joint.armature]
+        energies = [x.armature * rate_squared(self._of(x), x.name, q, v) / 2 for x in rotors]
+        return sum(energies) + (0.0 if lagrangian is None else lagrangian(t, q, v, params))
+
+    def _of_springs(self, t, q: PyTree, params: PyTree):
+        springs = [joint for joint in self.joints.values() if joint.stiffness]
+        return sum(x.stiffness * (q[x.name] - x.rest) ** 2 / 2 for x in springs)
+
+    def _of_dampers(self, dissipation: Callable | None, t, q: PyTree, v: PyTree, params: PyTree):
+        own = sum(x.damping * _squared(x, q, v) / 2 for x in self.joints.values() if x.damping)
+        return own if dissipation is None else own + dissipation(t, q, v, params)
 
     def _of(self, joint: RobotJoint) -> BodyJoint:
         return next(x for x in self._between.values() if joint in x.joints)
@@ -364,6 +366,10 @@ class RobotModel:
             listed = _listed([(f"'{x.name}' " * bool(x.name) + f"({x.line})" * bool(x.line)).strip() for x in whose])
             lines.append(f"  not taken: {what} {'of ' * any(x.name for x in whose)}{listed}".rstrip())
         return "\n".join(lines)
+
+
+def _drawn(system: System, drawing: Drawing) -> System:
+    return replace(system, lagrangian=replace(system.lagrangian, drawn=drawing))
 
 
 def _listed(whose: list[str]) -> str:

@@ -1,15 +1,17 @@
 """A tree of bodies in joint coordinates: its Lagrangian, and its accelerations without a mass matrix."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.bodies.body import Body, Pose, PoseOnTree, check_bodies
+from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies
+from lagjax.bodies.driven import Seen
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
@@ -32,7 +34,7 @@ from lagjax.bodies.tree.motion import (
     unflat,
 )
 from lagjax.bodies.tree.recursion import accelerated
-from lagjax.display import Drawing
+from lagjax.display import Drawing, Shape
 from lagjax.system import Holonomic, Nonholonomic, System
 
 
@@ -163,27 +165,43 @@ class Tree:
         loads = check_loads("tree.system", loads)
         dynamics = Dynamics(self._geometry, loads, potential)
         beside = Acting(others.pop("force", None), others.pop("dissipation", None))
-        acting = beside.with_loads(loads, lambda t, q, v, params: dynamics.placed(q, v, params))
-
-        def total(t, q, v, params):
-            return dynamics.lagrangian(t, q, v, params)
+        acting = beside.with_loads(loads, dynamics.placed)
 
         rows = [[x] if isinstance(x, Holonomic) else x for x in self.joints.values()]
         joined = [*(joint for row in rows for joint in row), *named(closures or {}).values()]
-        looks_like = [*(joint.function for joint in joined), *(load.potential for load in loads)]
-
-        def drawn(q, params):
-            return {name: Pose(pose.position, pose.quaternion) for name, pose in self.poses(q, params).items()}
-
-        setattr(total, "drawing", Drawing(lambda params: usual_shapes(self.bodies, looks_like, params), drawn))
+        looks_like = (*(joint.function for joint in joined), *(load.potential for load in loads))
         return System(
-            total,
+            TreeLagrangian(self, dynamics, looks_like),
             {name: _closure(dynamics, c) for name, c in named(closures or {}).items()},
             force=acting.force,
             dissipation=acting.dissipation,
             forward_dynamics=dynamics.articulated_body_recursion,
             **others,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class TreeLagrangian(SystemFunction):
+    """L of a tree in joint coordinates; `looks_like`: what says by its `drawing` how joints and loads look."""
+
+    tree: Tree
+    dynamics: "Dynamics"
+    looks_like: tuple[Callable | None, ...]
+    drawn: Drawing | None = None
+
+    def __call__(self, t, q: PyTree, v: PyTree, params: PyTree):
+        return self.dynamics.lagrangian(t, q, v, params)
+
+    @property
+    def drawing(self) -> Drawing:
+        """How the system is drawn: as given, or bodies as boxes between their joints."""
+        return self.drawn or Drawing(self._shapes, self._poses)
+
+    def _shapes(self, params: PyTree) -> tuple[Shape, ...]:
+        return usual_shapes(self.tree.bodies, self.looks_like, params)
+
+    def _poses(self, q: PyTree, params: PyTree) -> dict[str, Pose]:
+        return {name: Pose(pose.position, pose.quaternion) for name, pose in self.tree.poses(q, params).items()}
 
 
 class Dynamics(NamedTuple):
@@ -216,8 +234,10 @@ class Dynamics(NamedTuple):
         a = _accelerations(geometry, given, motion, wrench, *(flat(geometry, x) for x in (q, v, force)))
         return {name: jax.tree.map(jnp.zeros_like, y) for name, y in q.items()} | unflat(geometry, a)
 
-    def placed(self, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Placed]:
-        """q and v as loads and closures read them."""
+    def placed(self, t, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Any]:
+        """q and v as loads and closures read them; with no rates at all, q alone."""
+        if not v:
+            return _placed(self.geometry, q, params), v
         return jax.jvp(lambda q: _placed(self.geometry, q, params), (q,), (v,))
 
 
@@ -287,14 +307,5 @@ def _of_growth(geometry: Geometry, given: LinkNumbers) -> Array:
 
 def _closure(dynamics: Dynamics, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
     """A constraint of poses as one of joint coordinates."""
-    if isinstance(constraint, Holonomic):
-
-        def closes(t, q, params):
-            return constraint.g(t, _placed(dynamics.geometry, q, params), params)
-
-        return Holonomic(closes)
-
-    def moves(t, q, v, params):
-        return constraint.phi(t, *dynamics.placed(q, v, params), params)
-
-    return Nonholonomic(moves)
+    seen = Seen(constraint.function, dynamics.placed)
+    return Holonomic(seen.of_positions) if isinstance(constraint, Holonomic) else Nonholonomic(seen)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from lagjax.integrate.elements.compliant import Compliant
-from lagjax.integrate.elements.laws import CLOSED, STICKS, Laws, Tangent
+from lagjax.integrate.elements.laws import CLOSED, LEANS, STICKS, Laws, Tangent
 from lagjax.integrate.elements.laws_of_elements import laws_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.system import (
@@ -70,8 +70,10 @@ class WithElements(eqx.Module):
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
             speed = law.speeds(slip) if law.plane else side * slip
             side = side * slip / speed if law.plane else side
-            size = law.kinetic(speed, params) * law.normal_forces(t, q, v, forces, params)
-            found[law.name] = back(-side * size)[0]
+            leans, pressed = mode == LEANS, law.normal_forces(t, q, v, forces, params)
+            mu = jnp.where(leans, law.sticking(speed, params), law.kinetic(speed, params))
+            against = jnp.where(leans, -given.slack[slice(*law.at)], side)
+            found[law.name] = back(-against * mu * pressed)[0]
         return found
 
 

@@ -1,8 +1,9 @@
 """The laws of elements: what holds in which mode, and the guards at which modes end.
 
 A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
-side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. A spring behind a gap is apart (0) or
-pressed (1), with a force (`compliant.py`).
+side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. Or it rests since others hold it (3),
+with a force of size μ N and a fixed direction (`redundant.py`), which stands in the place of its slack. A spring behind
+a gap is apart (0) or pressed (1), with a force (`compliant.py`).
 
 A sliding velocity in a plane is two rows with one mode: it slides (1) with a force -μ N s/|s|, which has no limit at
 s = 0. Its sliding ends at a speed δ, the slack of its mode, and begins with 2 δ in the direction of the acceleration: a
@@ -34,7 +35,7 @@ from lagjax.jaxtools import is_traced, stop_gradient
 from lagjax.system import InModes, State
 
 OPEN, CLOSED = 0, 1
-FREE, STICKS = 0, 2
+FREE, STICKS, LEANS = 0, 2, 3
 ALL_CLOSED = {"where contacts stick": STICKS, "where contacts slide": 1}
 
 
@@ -256,7 +257,8 @@ class Laws(eqx.Module):
             most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params)
             holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
             slides = law.speeds(slips) - 2 * given.slack[slice(*law.at)] if law.plane else mode * slips
-            found.append(jnp.where(mode == STICKS, holds, jnp.where(mode == FREE, 1.0, slides)))
+            # More than the direction that LEANS has as its slack.
+            found.append(jnp.where(mode == STICKS, holds, jnp.where((mode == FREE) | (mode == LEANS), 2.0, slides)))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])

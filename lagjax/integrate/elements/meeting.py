@@ -24,9 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.complementarity import ContactProblem, directions, lengths, pseudo_inverse, solved
+from lagjax.integrate.elements.complementarity import ContactProblem, Forces, directions, lengths, pseudo_inverse
 from lagjax.integrate.elements.impact_law import Struck
-from lagjax.integrate.elements.laws import CLOSED, FREE, OPEN, STICKS, Laws
+from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
+from lagjax.integrate.elements.redundant import AtBound, Held, within_laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -128,9 +129,13 @@ class AsFound(NamedTuple):
 
 
 class ContactForces(NamedTuple):
-    """Forces that obey the laws, if `found`, with the accelerations `a`; below which size either is zero, for each."""
+    """Forces that obey the laws, if `found`, with the accelerations `a`; below which size either is zero, for each.
+
+    `bound`: what has the bound of its law though it does not move (`redundant.py`).
+    """
 
     problem: ContactProblem
+    bound: AtBound
     forces: Float[Array, " k"]
     a: Float[Array, " k"]
     no_force: Float[Array, " k"]
@@ -141,7 +146,7 @@ class ContactForces(NamedTuple):
         """Which gaps that touch stay closed: those that are pushed, and those that do not open."""
         # Round-off may leave a force a little above zero: it pushes where it outweighs the acceleration.
         stays = (self.forces > self.problem.step * self.a) | (self.a <= self.no_acceleration)
-        return self.problem.may_push & stays[: self.problem.may_push.size]
+        return self.problem.may_push & ~self.bound.lifted & stays[: self.problem.may_push.size]
 
     def sides(self) -> Float[Array, " kT"]:
         """The side, or direction, to which each sliding velocity slides on, or begins to slide; zero where it sticks.
@@ -325,7 +330,7 @@ class Meeting(eqx.Module):
         return contacts.closed & (jnp.abs(self._velocities(at)[:normals]) <= slower)
 
     def _problem(self, at: AtMeeting, rows: Rows, touching: Bool[Array, " kN"], slides: Float[Array, " kT"]):
-        """The complementarity problem of the forces at accelerations."""
+        """The complementarity problem of the forces at accelerations, and the rows that these hold."""
         model, t, x, u, _ = at
         mine, always = self._places(model)
         every, linear = constraints.acceleration_rows(model, t, x, u), mass_and_forcing(self._free(at), t, x, u)
@@ -336,27 +341,38 @@ class Meeting(eqx.Module):
         moving, resting = (self._coefficients(at, slips, sticking) for sticking in (False, True))
         mu = jnp.where(lengths(slides, self.laws.partners) > 0, moving, resting)
         free = rows.jacobian @ a - every.gamma[mine]
-        return ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
+        problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
+        return problem, Held(rows.jacobian, held, multipliers, rows.of_constraints)
 
     def _contact_forces(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> ContactForces:
         """The forces at accelerations."""
-        problem = self._problem(at, rows, self._touching(at, contacts), self._sliding(at, contacts))
-        forces, found = solved(problem)
-        no_force = _no_force(problem, forces, contacts.scale)
-        # Where nothing pushes and nothing opens, a contact is closed; what has just let go, by its slack, is not. It
-        # may open far more slowly than by its own response, since others stay closed.
+        problem, held = self._problem(at, rows, self._touching(at, contacts), self._sliding(at, contacts))
+        # What has just let go, by its slack, is not closed where nothing pushes and nothing opens. It may open far more
+        # slowly than by its own response, since others stay closed.
         let_go = contacts.fired & self.laws.holds(at.given.modes)
-        least = jnp.where(let_go, LET_GO * at.given.slack[: let_go.size], no_force)
-        a = problem.matrix @ forces + problem.free
-        return ContactForces(problem, forces, a, no_force, least / problem.step, found)
+        # What others hold lets go with them.
+        with_others = (at.given.modes[: let_go.size] == LEANS) & jnp.any(let_go)
 
-    def _modes(self, at: AtMeeting, stays: Bool[Array, " kN"], sides: Float[Array, " kT"]) -> Int[Array, " kNT"]:
-        """The modes of gaps, and of sliding velocities that slide to these `sides`, zero where they stick or are
-        free."""
-        laws, owners = self.laws, np.array(self.laws.owners, int)
+        def solution(bound: AtBound, forces: Forces) -> ContactForces:
+            no_force = _no_force(problem, forces.forces, contacts.scale)
+            least = jnp.where(with_others, LET_GO * no_force, no_force)
+            least = jnp.where(let_go, LET_GO * at.given.slack[: let_go.size], least)
+            a = problem.matrix @ forces.forces + problem.free
+            return ContactForces(problem, bound, forces.forces, a, no_force, least / problem.step, forces.found)
+
+        def holds(bound: AtBound, forces: Forces) -> tuple[Array, Array]:
+            found = solution(bound, forces)
+            return self.laws.holds(self._modes(at, found)), found.no_force
+
+        return solution(*within_laws(problem, held, holds))
+
+    def _modes(self, at: AtMeeting, solution: ContactForces) -> Int[Array, " kNT"]:
+        """The modes of gaps and of sliding velocities that follow from forces."""
+        laws, owners, stays, sides = self.laws, np.array(self.laws.owners, int), solution.stays(), solution.sides()
         rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], laws.rubs(at.given.modes))
         slides = jnp.where(laws.in_planes, lengths(sides, laws.partners) > 0, sides).astype(int)
-        tangents = jnp.where(rubs, jnp.where(slides != 0, slides, STICKS), FREE)
+        rests = jnp.where(lengths(solution.bound.leans, laws.partners) > 0, LEANS, STICKS)
+        tangents = jnp.where(rubs, jnp.where(slides != 0, slides, rests), FREE)
         return jnp.concatenate([jnp.where(stays, CLOSED, OPEN), tangents]).astype(at.given.modes.dtype)
 
     def _decided(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> Decided:
@@ -366,7 +382,7 @@ class Meeting(eqx.Module):
             return Decided(at.given.modes[:0], at.u[:0], at.u[:0], jnp.asarray(True))
         solution = self._contact_forces(at, rows, contacts)
         sides = solution.sides()
-        modes = self._modes(at, solution.stays(), sides)
+        modes = self._modes(at, solution)
         holds, begins = laws.holds(modes), laws.in_planes & (modes[normals:] == 1) & ~solution.problem.given
         # What begins to slide in a plane needs a direction: it gets twice the speed at which it would end.
         ends_at, least = self._ends_at(at.u.dtype), ENDS_AT_ROUND_OFFS * jnp.finfo(at.u.dtype).eps
@@ -374,6 +390,7 @@ class Meeting(eqx.Module):
         ends = jnp.where(begins, slower * contacts.ends, contacts.ends)
         onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, jnp.nan)])
         slowest = jnp.where(laws.in_planes, ends, _round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]))
+        slowest = jnp.where(modes[normals:] == LEANS, solution.bound.leans, slowest)
         slack = jnp.where(holds, solution.no_force, jnp.concatenate([contacts.gap, slowest]))
         return Decided(modes, slack, jnp.where(holds, 0.0, onto), solution.found)
 

@@ -228,6 +228,8 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         own_size = jnp.where(scales.unknown, jnp.maximum(own_size, from_nothing), own_size)
         if any(self.angles):
             others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
+        # At rest velocities are the round-off of forces that cancel, whose size only the start tells.
+        others = jnp.maximum(others, scales.reach * scales.over_root_mass)
         return self.tolerances.rtol[:, None] * own_size + rounding(others)
 
     def _capped_angles(self, sizes):

@@ -16,7 +16,7 @@ NO_PHASE = -1
 # What modes are called, by the kind of what they are modes of.
 MODES = {
     "gap": {0: "open", 1: "closed"},
-    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks"},
+    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks", 3: "is held by others"},
     "spring": {0: "apart", 1: "pressed"},
 }
 

@@ -16,7 +16,10 @@ from lagjax.integrate.trajectory.results import in_words
 # The counts that a trajectory keeps for each motion.
 COUNTS = "num_steps", "num_accepted_steps", "num_rejected_steps"
 
-MODES = {"of_gaps": "0 open, 1 closed", "of_sliding_velocities": "1 and -1 slides, 2 sticks, 0 free"}
+MODES = {
+    "of_gaps": "0 open, 1 closed",
+    "of_sliding_velocities": "1 and -1 slides, 2 sticks, 3 is held by others, 0 free",
+}
 
 
 def import_xarray():

@@ -1,0 +1,117 @@
+"""Systems of bodies in other processes: they are pickled, and copied, with all that acts in them."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+
+UP, ACROSS = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+FILE = """<robot name="slide"><link name="rail"/><link name="cart"><inertial><mass value="2"/>
+<inertia ixx="1" iyy="1" izz="1"/></inertial></link><joint name="s" type="prismatic"><parent link="rail"/>
+<child link="cart"/><dynamics damping="0.5"/></joint></robot>"""
+
+
+def turning(t, params):
+    """The motion of a table."""
+    return lj.Pose.at(angle=0.5 * t)
+
+
+def bowl(r, params):
+    """The distance to a sphere, from inside."""
+    return 5.0 - jnp.sqrt(jnp.sum(r**2))
+
+
+def loaded(torque: float = 0.5) -> lj.System:
+    """A body on a pivot with a load of each kind."""
+    bob, ground = lj.Body("bob", 1.0, (0.1, 0.2, 0.2)), lj.ground.at()
+    loads = [
+        lj.weight([bob]),
+        lj.spring(lj.ground.at((1.0, 0.0, 0.0)), bob.at(), 3.0, length=0.5, damping=0.1),
+        lj.torsion(ground, bob.at(), 1.0, angle=0.2, damping=0.3),
+        lj.motor(ground, bob.at(), torque),
+        lj.applied(bob.at(), (0.1, 0.2, 0.3)),
+    ]
+    return lj.multibody([bob], {"pivot": lj.spherical(ground, bob.at(UP))}, loads)
+
+
+def cases() -> dict:
+    """Systems of each kind, with a state of each."""
+    ball, table = lj.Body("ball", 1.0, (0.4, 0.4, 0.4)), lj.Body("table", motion=turning)
+    bob, near, far = (lj.Pose.at((0.1, 0.2, z), ACROSS, 0.3) for z in (-1.0, 1.0, -4.0))
+    arm, hand = (lj.Body(name, 1.0, (0.1, 0.1, 0.01)) for name in ("arm", "hand"))
+    joints = {
+        "shoulder": lj.revolute(lj.ground.at(axis=ACROSS), arm.at((0.0, 0.0, 0.5), axis=ACROSS)),
+        "elbow": lj.revolute(arm.at((0.0, 0.0, -0.5), axis=ACROSS), hand.at((0.0, 0.0, 0.5), axis=ACROSS)),
+    }
+    closed = {"end": lj.planar(lj.ground.at(), hand.at()), "rolls": lj.rolling_sphere(hand.at(), lj.ground.at(), 1.0)}
+    touching = lj.rolling_sphere(ball.at(), lj.ground.at(), 1.0)["touches"]
+    model = lj.read_urdf(FILE)
+    still, spun = ({"ball": x.moving((0.3, 0.0, 0.0), (0.1, 0.2, 0.3))} for x in (near, far))
+    angles = {"shoulder": jnp.asarray(0.3), "elbow": jnp.asarray(0.1)}
+    return {
+        "loads": (loaded(), {"bob": bob}, {"bob": bob.moving(spin=(0.1, 0.2, 0.3))}),
+        "driven": (lj.multibody([table, ball], lj.rolling_sphere(ball.at(), table.at(), 1.0)), {"ball": near}, still),
+        "surface": (
+            lj.multibody([ball], {"on": lj.rolling_sphere(ball.at(), lj.Surface(bowl), 1.0)}), {"ball": far}, spun
+        ),
+        "contact": (
+            lj.multibody([ball], elements={"floor": lj.Contact(touching.g, restitution=0.5)}), {"ball": near}, still
+        ),
+        "tree": (lj.Tree([arm, hand], joints).system([lj.weight([arm]), lj.motor(*ends(joints), 0.5)], closed),
+                 angles, angles),
+        "file": (model.system(), *model.state({"s": 0.5}, {"s": 3.0})),
+        "joints of a file": (model.joint_system(), *model.joint_state({"s": 0.5}, {"s": 3.0})),
+    }  # fmt: skip
+
+
+def ends(joints: dict) -> tuple:
+    """The two places of the elbow."""
+    return joints["elbow"].g.a, joints["elbow"].g.b
+
+
+def program(system: lj.System, q, v) -> tuple[str, list]:
+    """The program of the functions of a system, from which its accelerations follow, with its numbers."""
+
+    def every(q, v):
+        found = [system.lagrangian(0.3, q, v, None)]
+        found += [c.residual(0.3, q, v, None) for c in system.constraints.values()]
+        found += [f(0.3, q, v, None) for f in (system.force, system.dissipation) if f is not None]
+        return found + [x.gap(0.3, q, None) for x in (system.elements or {}).values()]
+
+    closed = jax.make_jaxpr(every)(q, v)
+    return str(closed.jaxpr), [np.asarray(x).tolist() for x in closed.consts]
+
+
+IN_ANOTHER = """
+import pickle, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+from tests.bodies.test_pickling import program
+cases = pickle.load(sys.stdin.buffer)
+pickle.dump({name: program(*case) for name, case in cases.items()}, sys.stdout.buffer)
+"""
+
+
+@pytest.mark.slow
+def test_in_another_process():
+    """Systems of each kind are there the same programs of the same numbers. Twin: not with twice the torque."""
+    here = cases()
+    ran = subprocess.run([sys.executable, "-c", IN_ANOTHER], input=pickle.dumps(here), capture_output=True, check=True)
+    found = pickle.loads(ran.stdout)
+    assert found == {name: program(*case) for name, case in here.items()}
+    assert found["loads"] != program(loaded(1.0), *here["loads"][1:])
+
+
+def test_copies():
+    """A deep copy is the same system, and one that was pickled draws the same shapes."""
+    system = loaded()
+    assert copy.deepcopy(system) == system
+    shapes, again = (x.lagrangian.drawing.shapes(None) for x in (system, pickle.loads(pickle.dumps(system))))
+    assert [*map(repr, shapes)] == [*map(repr, again)] and len(shapes) > 1
