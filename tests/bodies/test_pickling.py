@@ -51,7 +51,7 @@ def cases() -> dict:
         "elbow": lj.revolute(arm.at((0.0, 0.0, -0.5), axis=ACROSS), hand.at((0.0, 0.0, 0.5), axis=ACROSS)),
     }
     closed = {"end": lj.planar(lj.ground.at(), hand.at()), "rolls": lj.rolling_sphere(hand.at(), lj.ground.at(), 1.0)}
-    touching = lj.rolling_sphere(ball.at(), lj.ground.at(), 1.0)["touches"]
+    touching = lj.rolling_sphere(ball.at(), lj.ground.at(), 1.0)["touches"].function
     model = lj.read_urdf(FILE)
     still, spun = ({"ball": x.moving((0.3, 0.0, 0.0), (0.1, 0.2, 0.3))} for x in (near, far))
     angles = {"shoulder": jnp.asarray(0.3), "elbow": jnp.asarray(0.1)}
@@ -62,7 +62,7 @@ def cases() -> dict:
             lj.multibody([ball], {"on": lj.rolling_sphere(ball.at(), lj.Surface(bowl), 1.0)}), {"ball": far}, spun
         ),
         "contact": (
-            lj.multibody([ball], elements={"floor": lj.Contact(touching.function, restitution=0.5)}), {"ball": near}, still
+            lj.multibody([ball], elements={"floor": lj.Contact(touching, restitution=0.5)}), {"ball": near}, still
         ),
         "tree": (lj.Tree([arm, hand], joints).system([lj.weight([arm]), lj.motor(*ends(joints), 0.5)], closed),
                  angles, angles),
