@@ -6,6 +6,10 @@ way works in arrays: one matrix (`saddle_point.py`), or a band where the system 
 for small systems: their equations are also written out number by number (`scalar_equations.py`), which is many times as
 fast, and gives NaN where it fails.
 
+Either may be taken for regular, by callers who solve again if they find NaN: no program then contains the robust way.
+In one matrix all constraint equations are solved with, which compiles in two thirds of the time; not where there are
+as many as coordinates, as some then depend on others if anything moves.
+
 A caller has an `Equations` and does not choose between them.
 """
 
@@ -54,8 +58,10 @@ class Equations(eqx.Module):
 
     @property
     def are_taken_for_regular(self) -> bool:
-        """Whether the equations are assumed regular: the result is NaN, unexplained, where the fast way fails."""
-        return self.written is not None and self.written.may_fail and not self.fallback
+        """Whether the equations are assumed regular: the result is NaN, unexplained, where they are not."""
+        if self.written is None:
+            return isinstance(self.form, Dense) and self.form.regular
+        return self.written.may_fail and not self.fallback
 
     def operations(self, t: Array, q: PyTree, v: PyTree) -> int:
         """How many operations the accelerations have; written out, with those of the return to the constraints."""
@@ -140,8 +146,10 @@ class Equations(eqx.Module):
         )  # fmt: skip
         return (model.tree(x), model.tree(u)), verdict
 
-    def _known_at(self, t: Array, state: Array) -> list:
-        assert self.written is not None
+    def _known_at(self, t: Array, state: Array):
+        if self.written is None:
+            assert isinstance(self.form, Dense)
+            return self.form.with_more(self.model, t, *state)
         q, v = map(self.model.tree, state)
         return self.written.equations.with_more_at(self.prepared[0], t, q, v)
 
@@ -196,13 +204,14 @@ def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> 
     if written is not None:
         both = written.equations, written.project
         prepared = tuple(None if numbers is None else numbers.prepare(model) for numbers in both)
+    regular = not fallback and 0 < model.m < model.n and model.off is None
     fallback = fallback and written is not None and written.may_fail
     if model.solves_itself:
         return Equations(model, prepared, ForwardDynamics(_named(model)), None, False, None)
     sparse, unknowns = plan(model), model.n + model.m
     # Other small systems are written out, where zeros cost nothing.
     may_divide = has_networks(model) and not model.m and unknowns <= UP_TO
-    form = Dense(unknowns, may_divide and is_diagonal(model)) if sparse is None else Banded(sparse)
+    form = Dense(unknowns, may_divide and is_diagonal(model), regular) if sparse is None else Banded(sparse)
     return Equations(model, prepared, form, written, fallback, users)
 
 

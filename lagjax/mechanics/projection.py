@@ -12,19 +12,17 @@ Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, Â§IV.4 and Â
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.jaxtools import compiled, jitted, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.mechanics.first_order import resolved
-from lagjax.numerics import largest
 from lagjax.system import InModes, Model, constraints, coordinates, given_in
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
@@ -43,7 +41,7 @@ class Projected(NamedTuple):
 
 def returned(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Array, atol: Array) -> Projected:
     """Return the state moved onto the constraints; NaN if equations assumed regular turn out singular."""
-    if equations.are_taken_for_regular:
+    if equations.are_written and equations.are_taken_for_regular:
         return Projected(*equations.projected(t, q, v), jnp.asarray(True))
     return to_manifold(equations, t, q, v, rtol, atol)
 
@@ -55,67 +53,63 @@ def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Arra
     `holds` is true if a displacement of `atol + rtol |y|` accounts for what is left of each residual, including those
     of dependent constraints; `rtol` and `atol` are one number, or one for q and one for v.
     """
-    model, (x, u) = equations.model, equations.model.vectors(q, v)
+    model, y = equations.model, jnp.stack(equations.model.vectors(q, v))
     if not model.m:
-        return Projected(q, model.tree(resolved(model, t, x, u)), jnp.asarray(True))
+        return Projected(q, model.tree(resolved(model, t, *y)), jnp.asarray(True))
     # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
     frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
-    displacement, slope = frozen.displacement(*at), frozen.row_sizes(*at)
-    of_q, of_v = _allowed(jnp.abs(jnp.concatenate([x, u])), rtol, atol)
-    live, holonomic, left = (model, t), model.holonomic, []
+    displacement, (slopes, size) = frozen.displacement(*at), _slopes(model, frozen.row_sizes(*at), *at[1:])
+    first_level = model.holonomic.sum()
 
-    if holonomic.any():
+    def step(r: Array):
+        of_positions, of_velocities = jnp.split(r, [first_level])
         # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        x, r = _newton(_position_residual, live, x, partial(displacement, holonomic), slope[holonomic])
-        left.append(jnp.abs(r) <= slope[holonomic] * of_q)
+        along_q = displacement(model.holonomic, of_positions) if first_level else jnp.zeros_like(y[0])
+        return jnp.stack([along_q, displacement(np.ones(model.m, bool), of_velocities)])
 
-    u, r = _newton(_velocity_residual, (*live, x), u, partial(displacement, np.ones_like(holonomic)), slope)
-    left.append(jnp.abs(r) <= slope * of_v)
-    holds = jnp.all(jnp.concatenate(left))
-    return Projected(model.tree(x), model.tree(resolved(model, t, x, u)), lax.stop_gradient(holds))
+    def sizes(r: Array):
+        return jnp.max(jnp.abs(r)[:, None] / jnp.where(slopes > 0, slopes, jnp.inf), axis=0)
+
+    y, r = _newton(_residuals, (model, t), y, step, sizes)
+    holds = jnp.all(jnp.abs(r) <= slopes @ _allowed(size, rtol, atol))
+    return Projected(model.tree(y[0]), model.tree(resolved(model, t, *y)), lax.stop_gradient(holds))
 
 
-# Jitted, so that JAX traces them once for all the places of a program that need them.
+# Jitted, so that JAX traces it once for all the places of a program that need it.
 @jitted
-def _position_residual(problem: tuple, x: Array) -> Array:
-    return constraints.position_residual(*problem, x)
+def _residuals(problem: tuple, y: Float[Array, "2 n"]) -> Array:
+    """The residuals of positions, and after them those of velocities."""
+    return jnp.concatenate([constraints.position_residual(*problem, y[0]), constraints.velocity_residual(*problem, *y)])
 
 
-@jitted
-def _velocity_residual(problem: tuple, u: Array) -> Array:
-    return constraints.velocity_residual(*problem, u)
+def _newton(residual: Callable, problem: PyTree, y: Array, step: Callable, sizes: Callable):
+    """Iterate `y - step(r(problem, y))` for positions and velocities together; return y and what is left of r.
 
-
-def _newton(residual: Callable, problem: PyTree, y: Array, displacement: Callable, slope: Array):
-    """Iterate `y - displacement(r(problem, y))`; return y and what is left of r.
-
-    Only the last iteration is differentiated, enough where r vanishes. The residual is in the program twice: four
-    copies made up half of a vehicle's.
+    `sizes(r)`: of both levels. Only the last two iterations are differentiated, enough where r vanishes: velocities
+    follow the positions that the first of them moves. The residual is in the program twice: four copies made up half
+    of a vehicle's.
     """
     fixed, start = stop_gradient((problem, y))
-
-    def size(r: Array):
-        return largest(r / jnp.where(slope > 0, slope, 1.0))
 
     def iterate(state):
         i, _, y, first, _ = state
         r = residual(fixed, y)
-        first = jnp.where(i == 0, size(r), first)
-        going = size(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(largest(y), first)
-        return i + 1, y, y - displacement(r), first, going
+        first = jnp.where(i == 0, sizes(r), first)
+        going = jnp.any(sizes(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(jnp.max(jnp.abs(y), axis=1), first))
+        return i + 1, y, y - step(r), first, going
 
     def unfinished(state):
         return (state[0] <= ITERATIONS) & state[4]
 
-    at_start = jnp.asarray(0), start, start, jnp.zeros((), y.dtype), jnp.asarray(True)
+    at_start = jnp.asarray(0), start, start, jnp.zeros(2, y.dtype), jnp.asarray(True)
     near = lax.while_loop(unfinished, iterate, at_start)[1]
 
     def last(y: Array, moves: Array):
         r = residual(problem, y)
-        return y - displacement(jnp.where(moves, r, 0.0)), r
+        return y - step(jnp.where(moves, r, 0.0)), r
 
-    y, residuals = lax.scan(last, near + (y - lax.stop_gradient(y)), jnp.asarray([True, False]))
-    return y, residuals[1]
+    y, residuals = lax.scan(last, near + (y - lax.stop_gradient(y)), jnp.asarray([True, True, False]))
+    return y, residuals[-1]
 
 
 def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array):
@@ -173,8 +167,7 @@ def _allowed(size: Array, rtol: Array, atol: Array):
 def residuals_and_slopes(equations: Equations, t: Array, q: PyTree, v: PyTree):
     """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
     model, (x, u) = equations.model, equations.model.vectors(q, v)
-    position, velocity = _position_residual((model, t), x), _velocity_residual((model, t, x), u)
-    return jnp.concatenate([position, velocity]), *_slopes(model, equations.row_sizes(t, q, v), q, v)
+    return _residuals((model, t), jnp.stack([x, u])), *_slopes(model, equations.row_sizes(t, q, v), q, v)
 
 
 def _slopes(model: Model, slope: Array, q: PyTree, v: PyTree):

@@ -83,14 +83,31 @@ def acceleration_round_off(inertia, forces, x: Array, u: Array):
     return 1e4 * jnp.finfo(x.dtype).eps * (by_force + by_velocity)
 
 
+class Known(NamedTuple):
+    """What is known of a state besides: L, M, A and the residuals of positions and velocities."""
+
+    lagrangian: Float[Array, ""]
+    mass: Float[Array, "n n"]
+    jacobian: Float[Array, "m n"]
+    residuals: Float[Array, " k"]
+
+
+def known_at(model: Model, t: Array, x: Array, u: Array, mass: Array, jacobian: Array) -> Known:
+    """What is known of a state, given M and A."""
+    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
+    return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, jnp.concatenate([position, velocity]))
+
+
 class Dense(NamedTuple):
     """The equations solved as one matrix of `unknowns` rows. A state is given as (model, t, x, u).
 
-    `diagonal`: there are no constraints, and the mass matrix is known to be diagonal.
+    `diagonal`: there are no constraints, and the mass matrix is known to be diagonal. `regular`: all constraint
+    equations are solved with, and the results are NaN where they depend on each other.
     """
 
     unknowns: int
     diagonal: bool = False
+    regular: bool = False
 
     def accelerations(
         self,
@@ -113,20 +130,30 @@ class Dense(NamedTuple):
             return dense.solve(linear.mass, linear.forcing), no_multipliers
         if baumgarte_rate is not None:
             gamma = gamma + constraints.baumgarte_feedback(model, t, x, u, baumgarte_rate)
-        independent = chosen(model, jacobian) if independent is None else independent
+        independent = self._chosen(model, jacobian) if independent is None else independent
         return _solved(linear, jacobian, gamma, independent)[:2]
+
+    def with_more(self, model: Model, t: Array, x: Array, u: Array):
+        """The accelerations and the stacked multipliers, and what else is `Known`."""
+        linear, rows = linear_equations(model, t, x, u)
+        a, multipliers, unique = _solved(linear, *rows, self._chosen(model, rows.jacobian))
+        a = jnp.where(unique, completed(model, t, x, u, a), jnp.nan)
+        return (model.tree(a), multipliers), known_at(model, t, x, u, linear.mass, rows.jacobian)
+
+    def _chosen(self, model: Model, jacobian: Array, dependent_below: float | None = None):
+        return None if self.regular else chosen(model, jacobian, dependent_below)
 
     def independent(
         self, model: Model, t: Array, x: Array, u: Array, dependent_below: float | None = None
-    ) -> Bool[Array, " m"]:
-        """Which constraint equations to solve with."""
-        return chosen(model, linear_equations(model, t, x, u)[1].jacobian, dependent_below)
+    ) -> Bool[Array, " m"] | None:
+        """Which constraint equations to solve with; None: all."""
+        return self._chosen(model, linear_equations(model, t, x, u)[1].jacobian, dependent_below)
 
     def displacement(self, *state) -> Callable:
         """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
         linear, (jacobian, _) = linear_equations(*state)
         # The rows are chosen here and not at the step's start, as the step may have come near a singular position.
-        matrix = displacement_map(linear.mass, jacobian, chosen(state[0], jacobian))
+        matrix = displacement_map(linear.mass, jacobian, self._chosen(state[0], jacobian))
         return lambda which, r: matrix[:, which] @ r
 
     def row_sizes(self, *state) -> Float[Array, " m"]:
@@ -186,16 +213,37 @@ def chosen(model: Model, jacobian: Array, dependent_below: float | None = None) 
     return independent if model.off is None else independent & ~model.off
 
 
-def solve_saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array):
-    """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A."""
+def solve_saddle_point(mass: Array, jacobian: Array, forcing: Array, gamma: Array, independent: Array | None):
+    """Solve `M a - Aᵀ λ = F`, `A a = gamma` for a and the shortest λ, with the independent rows of A.
+
+    If None, with all of them; NaN where they depend on each other.
+    """
     n = mass.shape[0]
+    if independent is None:
+        matrix, inverted = inverse_if_regular(mass, jacobian)
+        a, multipliers = jnp.split(dense.refined(inverted, matrix, jnp.concatenate([forcing, gamma])), [n])
+        return a, -multipliers
     known = jnp.concatenate([forcing, _pick(gamma, independent, n)])
     solution = dense.solve(saddle_point_matrix(mass, jacobian, independent), known)
     multipliers = _spread(-solution[n:], independent)
     return solution[:n], minimum_norm(jacobian, multipliers, independent)
 
 
-def _solved(linear: LinearEquation, jacobian: Array, gamma: Array, independent: Array) -> Reactions:
+def inverse_if_regular(mass: Array, jacobian: Array):
+    """The saddle-point matrix of all rows, and its inverse: NaN where a row would be left out.
+
+    Its columns hold displacements that change one residual by one and the others not at all. None of these is shorter
+    than 1 / (|A_i| s), with s the sine of the angle of the row to the span of the others.
+    """
+    m, n = jacobian.shape
+    matrix = jnp.block([[mass, jacobian.T], [jacobian, jnp.zeros((m, m), mass.dtype)]])
+    inverted = dense.inverse(matrix)
+    squared = jnp.sum(jacobian**2, axis=1) * jnp.sum(inverted[:n, n:] ** 2, axis=0)
+    regular = jnp.max(squared) < DEPENDENT_BELOW[np.dtype(mass.dtype)] ** -2
+    return matrix, jnp.where(regular, inverted, jnp.nan)
+
+
+def _solved(linear: LinearEquation, jacobian: Array, gamma: Array, independent: Array | None) -> Reactions:
     """The solution where the force may depend on the multipliers."""
     return with_reactions(
         lambda forcing, gamma: solve_saddle_point(linear.mass, jacobian, forcing, gamma, independent),
@@ -222,9 +270,11 @@ def _scaled_matrix(mass: Array, jacobian: Array, independent: Array):
     return saddle_point_matrix(scaled(mass), scaled(jacobian), independent)
 
 
-def displacement_map(mass: Array, jacobian: Array, independent: Array):
+def displacement_map(mass: Array, jacobian: Array, independent: Array | None):
     """The shortest displacement in the metric of M that changes the residuals by a given amount, (n, m)."""
     n = mass.shape[0]
+    if independent is None:
+        return inverse_if_regular(mass, jacobian)[1][:n, n:]
     inverted = dense.inverse(saddle_point_matrix(mass, jacobian, independent))
     return _spread(inverted[:n, n:], independent)
 

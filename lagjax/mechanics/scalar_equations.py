@@ -21,12 +21,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from lagjax.jaxtools import TooLong, decided, is_array, is_plain
 from lagjax.mechanics.first_order import completed, resolved, without_mass
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanics.multiplier_forces import with_reactions
+from lagjax.mechanics.saddle_point import known_at
 from lagjax.mechanics.scalar_form import Numbers
 from lagjax.mechanics.structure import is_diagonal
 from lagjax.numerics import dense
@@ -46,15 +47,6 @@ LONG, CONSTRAINED_LONG = 3000, 6000
 ON_THE_WAY = 5
 # Two iterations are enough where the second one moves the state by less than this share of its size.
 SMALL_CORRECTION = 1e-7
-
-
-class Known(NamedTuple):
-    """What is known of a state besides: L, M, A and the residuals of positions and velocities."""
-
-    lagrangian: Float[Array, ""]
-    mass: Float[Array, "n n"]
-    jacobian: Float[Array, "m n"]
-    residuals: Float[Array, " k"]
 
 
 class WrittenOut(NamedTuple):
@@ -102,7 +94,7 @@ def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     x, u = model.vectors(q, v)
     linear = mass_and_forcing(model, t, x, u)
     if model.n == 1 and not model.m:
-        a, known = linear.forcing / linear.mass[0], _known(model, t, x, u, linear.mass, jnp.zeros((0, 1), x.dtype))
+        a, known = linear.forcing / linear.mass[0], known_at(model, t, x, u, linear.mass, jnp.zeros((0, 1), x.dtype))
         return (model.tree(completed(model, t, x, u, a)), jnp.zeros(0, x.dtype)), known
     rows = constraints.acceleration_rows(model, t, x, u)
     solver = dense.Saddle(linear.mass, rows.jacobian, diagonal, model.off)
@@ -110,12 +102,7 @@ def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
     a = completed(model, t, x, u, a)
     valid = solver.valid if linear.response is None else solver.valid & unique
     a = a if diagonal else jnp.where(decided(valid), a, jnp.nan)
-    return (model.tree(a), multipliers), _known(model, t, x, u, linear.mass, rows.jacobian)
-
-
-def _known(model: Model, t: Array, x: Array, u: Array, mass: Array, jacobian: Array) -> Known:
-    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
-    return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, jnp.concatenate([position, velocity]))
+    return (model.tree(a), multipliers), known_at(model, t, x, u, linear.mass, rows.jacobian)
 
 
 def _projected(known_of: Callable, model: Model, t: Array, q: PyTree, v: PyTree):

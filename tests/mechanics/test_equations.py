@@ -9,6 +9,7 @@ import lagjax as lj
 from lagjax.jaxtools.jaxpr import equations as equations_in
 from lagjax.mechanics import equations, sparse_saddle_point
 from lagjax.mechanics.equations import equations_of
+from lagjax.mechanics.projection import to_manifold
 from lagjax.mechanics.saddle_point import Dense
 from lagjax.mechanics.sparse_saddle_point import Banded
 from lagjax.system import coordinates
@@ -79,6 +80,42 @@ def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     assert bool(finite) and not bool(nowhere)
     # Dependent equations share the force equally.
     np.testing.assert_allclose(*multipliers["rod"], rtol=1e-12)
+
+
+def test_in_arrays_they_are_the_same_or_nan():
+    """Taken for regular, all equations are solved with: where the robust way leaves one out, the results are NaN.
+
+    The third constraint is the first link's and a little more, by as much as it turns the row. At a turn of one the
+    start is returned to where the robust way returns it.
+    """
+
+    def more(t, q, p):
+        return (jnp.sum(q[0] ** 2) - p["l"] ** 2 + p["turn"] * (q[1, 0] - Q[1, 0]))[None]
+
+    system = lj.System(SYSTEM.lagrangian, SYSTEM.constraints | {"more": lj.Holonomic(more)})
+    s = coordinates.state(0.0, Q, 0.0 * V, OF_CHAIN | {"turn": 1.0})
+
+    @jax.jit
+    def both(turn, shift):
+        model, q = model_of(system, *s).of(s.params | {"turn": turn}), s.q + shift * jnp.array([[1.0, 2.0], [3.0, 4.0]])
+        robust, regular = equations_of(model), equations_of(model, fallback=False)
+        assert regular.are_taken_for_regular and not robust.are_taken_for_regular and not regular.are_written
+        of = lambda one: (one.accelerations(s.t, q, s.v), one.displacement(s.t, q, s.v)(np.ones(3, bool), jnp.ones(3)))
+        (begun, verdict), moved = regular.begin(s.t, q, s.v, True), to_manifold(robust, s.t, q, s.v, 1e-12, 1e-12)
+        valid = verdict.finite & ~verdict.singular
+        return of(regular), of(robust), robust.independent(s.t, q, s.v), (begun, valid), moved
+
+    for turn in (1.0, 1e-5):
+        found, expected, independent, (_, valid), _ = both(turn, 0.0)
+        np.testing.assert_allclose(flat(found), flat(expected), rtol=1e-9)
+        assert np.all(independent) and valid
+    found, expected, independent, (_, valid), _ = both(1e-7, 0.0)
+    assert np.all(np.isnan(flat(found))) and np.all(np.isfinite(flat(expected)))
+    assert np.sum(independent) == 2 and not valid
+    *_, (begun, valid), moved = both(1.0, 1e-5)
+    np.testing.assert_allclose(flat(begun), flat(moved[:2]), atol=1e-9)
+    assert valid and moved.holds and np.max(np.abs(flat(begun[0]) - np.ravel(Q))) > 1e-6
+    assert not both(1.0, 3.0)[3][1]
 
 
 @not_plain

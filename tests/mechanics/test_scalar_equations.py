@@ -72,7 +72,8 @@ def test_the_same_projection():
     found = project(model_of(rod_pendulum, *s), *s[:3])
     expected = to_manifold(equations_of(model_of(rod_pendulum, *s)), *s[:3], 1e-9, 1e-9)
     for a, b in zip(found, (expected.q, expected.v)):
-        np.testing.assert_allclose(coordinates.flatten(a)[0], coordinates.flatten(b)[0], rtol=1e-14, atol=1e-15)
+        # Two iterations with one matrix leave the third power of the distance, 1e-15, times the speed of 3.
+        np.testing.assert_allclose(coordinates.flatten(a)[0], coordinates.flatten(b)[0], rtol=1e-14, atol=1e-14)
     far = coordinates.state(0.0, {"x": 1.4, "y": 0.3}, v, PARAMS)
     assert np.isnan(project(model_of(rod_pendulum, *far), *far[:3])[0]["x"])
 
