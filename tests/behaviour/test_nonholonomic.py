@@ -697,7 +697,8 @@ def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
         a, multiplier = solved(*equations)
         return a, multiplier / (0.5 if flaw == "half Chetaev" else 1.0)
 
-    monkeypatch.setattr(constraints, "acceleration_rows", rows)
+    linear = saddle_point.linear_equations
+    monkeypatch.setattr(saddle_point, "linear_equations", lambda *state: (linear(*state)[0], rows(*state)))
     monkeypatch.setattr(saddle_point, "solve_saddle_point", acting)
     # The parameters differ by `of`, so that the compiled programs of the true equations are not reused.
     system = lj.System(thrown, {"drive": lj.Nonholonomic(driving)})
