@@ -72,7 +72,7 @@ class WithElements(eqx.Module):
             side = side * slip / speed if law.plane else side
             leans, pressed = mode == LEANS, law.normal_forces(t, q, v, forces, params)
             mu = jnp.where(leans, law.sticking(speed, params), law.kinetic(speed, params))
-            against = jnp.where(leans, -given.slack[slice(*law.at)], side)
+            against = jnp.where(leans, -given.slack[slice(*law.at)].astype(t.dtype), side)
             found[law.name] = back(-against * mu * pressed)[0]
         return found
 
