@@ -1,12 +1,7 @@
 """Wheels and balls that roll without slipping, on planes and on surfaces f = 0.
 
-The point of contact is where f is least on the rim, or on the sphere. It lies from the centre along a unit vector,
-
-    e = (e0 + x T)/|e0 + x T|,        ∂f/∂x = 0,
-
-where e0 leads down the gradient at the centre, and T are one direction (rim) or two (sphere) at right angles to e0.
-On a plane x = 0, and for a ball where f is the distance to the surface. Elsewhere x is found by a few steps of
-Newton's, without loops, so that the equations are written out in single numbers.
+The point of contact is where f is least on the rim, or on the sphere (`contact_point.py`). On a plane, and for a ball
+where f is the distance to the surface, it lies straight below the centre; elsewhere it is searched for.
 
 Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4; Routh, *Advanced Rigid Dynamics*, §§ 214-224 (spheres on
 surfaces).
@@ -14,26 +9,21 @@ surfaces).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, SystemFunction, ground, valued
+from lagjax.bodies.contact_point import Meeting, below, on_plane, searched
 from lagjax.bodies.joints import check_two
 from lagjax.bodies.shapes import disk, level, sphere
 from lagjax.display import Shape
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
-# Steps of Newton's to the point of contact from the one below the centre, of which the last turns the way there by less
-# than `SETTLED`: some 1e-6 is left, which each of those for derivatives multiplies by that.
-STEPS, SETTLED = 3, 1e-3
-# Derivatives of the point of contact are exact up to this order: accelerations have the first, and so these leave two.
-ORDERS = 3
 # By how much the slope of a distance may differ from one.
 NOT_ONE = 1e-3
 
@@ -53,7 +43,7 @@ class Surface:
     **Arguments:** `f`, a function of (r, params) with r (3,) a point; twice differentiable, of any unit, its gradient
     not zero near the surface nor at the centre of what rolls. `on`: the marker in whose frame r is, on a body that may
     move, or `lj.ground`. `is_distance`: whether f is the distance to the surface, |∇f| = 1. A ball then touches
-    straight below its centre, and nothing is searched, which compiles in a fraction of the time.
+    straight below its centre, and nothing is searched, which compiles in half the time.
 
     >>> pipe = lj.Surface(lambda r, params: 5.0 - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
     >>> contact = lj.rolling_sphere(ball.at(), pipe, radius=1.0)
@@ -64,8 +54,8 @@ class Surface:
     than the bowl.
 
     **Raises:** `TypeError` for an `f` that is not a function, and for an `on` that is no marker. Where `is_distance`
-    and |∇f| is not one, and where three steps of Newton's from straight below the centre do not reach the point of
-    contact (what rolls is nearly as large as the surface is curved, or far from it), "touches" is NaN.
+    and |∇f| is not one, and where four steps of Newton's from straight below the centre do not reach a point of contact
+    at which f is least (what rolls is nearly as large as the surface is curved, or far from it), "touches" is NaN.
     """
 
     f: Callable[[Float[Array, "3"], Any], Any]
@@ -158,23 +148,21 @@ class Touching(SystemFunction):
     is_rim: bool
 
     def __call__(self, t, q: PyTree, params: PyTree) -> Float[Array, ""]:
-        point, _ = self._meeting(q, params)
+        found = self._meeting(q, params)
         if self._is_plane:
-            return self._height(point, params)
-        value, gradient = jax.value_and_grad(self._height)(point, params)
-        length = jnp.sqrt(jnp.sum(gradient**2))
+            return found.height
         if self.floor.is_distance:
-            return jnp.where(jnp.abs(lax.stop_gradient(length) - 1) < NOT_ONE, value, jnp.nan)
-        return value / length
+            return jnp.where(jnp.abs(lax.stop_gradient(found.slope) - 1) < NOT_ONE, found.height, jnp.nan)
+        return found.height / found.slope
 
     def slip(self, t, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, "2"]:
         """The velocity of the wheel at the point of contact, less that of the floor there, along the floor."""
-        (point, arm), at, wheel = self._meeting(q, params), self.at, self.wheel
+        found, at, wheel = self._meeting(q, params), self.at, self.wheel
         axes = at.axes(q)
-        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), arm @ axes)
-        of_floor = at.velocity(q, v, params) + jnp.cross(at.body.spin(q, v), point @ axes)
+        of_wheel = wheel.velocity(q, v, params) + jnp.cross(wheel.body.spin(q, v), found.arm @ axes)
+        of_floor = at.velocity(q, v, params) + jnp.cross(at.body.spin(q, v), found.point @ axes)
         slip = axes @ (of_wheel - of_floor)
-        return slip[:2] if self._is_plane else tangents(self._normal(point, params)) @ slip
+        return slip[:2] if self._is_plane else tangents(found.normal) @ slip
 
     @property
     def at(self) -> Marker:
@@ -191,59 +179,20 @@ class Touching(SystemFunction):
     def _is_plane(self) -> bool:
         return not isinstance(self.floor, Surface)
 
-    def _height(self, r: Array, params: PyTree) -> Array:
-        """f at a point that is given in the frame of the floor."""
-        return r[2] if self._is_plane else jnp.asarray(self.floor.f(r, params))
-
-    def _normal(self, r: Array, params: PyTree) -> Array:
-        return _unit(jax.grad(self._height)(r, params))
-
-    def _meeting(self, q: PyTree, params: PyTree) -> tuple[Array, Array]:
-        """The point of contact and the way there from the centre, in the frame of the floor."""
+    def _meeting(self, q: PyTree, params: PyTree) -> Meeting:
+        """The point of contact in the frame of the floor."""
         size, axes = valued(self.radius, params), self.at.axes(q)
         centre = axes @ (self.wheel.position(q, params) - self.at.position(q, params))
-        axis = axes @ self.wheel.axis(q) if self.is_rim else None
-        if self._is_plane or self.floor.is_distance and not self.is_rim:
-            e = -self._normal(centre, params)
-            arm = size * (e if axis is None else _unit(_off(axis, e)))
-        else:
-            arm = size * _towards(self._height, centre, axis, size, params)
-        return centre + arm, arm
+        shape = size * (self.wheel.axes(q)[:2] @ axes.T if self.is_rim else np.eye(3, dtype=centre.dtype))
+        if self._is_plane:
+            return on_plane(centre, shape)
+        f = partial(_height, self.floor.f, params)
+        is_below = self.floor.is_distance and not self.is_rim
+        return below(f, centre, size) if is_below else searched(f, centre, shape)
 
 
-def _towards(f: Callable, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
-    """The unit vector to the point of contact: where f is least on the rim about an axis or, without one, on a sphere.
-
-    It is found for numbers alone. Its derivatives are those of further steps of Newton's from there with the matrix
-    held, each of which adds an order (the first is the implicit function theorem).
-    """
-
-    def on_it(e: Array, axis: Array | None) -> Array:
-        return _unit(e if axis is None else _off(axis, e))
-
-    def slope(e: Array, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
-        """∂f/∂x in the directions in which the point may move."""
-        across = _off(e, jax.grad(f)(centre + size * e, params))
-        return across if axis is None else _off(axis, across)
-
-    def inverse(e: Array, centre: Array, axis: Array | None, size: Any, params: PyTree) -> Array:
-        """The inverse of the derivative of `slope` by these directions."""
-        point = centre + size * e
-        gradient, hessian = jax.grad(f)(point, params), jax.jacfwd(jax.grad(f))(point, params)
-        turns = tangents(e) if axis is None else jnp.cross(axis, e)[None]
-        inner = size * turns @ hessian @ turns.T - jnp.dot(e, gradient) * np.eye(len(turns), dtype=e.dtype)
-        return turns.T @ _inverted(inner) @ turns
-
-    given = (centre, axis, size, params)
-    held = lax.stop_gradient(given)
-    found = before = on_it(-jax.grad(f)(held[0], held[3]), held[1])
-    for _ in range(STEPS):
-        before, found = found, on_it(found - inverse(found, *held) @ slope(found, *held), held[1])
-    found = jnp.where(jnp.sum((found - before) ** 2) < SETTLED**2, found, jnp.nan)
-    chord, e = inverse(found, *held), on_it(found, axis)
-    for _ in range(ORDERS):
-        e = on_it(e - chord @ slope(e, *given), axis)
-    return e
+def _height(f: Callable, params: PyTree, r: Array) -> Array:
+    return jnp.asarray(f(r, params))
 
 
 def tangents(normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
@@ -257,20 +206,3 @@ def tangents(normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
     axis = jnp.stack([jnp.zeros_like(side), jnp.zeros_like(side), side])
     along = normal[:2] / (1 + side * normal[2])
     return jnp.eye(2, 3, dtype=normal.dtype) - along[:, None] * (axis + normal)[None]
-
-
-def _unit(x: Array) -> Array:
-    return x / jnp.sqrt(jnp.sum(x**2))
-
-
-def _off(e: Array, x: Array) -> Array:
-    """The part of x at right angles to a unit vector."""
-    return x - jnp.dot(e, x) * e
-
-
-def _inverted(a: Array) -> Array:
-    """The inverse of one number or of four: what has a rule of differentiation of its own is traced several times."""
-    if len(a) == 1:
-        return 1 / a
-    (p, q), (r, s) = a
-    return jnp.array([[s, -q], [-r, p]]) / (p * s - q * r)

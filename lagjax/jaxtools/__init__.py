@@ -43,7 +43,15 @@ from lagjax.jaxtools.jaxpr import (
     stands_for,
     written,
 )
-from lagjax.jaxtools.jaxpr_identity import Itself, Meaning, content_of, meaning_of, rules_of, with_own_constants
+from lagjax.jaxtools.jaxpr_identity import (
+    Itself,
+    Meaning,
+    content_of,
+    meaning_of,
+    rule_follows,
+    rules_of,
+    with_own_constants,
+)
 from lagjax.jaxtools.linearity import is_linear
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
@@ -75,6 +83,7 @@ from lagjax.jaxtools.tracing import (
     WATCHED,
     as_usual,
     full_products,
+    is_differentiated,
     is_eager,
     is_traced,
     numpy_of,

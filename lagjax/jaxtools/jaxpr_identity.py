@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from lagjax.jaxtools.jaxpr import equations, evaluate, once_per_program
+from lagjax.jaxtools.jaxpr import bodies, equations, evaluate, once_per_program
 
 # The rules of functions with rules of their own, and what only belongs to these.
 RULES = {
@@ -29,6 +29,8 @@ RULES = {
 }
 # Derivatives of a function with its own rule up to this order are compared.
 ORDERS = 2
+# The name of a jitted function in one with a rule that follows from what the program computes: it is not compared.
+RULE_FOLLOWS = "its rule follows from the program"
 # Arrays of up to so many bytes are compared whole, larger ones by a hash.
 WHOLE = 1024
 
@@ -77,12 +79,31 @@ def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
     """What the derivatives of a function compute, where parts of it have rules of their own; () where none has."""
     found = []
     for _ in range(ORDERS):
-        if not any(equation.primitive.name in RULES for equation in equations(program.jaxpr)):
+        if not any(map(_has_a_rule, equations(program.jaxpr))):
             break
         function = _pulled_back(function)
         program = jax.make_jaxpr(function)(*args)
         found.append((meaning_of(program.jaxpr), tuple(map(_key, program.consts))))
     return tuple(found)
+
+
+def _has_a_rule(equation: JaxprEqn) -> bool:
+    inside = [e.params.get("name") for body in bodies(equation) for e in body.eqns]
+    return equation.primitive.name in RULES and inside != [RULE_FOLLOWS]
+
+
+def rule_follows(function: Callable) -> jax.custom_jvp:
+    """`jax.custom_jvp`, where what the rule computes follows from the program that contains the function.
+
+    So it is for derivatives of what a search finds, of which the program contains the search: to compare two of them,
+    their rules need not be traced.
+    """
+
+    def named(*args):
+        return function(*args)
+
+    named.__name__ = RULE_FOLLOWS
+    return jax.custom_jvp(jax.jit(named))
 
 
 def _pulled_back(function: Callable):

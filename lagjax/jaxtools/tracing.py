@@ -79,3 +79,22 @@ def numpy_of(tree: PyTree):
 def is_traced(tree: PyTree) -> bool:
     """Whether JAX is tracing through `tree`, so that its values are not known."""
     return any(isinstance(leaf, Tracer) for leaf in jtu.tree_leaves(tree))
+
+
+def is_differentiated(tree: PyTree) -> bool:
+    """Whether JAX is taking a derivative by something in `tree`; from inside a jitted function that is not seen.
+
+    >>> def seen(x):
+    ...     print(is_differentiated({"x": x}))
+    ...     return x
+    >>> slopes = seen(1.0), jax.grad(seen)(1.0), jax.jit(jax.vmap(jax.grad(seen)))(jnp.ones(2))
+    False
+    True
+    True
+    """
+
+    def moves(x: Any) -> bool:
+        # The tracers of both modes hold a tangent; one of lanes holds what its lanes are.
+        return isinstance(x, Tracer) and (hasattr(x, "tangent") or hasattr(x, "batch_dim") and moves(getattr(x, "val")))
+
+    return any(map(moves, jtu.tree_leaves(tree)))

@@ -10,11 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.jaxtools import compiled, is_differentiated, is_eager, is_traced
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.mechanics.saddle_point import Dense, examined
+from lagjax.mechanics.scalar_equations import LONG
 from lagjax.system import (
     Model,
     State,
@@ -66,8 +67,12 @@ def accelerations(
 def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array], dict[str, Array]]:
     """The accelerations and the multipliers of a prepared system."""
     # A value that a function closes over may be traced where no argument is.
-    if not is_eager() or is_traced((s, eqx.filter(model, eqx.is_array))):
+    given = s, eqx.filter(model, eqx.is_array)
+    if not is_eager() or is_traced(given):
         equations = equations_of(model, fast=True)
+        if is_differentiated(given) and equations.written and equations.written.equations.length > LONG:
+            # The derivative of a long program takes XLA longer than the arrays', and both would be compiled.
+            equations = equations_of(model)
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(model)

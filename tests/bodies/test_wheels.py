@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.bodies import wheels
+from lagjax.bodies.contact_point import least_of
 from lagjax.bodies.wheels import tangents
 
 G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
@@ -200,23 +201,160 @@ def test_tangents():
         np.testing.assert_allclose(both @ normal, 0.0, atol=1e-14)
 
 
+WHEEL, RIM, AXIAL, ACROSS = 0.8, 0.5, 0.11, 0.06
+
+
+def rolling_wheel():
+    """A wheel on a quadric, under its weight."""
+    wheel = lj.Body("wheel", WHEEL, (ACROSS, ACROSS, AXIAL))
+    contact = lj.rolling(wheel.at(), lj.Surface(quadric), RIM)
+    return lj.multibody([wheel], {"rim": contact}, [lj.weight([wheel])])
+
+
+IN_BOWL = numbers(LARGE**2, (0.0, 0.0, 0.0), (-1.0, -1.0, -1.0))
+
+
+def moment(spin, axis):
+    """The wheel's angular momentum."""
+    return ACROSS * spin + (AXIAL - ACROSS) * (spin @ axis) * axis
+
+
+def in_a_bowl(place, axis, spin):
+    """Rates of a wheel's place, axis and spin in a spherical bowl, by Newton and Euler.
+
+    The rim touches where it is farthest from the bowl's centre: e = w/|w| with w = c - (c·a) a. There v + ω × R e = 0,
+    and m (v̇ - g) is the force.
+    """
+    turning = np.cross(spin, axis)
+    off = place - (place @ axis) * axis
+    to_rim = off / np.linalg.norm(off)
+    velocity = -RIM * np.cross(spin, to_rim)
+    change = velocity - (velocity @ axis + place @ turning) * axis - (place @ axis) * turning
+    turns = (change - (change @ to_rim) * to_rim) / np.linalg.norm(off)
+    # L̇ = R e × m (v̇ - g) with v̇ = -R (ω̇ × e + ω × ė), linear in ω̇.
+    gravity = np.array([0.0, 0.0, -G])
+    known = RIM * WHEEL * np.cross(to_rim, -RIM * np.cross(spin, turns) - gravity)
+    known = known - (AXIAL - ACROSS) * ((spin @ turning) * axis + (spin @ axis) * turning)
+    matrix = np.stack(
+        [moment(x, axis) + RIM**2 * WHEEL * np.cross(to_rim, np.cross(x, to_rim)) for x in np.eye(3)], axis=1
+    )
+    rate = np.linalg.solve(matrix, known)
+    return velocity, turning, rate, -RIM * (np.cross(rate, to_rim) + np.cross(spin, turns))
+
+
+def start_in_a_bowl(spin, aside=0.4):
+    """A wheel that touches the bowl."""
+    pose = lj.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3)
+    axis = np.asarray(pose.matrix)[:, 2]
+    down = np.array([0.3, 0.2, -1.0])
+    down = down - (down @ axis) * axis
+    place = aside * axis + (np.sqrt(LARGE**2 - aside**2) - RIM) * down / np.linalg.norm(down)
+    pose = pose._replace(position=jnp.asarray(place))
+    velocity = in_a_bowl(place, axis, np.asarray(spin))[0]
+    return {"wheel": pose}, {"wheel": pose.moving(velocity, spin)}
+
+
+def steadily(params, radius, height, lean):
+    """A wheel that runs in a circle about the vertical on a surface of revolution, and its rate of turning.
+
+    All turns about the vertical: m (g e_z - Ω² r_c e_r) is the force at the point of contact, and R e × that is
+    Ω e_z × L. The axis leans by an angle from the tangent of the surface.
+    """
+    radial, across, up = np.eye(3)
+    point = radius * radial + height * up
+    normal = np.asarray(jax.grad(quadric)(jnp.asarray(point), params))
+    normal = normal / np.linalg.norm(normal)
+    axis = np.cos(lean) * np.cross(normal, across) + np.sin(lean) * normal
+    to_rim = np.cross(axis, across)
+    to_rim = to_rim * -np.sign(to_rim @ normal)
+    place = point - RIM * to_rim
+    # σ a × R e = -Ω r e_y: no slip.
+    own = -radius / (RIM * np.cross(axis, to_rim) @ across)
+    swing = np.cross(up, moment(up + own * axis, axis)) @ across
+    square = WHEEL * G * RIM * np.cross(to_rim, up) @ across
+    rate = np.sqrt(square / (swing + WHEEL * RIM * (place @ radial) * np.cross(to_rim, radial) @ across))
+    half = np.arctan2(np.cross(up, axis) @ across, up @ axis)
+    return lj.Pose.at(place, across, half), rate * (up + own * axis), rate
+
+
 @pytest.mark.slow
-def test_derivatives_of_the_point_of_contact(monkeypatch):
-    """In a spherical bowl it lies outwards, c/|c|: derivatives up to the third, by three steps and not by two."""
+def test_a_wheel_on_surfaces():
+    """In a bowl as Newton and Euler have it; in circles in a cylinder, a bowl, a cone and a paraboloid."""
+    system = rolling_wheel()
+    accelerations = jax.jit(lambda q, v, params: lj.accelerations(system, 0.0, q, v, params)[0]["wheel"].position)
+    for spin in ((0.3, -0.8, 4.0), (2.0, 1.0, -1.5)):
+        q, v = start_in_a_bowl(spin)
+        for residual in lj.constraint_residual(system, 0.0, q, v, IN_BOWL).values():
+            np.testing.assert_allclose(residual, 0.0, atol=1e-14)
+        axis = np.asarray(q["wheel"].matrix)[:, 2]
+        expected = in_a_bowl(np.asarray(q["wheel"].position), axis, np.asarray(spin))[3]
+        np.testing.assert_allclose(accelerations(q, v, IN_BOWL), expected, atol=1e-11)
 
-    def found(c):
-        return wheels._towards(lambda r, params: params - jnp.sum(r**2), c, None, SMALL, LARGE**2)
+    zero, flat = (0.0, 0.0, 0.0), (-1.0, -1.0, 0.0)
+    for params, radius, height, lean in (
+        (numbers(LARGE**2, zero, flat), LARGE, 0.3, 0.2),
+        (IN_BOWL, 1.6, -1.2, 0.3),
+        (numbers(0.0, zero, (-1.0, -1.0, 1.0)), 1.7, 1.7, 0.25),
+        (numbers(0.0, (0.0, 0.0, 1.0), (-0.5, -0.5, 0.0)), 1.5, 1.125, 0.3),
+    ):
+        pose, spin, rate = steadily(params, radius, height, lean)
+        around = rate * np.cross([0.0, 0.0, 1.0], pose.position)
+        q, v = {"wheel": pose}, {"wheel": pose.moving(around, spin)}
+        for residual in lj.constraint_residual(system, 0.0, q, v, params).values():
+            np.testing.assert_allclose(residual, 0.0, atol=1e-13)
+        inwards = -(rate**2) * np.asarray(pose.position) * np.array([1.0, 1.0, 0.0])
+        np.testing.assert_allclose(accelerations(q, v, params), inwards, atol=1e-10)
+        # Twin: at another speed it does not run in this circle.
+        faster = jax.tree.map(lambda x: 1.05 * x, v)
+        assert np.linalg.norm(accelerations(q, faster, params) - 1.05**2 * inwards) > 0.05
 
-    def derivatives(f):
-        first = jax.jacfwd(f)
-        second = jax.jacfwd(jax.jacrev(f))
-        return jax.jit(lambda c: (f(c), first(c), second(c), jax.jacfwd(second)(c)))(jnp.array([0.5, -1.2, 0.9]))
 
-    expected = derivatives(lambda c: c / jnp.sqrt(jnp.sum(c**2)))
-    for x, y in zip(derivatives(found), expected):
-        np.testing.assert_allclose(x, y, atol=1e-13)
-    monkeypatch.setattr(wheels, "ORDERS", 2)
-    assert np.max(np.abs(derivatives(found)[3] - expected[3])) > 1e-2
+@pytest.mark.exhaustive
+def test_motion_of_a_wheel_in_a_bowl():
+    """It rolls, leans and turns as by Newton and Euler, integrated by SciPy."""
+    q, v = start_in_a_bowl((0.3, -0.8, 4.0))
+    pose, ts = q["wheel"], jnp.linspace(0.0, 2.0, 9)
+    first = np.concatenate([pose.position, pose.matrix[:, 2], (0.3, -0.8, 4.0)])
+
+    def rates(t, y):
+        return np.concatenate(in_a_bowl(*np.split(y, 3))[:3])
+
+    expected = solve_ivp(rates, (0.0, 2.0), first, "DOP853", t_eval=np.asarray(ts), rtol=1e-13, atol=1e-13).y.T
+    traj = lj.integrate(rolling_wheel(), q, v, IN_BOWL, ts=ts, rtol=1e-11)
+    np.testing.assert_allclose(traj.q["wheel"].position, expected[:, :3], atol=1e-9)
+    axes = jax.vmap(lambda pose: pose.matrix[:, 2])(traj.q["wheel"])
+    np.testing.assert_allclose(axes, expected[:, 3:6], atol=1e-9)
+
+
+def derivatives(f):
+    """A function and its first three derivatives, compiled."""
+    first = jax.jacfwd(f)
+    second = jax.jacfwd(jax.jacrev(f))
+    return jax.jit(lambda x: (f(x), first(x), second(x), jax.jacfwd(second)(x)))
+
+
+@pytest.mark.slow
+def test_derivatives_of_the_point_of_contact():
+    """In a spherical bowl it lies outwards, c/|c|, on a rim along c in its plane: derivatives up to the third."""
+    place, axes = jnp.array([0.5, -1.2, 0.9]), lj.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3).matrix.T
+
+    def unit(x):
+        return x / jnp.sqrt(jnp.sum(x**2))
+
+    for rows in (jnp.eye(3), axes[:2]):
+
+        def found(c, rows=rows):
+            start = jax.lax.stop_gradient(unit(unit(rows @ c) + 0.1))
+            return jnp.append(*least_of(lambda u: LARGE**2 - jnp.sum((c + SMALL * u @ rows) ** 2), start))
+
+        def known(c, rows=rows):
+            u = unit(rows @ c)
+            return jnp.append(u, LARGE**2 - jnp.sum((c + SMALL * u @ rows) ** 2))
+
+        for x, y in zip(derivatives(found)(place), derivatives(known)(place)):
+            np.testing.assert_allclose(x, y, atol=1e-12)
+    # Too far to be found from here.
+    assert np.isnan(least_of(lambda u: -jnp.dot(u, place), -unit(place + 0.3))[1])
 
 
 def test_distances():

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.jaxtools.jaxpr_identity import Itself, content_of, meaning_of, rules_of, with_own_constants
+from lagjax.jaxtools.jaxpr_identity import (
+    Itself,
+    content_of,
+    meaning_of,
+    rule_follows,
+    rules_of,
+    with_own_constants,
+)
 
 TABLE = np.arange(300.0)
 
@@ -66,6 +73,20 @@ def with_rule(slope):
     square = jax.custom_jvp(lambda x: x * x)
     square.defjvps(lambda dx, value, x: slope(x) * dx)
     return square
+
+
+def test_rules_that_follow_do_not_count():
+    """A function whose rule follows from the program has it, and none that is compared; another's is compared."""
+
+    def twice(kind):
+        function = kind(lambda x: 1.0 * x)
+        function.defjvp(lambda primals, tangents: (primals[0], 2 * tangents[0]))
+        return function
+
+    known, other = twice(rule_follows), twice(jax.custom_jvp)
+    assert jax.grad(known)(1.0) == jax.jit(jax.grad(known))(1.0) == 2.0
+    assert rules_of(known, jax.make_jaxpr(known)(1.0), 1.0) == ()
+    assert rules_of(other, jax.make_jaxpr(other)(1.0), 1.0) != ()
 
 
 def test_rules_of_differentiation_count():
