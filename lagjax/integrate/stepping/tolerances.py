@@ -229,7 +229,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         if any(self.angles):
             others = jnp.maximum(others, np.stack([self.angles, np.zeros(len(self.angles))]).astype(others.dtype))
         # At rest velocities are the round-off of forces that cancel, whose size only the start tells.
-        others = jnp.maximum(others, scales.reach * scales.over_root_mass)
+        others = jnp.maximum(others, stop_gradient(scales.reach * scales.over_root_mass))
         return self.tolerances.rtol[:, None] * own_size + rounding(others)
 
     def _capped_angles(self, sizes):
