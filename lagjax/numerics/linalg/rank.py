@@ -66,7 +66,9 @@ def unit_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Arr
     # Scaled by the largest entry first, so that squares neither overflow nor underflow.
     largest = jnp.max(jnp.abs(rows), axis=1)
     shape = rows / jnp.where(largest > 0, largest, 1.0)[:, None]
-    length = largest * jnp.sqrt(jnp.sum(shape**2, axis=1))
+    # The derivative of the root of zero, as of a row that does not hold now, would be NaN.
+    square = jnp.sum(shape**2, axis=1)
+    length = largest * jnp.sqrt(jnp.where(square > 0, square, 1.0))
     return rows / jnp.where(length > 0, length, 1.0)[:, None], length
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lagjax.jaxtools import length
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows
+from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
 
 rng = np.random.default_rng(11)
 
@@ -44,3 +44,12 @@ def test_rows_that_are_zero_or_not_finite_are_kept():
     """A constraint without a derivative must not count as redundant."""
     assert independent_rows(jnp.array([[1.0, 2.0], [0.0, 0.0]])).tolist() == [True, True]
     assert independent_rows(jnp.array([[1.0, 2.0], [2.0, jnp.nan]])).tolist() == [True, True]
+
+
+def test_a_row_of_zeros_has_derivatives():
+    """Lengths and unit rows of zeros do not change; beside them those of (3, 4) do. Twin: a rate that is not zero."""
+    rows, rates = jnp.array([[0.0, 0.0], [3.0, 4.0]]), jnp.array([[0.0, 0.0], [1.0, 0.0]])
+    (units, lengths), (_, grow) = jax.jvp(unit_rows, (rows,), (rates,))
+    np.testing.assert_allclose(units, [[0.0, 0.0], [0.6, 0.8]])
+    np.testing.assert_allclose(lengths, [0.0, 5.0])
+    np.testing.assert_allclose(grow, [0.0, 0.6])
