@@ -39,9 +39,8 @@ UP_TO, CONSTRAINED_UP_TO = 8, 16
 # Products with matrices of this size, as of a network in L, are left to arrays: two coordinates in a network of a
 # thousand numbers take 1.7 microseconds written out and 1.1 in arrays, and in reverse 15 and 0.6.
 MATRIX = 64
-# A program of more operations goes to arrays. With constraints, the longest ones below this that were measured are a
-# rattleback's, 18 s of processor time written out and 50 s in arrays, and that of a ball in a bowl (5,200 operations),
-# whose first answer takes 33 s written out and more than 140 s in arrays. None above it was.
+# A program of more operations goes to arrays. With constraints, first answers in processor seconds, written out and in
+# arrays: 15 and 22 of a rattleback (1,600 operations); 56 and 40 of a vehicle (6,200), which is above it.
 LONG, CONSTRAINED_LONG = 3000, 6000
 # What is not yet without its zeros may be so many times as long.
 ON_THE_WAY = 5
