@@ -163,6 +163,7 @@ if TYPE_CHECKING:
         revolute,
         rod,
         rolling,
+        rolling_ellipsoid,
         rolling_sphere,
         sphere,
         spherical,
@@ -215,8 +216,8 @@ LATER = {
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
         "Body Load Marker Pose Surface Tree applied box cylinder cylindrical disk fixed ground line mesh motor "
-        "multibody planar prismatic revolute rod rolling rolling_sphere sphere spherical spring torsion trail "
-        "universal weight"
+        "multibody planar prismatic revolute rod rolling rolling_ellipsoid rolling_sphere sphere spherical "
+        "spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.models": "RobotModel read_mjcf read_urdf",
@@ -270,6 +271,7 @@ __all__ = [
     "prismatic",
     "fixed",
     "rolling",
+    "rolling_ellipsoid",
     "rolling_sphere",
     "Load",
     "weight",

@@ -16,7 +16,7 @@ from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
 from lagjax.bodies.shapes import axis, box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
-from lagjax.bodies.wheels import Surface, rolling, rolling_sphere
+from lagjax.bodies.wheels import Surface, rolling, rolling_ellipsoid, rolling_sphere
 
 __all__ = [
     "Body",
@@ -42,6 +42,7 @@ __all__ = [
     "revolute",
     "rod",
     "rolling",
+    "rolling_ellipsoid",
     "rolling_sphere",
     "sphere",
     "spherical",

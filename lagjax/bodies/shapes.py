@@ -61,7 +61,12 @@ def sphere(place: Place, radius: Any, color: str | None = None) -> Shape:
 
     **Raises:** as `lj.box` does.
     """
-    return Shape("solid", (_anchor(place),), SPHERE, _sizes(radius, radius, radius), color)
+    return ellipsoid(place, (radius, radius, radius), color)
+
+
+def ellipsoid(place: Place, half_axes: Sequence, color: str | None = None) -> Shape:
+    """An ellipsoid about a place, its axes along those of the place."""
+    return Shape("solid", (_anchor(place),), SPHERE, _sizes(*half_axes), color)
 
 
 def disk(place: Place, radius: Any, color: str | None = None) -> Shape:

@@ -1,13 +1,13 @@
-"""Wheels and balls that roll without slipping, on planes and on surfaces f = 0.
+"""Wheels, balls and ellipsoids that roll without slipping, on planes and on surfaces f = 0.
 
-The point of contact is where f is least on the rim, or on the sphere (`contact_point.py`). On a plane, and for a ball
+The point of contact is where f is least on what rolls (`contact_point.py`). On a plane, and for a ball
 where f is the distance to the surface, it lies straight below the centre; elsewhere it is searched for.
 
 Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4; Routh, *Advanced Rigid Dynamics*, §§ 214-224 (spheres on
 surfaces).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.bodies.body import Ground, Marker, SystemFunction, ground, valued
 from lagjax.bodies.contact_point import Meeting, below, on_plane, searched
 from lagjax.bodies.joints import check_two
-from lagjax.bodies.shapes import disk, level, sphere
+from lagjax.bodies.shapes import disk, ellipsoid, level, sphere
 from lagjax.display import Shape
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
@@ -109,7 +109,7 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
-    return _contact(wheel, floor, radius, is_rim=True)
+    return _contact(Touching(wheel, floor, "rim", radius))
 
 
 def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str, Holonomic | Nonholonomic]:
@@ -123,29 +123,61 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    return _contact(ball, floor, radius, is_rim=False)
+    return _contact(Touching(ball, floor, "sphere", radius))
 
 
-def _contact(wheel: Marker, floor: "Marker | Surface", radius: Any, is_rim: bool):
-    touches = Touching(wheel, floor, radius, is_rim)
-    check_two(wheel, touches.at)
+def rolling_ellipsoid(stone: Marker, floor: "Marker | Surface", half_axes: Sequence):
+    """Let an ellipsoid roll without slipping, as a rattleback does.
+
+    `stone` is its centre, and the axes of its shape, which may be turned against the principal axes of inertia;
+    `half_axes` three numbers or functions of params, along these axes; the rest as in `lj.rolling`. On a plane with
+    normal n it touches at
+
+        c - S² n / |S n|,      S² = Σ s_i² e_i e_iᵀ
+
+    >>> import lagjax as lj
+    >>> stone = lj.Body("stone", 1.0, (2.0, 16.0, 17.0))
+    >>> contact = rolling_ellipsoid(stone.at(), lj.ground.at(), (2.0, 0.3, 0.2))
+    >>> on_its_end = lj.Pose.at((0.0, 0.0, 2.25), (0.0, 1.0, 0.0), jnp.pi / 2)
+    >>> print(contact["touches"].g(0.0, {"stone": on_its_end}, None).round(12))
+    0.25
+
+    **Returns:** as `lj.rolling`.
+
+    **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body, and unless there are three
+    half axes.
+
+    Source: Garcia & Hubbard, Proc. R. Soc. A 418 (1988) 165 (the rattleback).
+    """
+    if np.shape(half_axes) != (3,):
+        raise ValueError(
+            f"lj.rolling_ellipsoid takes three half axes, and was given {half_axes!r}.\n"
+            "Usual cause: one radius.\nFix: (a, b, c) along the axes of the marker; lj.rolling_sphere for a sphere."
+        )
+    return _contact(Touching(stone, floor, "ellipsoid", tuple(half_axes)))
+
+
+def _contact(touches: "Touching") -> dict[str, Holonomic | Nonholonomic]:
+    check_two(touches.wheel, touches.at)
     return {"touches": Holonomic(touches), "rolls": Nonholonomic(touches.slip)}
 
 
 @dataclass(frozen=True, eq=False)
 class Touching(SystemFunction):
-    """The gap between a wheel, or a ball, and the floor, a function of (t, q, params); `slip` one of (t, q, v, params).
+    """The gap between what rolls and the floor, a function of (t, q, params); `slip` is one of (t, q, v, params).
+
+    `form`: "rim", "sphere" or "ellipsoid", of which `size` is the radius, or the half axes.
 
     >>> import lagjax as lj
     >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> print(Touching(ball.at(), lj.ground.at(), 1.0, False)(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
+    >>> print(Touching(ball.at(), lj.ground.at(), "sphere", 1.0)(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
     0.25
     """
 
     wheel: Marker
     floor: Any
-    radius: Any
-    is_rim: bool
+    form: str
+    size: Any
 
     def __call__(self, t, q: PyTree, params: PyTree) -> Float[Array, ""]:
         found = self._meeting(q, params)
@@ -171,9 +203,9 @@ class Touching(SystemFunction):
 
     @property
     def drawing(self) -> tuple[Shape, ...]:
-        """What it looks like: a disk or a sphere, and the surface."""
-        solid = disk if self.is_rim else sphere
-        return solid(self.wheel, self.radius), *getattr(self.floor, "drawing", ())
+        """What it looks like, and the surface."""
+        solid = {"rim": disk, "sphere": sphere, "ellipsoid": ellipsoid}[self.form]
+        return solid(self.wheel, self.size), *getattr(self.floor, "drawing", ())
 
     @property
     def _is_plane(self) -> bool:
@@ -181,14 +213,21 @@ class Touching(SystemFunction):
 
     def _meeting(self, q: PyTree, params: PyTree) -> Meeting:
         """The point of contact in the frame of the floor."""
-        size, axes = valued(self.radius, params), self.at.axes(q)
+        axes = self.at.axes(q)
         centre = axes @ (self.wheel.position(q, params) - self.at.position(q, params))
-        shape = size * (self.wheel.axes(q)[:2] @ axes.T if self.is_rim else np.eye(3, dtype=centre.dtype))
+        shape = self._shape(self.wheel.axes(q) @ axes.T, params)
         if self._is_plane:
             return on_plane(centre, shape)
         f = partial(_height, self.floor.f, params)
-        is_below = self.floor.is_distance and not self.is_rim
-        return below(f, centre, size) if is_below else searched(f, centre, shape)
+        if self.floor.is_distance and self.form == "sphere":
+            return below(f, centre, valued(self.size, params))
+        return searched(f, centre, shape)
+
+    def _shape(self, axes: Float[Array, "3 3"], params: PyTree) -> Float[Array, "k 3"]:
+        """The rows S, of which it consists of the points uᵀS about its centre, for unit vectors u."""
+        if self.form == "ellipsoid":
+            return jnp.stack([jnp.asarray(valued(x, params), axes.dtype) for x in self.size])[:, None] * axes
+        return valued(self.size, params) * (axes[:2] if self.form == "rim" else np.eye(3, dtype=axes.dtype))
 
 
 def _height(f: Callable, params: PyTree, r: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Balls and disks that roll on surfaces f = 0, against closed forms (Routh, *Advanced Rigid Dynamics*, §§ 214-224)."""
+"""What rolls on surfaces f = 0, against closed forms (Routh, *Advanced Rigid Dynamics*, §§ 214-224)."""
 
 import jax
 import jax.numpy as jnp
@@ -167,7 +167,8 @@ def test_motion_in_a_cylinder():
 
 @pytest.mark.slow
 def test_the_point_of_contact():
-    """On an ellipsoid balls and wheels touch where f is least on them: g = 0 there, and grows as the distance."""
+    """In an ellipsoid balls, wheels and ellipsoids touch where f is least on them: g = 0 there, and grows as the
+    distance."""
     squares = np.array([4.0, 2.0, 1.0])
     inside = lj.Surface(lambda r, params: 1.0 - jnp.sum(r**2 / squares))
     place = np.sqrt(squares) * np.array([0.48, 0.6, 0.64])
@@ -177,10 +178,19 @@ def test_the_point_of_contact():
     turned = lj.Pose.at(axis=(1.0, 2.0, 0.5), angle=0.8)
     axis = np.asarray(body.direction({"wheel": turned}, (0.0, 0.0, 1.0)))
     to_rim = normal - (normal @ axis) * axis
-    for contact, arm in ((ball, 0.1 * normal), (wheel, 0.1 * to_rim / np.linalg.norm(to_rim))):
+    half_axes = 0.1 * np.array([1.0, 0.7, 0.4])
+    stone = lj.rolling_ellipsoid(body.at(), inside, half_axes)
+    stretched = np.asarray(turned.matrix) @ np.diag(half_axes**2) @ np.asarray(turned.matrix).T @ normal
+    for contact, arm in (
+        (ball, 0.1 * normal),
+        (wheel, 0.1 * to_rim / np.linalg.norm(to_rim)),
+        (stone, stretched / np.sqrt(normal @ stretched)),
+    ):
 
         def gap(height, contact=contact, arm=arm):
-            return contact["touches"].g(0.0, {"wheel": turned._replace(position=place + arm + height * normal)}, None)
+            return contact["touches"].function(
+                0.0, {"wheel": turned._replace(position=place + arm + height * normal)}, None
+            )
 
         value, slope = jax.jit(lambda x, gap=gap: jax.jvp(gap, (x,), (jnp.ones_like(x),)))(jnp.asarray(0.0))
         np.testing.assert_allclose(value, 0.0, atol=1e-15)
@@ -326,6 +336,49 @@ def test_motion_of_a_wheel_in_a_bowl():
     np.testing.assert_allclose(axes, expected[:, 3:6], atol=1e-9)
 
 
+HALF_AXES, STONE = (0.2, 0.03, 0.02), 1.1
+TILT = np.array([[np.cos(0.3), -np.sin(0.3), 0.0], [np.sin(0.3), np.cos(0.3), 0.0], [0.0, 0.0, 1.0]])
+INERTIA = TILT @ np.diag([2e-4, 1.6e-3, 1.7e-3]) @ TILT.T
+
+
+def rattling(axes, spin):
+    """The velocity and acceleration of an ellipsoid's centre on a plane, by Newton and Euler.
+
+    It touches at r = -R S² n/|S n|, with n = Rᵀ e_z, where v + ω × r = 0 and the force is m (v̇ + g e_z).
+    """
+    up, squares = np.array([0.0, 0.0, 1.0]), np.square(HALF_AXES)
+    n = axes.T @ up
+    n_dot, size = np.cross(n, axes.T @ spin), np.sqrt(n @ (squares * n))
+    r = -axes @ (squares * n) / size
+    r_dot = np.cross(spin, r) - axes @ (squares * (n_dot - n * (n @ (squares * n_dot)) / size**2)) / size
+    inertia = axes @ INERTIA @ axes.T
+    # I ω̇ + ω × I ω = r × m (v̇ + g e_z) with v̇ = -(ω̇ × r + ω × ṙ), linear in ω̇.
+    known = np.cross(r, STONE * (G * up - np.cross(spin, r_dot))) - np.cross(spin, inertia @ spin)
+    matrix = inertia + STONE * np.stack([np.cross(r, np.cross(x, r)) for x in np.eye(3)], axis=1)
+    rate = np.linalg.solve(matrix, known)
+    return r, -np.cross(spin, r), -(np.cross(rate, r) + np.cross(spin, r_dot))
+
+
+@pytest.mark.slow
+def test_a_rattleback():
+    """An ellipsoid whose inertia is turned against its shape, as Newton and Euler have it. Twin: another half axis."""
+    stone = lj.Body("stone", STONE, INERTIA)
+    half_axes = tuple(lambda params, i=i: params[i] for i in range(3))
+    contact = lj.rolling_ellipsoid(stone.at(), lj.ground.at(), half_axes)
+    system = lj.multibody([stone], {"rolls": contact}, [lj.weight([stone])])
+    accelerations = jax.jit(lambda q, v, params: lj.accelerations(system, 0.0, q, v, params)[0]["stone"].position)
+    for axis, angle, spin in (((1.0, 0.4, -0.3), 0.3, (0.3, -0.8, 4.0)), ((0.2, 1.0, 0.1), 1.2, (2.0, 1.0, -1.5))):
+        pose = lj.Pose.at(axis=axis, angle=angle)
+        r, velocity, expected = rattling(np.asarray(pose.matrix), np.asarray(spin))
+        pose = pose._replace(position=jnp.array([0.7, -0.4, -r[2]]))
+        q, v = {"stone": pose}, {"stone": pose.moving(velocity, spin)}
+        for residual in lj.constraint_residual(system, 0.0, q, v, HALF_AXES).values():
+            np.testing.assert_allclose(residual, 0.0, atol=1e-15)
+        found = accelerations(q, v, HALF_AXES)
+        np.testing.assert_allclose(found, expected, atol=1e-11)
+        assert np.linalg.norm(accelerations(q, v, (0.2, 0.032, 0.02)) - found) > 1e-3
+
+
 def derivatives(f):
     """A function and its first three derivatives, compiled."""
     first = jax.jacfwd(f)
@@ -386,3 +439,5 @@ def test_what_is_no_surface():
     ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="both places are on 'ball'"):
         lj.rolling_sphere(ball.at(), lj.Surface(lambda r, params: r[2], on=ball.at()), 1.0)
+    with pytest.raises(ValueError, match="three half axes, and was given 1.0"):
+        lj.rolling_ellipsoid(ball.at(), lj.ground.at(), 1.0)  # pyright: ignore[reportArgumentType]
