@@ -93,6 +93,7 @@ def view_of(low: np.ndarray, high: np.ndarray, azimuth: float, elevation: float)
 def labelled(values: np.ndarray, step: float) -> list[str]:
     """Numbers on a grid whose lines are `step` apart."""
     places = max(0, -math.floor(math.log10(step) + 1e-9))
-    on_grid = np.abs(values / step - np.rint(values / step)) < 1e-6
+    # What is nearer than a thousandth of a square cannot be told apart.
+    on_grid = np.abs(values / step - np.rint(values / step)) < 1e-3
     plain = on_grid & (1e-4 <= step < 1e6)
     return [f"{value:.{places}f}" if short else f"{value:.3g}" for value, short in zip(values, plain)]

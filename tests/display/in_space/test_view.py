@@ -46,6 +46,12 @@ def test_grids(size):
         assert 3 <= len(lines) <= 9 and len(set(labelled(lines, grid.step))) == len(lines)
 
 
+def test_labels():
+    """A height that cannot be told from a line has its label; others have three digits."""
+    assert labelled(np.array([2e-6, 0.1]), 0.1) == ["0.0", "0.1"]
+    assert labelled(np.array([0.0123]), 0.1) == ["0.0123"]
+
+
 def box(name, half):
     """A cube about the centre of a body."""
     return Shape("solid", (Anchor(name, np.zeros(3)),), CUBE, 2.0 * half * np.ones(3))
