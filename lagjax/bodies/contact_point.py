@@ -29,7 +29,7 @@ from lagjax.jaxtools import is_traced, jaxpr_as_fun, rule_follows
 STEPS, SETTLED = 4, 1e-5
 
 
-class Meeting(NamedTuple):
+class Touch(NamedTuple):
     """The point of contact and the way there from the centre; f, |∇f| and ∇f/|∇f| there."""
 
     point: Float[Array, "3"]
@@ -39,28 +39,28 @@ class Meeting(NamedTuple):
     normal: Float[Array, "3"]
 
 
-def on_plane(centre: Array, shape: Array) -> Meeting:
+def on_plane(centre: Array, shape: Array) -> Touch:
     """The point of contact with the plane z = 0, of which z is the height."""
     up = jnp.asarray((0.0, 0.0, 1.0), centre.dtype)
     arm = -unit(shape[:, 2]) @ shape
-    return Meeting(centre + arm, arm, centre[2] + arm[2], jnp.ones_like(centre[2]), up)
+    return Touch(centre + arm, arm, centre[2] + arm[2], jnp.ones_like(centre[2]), up)
 
 
-def below(f: Callable, centre: Array, radius: Array) -> Meeting:
+def below(f: Callable, centre: Array, radius: Array) -> Touch:
     """The point of contact of a sphere where f is the distance: straight below its centre, nearer by the radius."""
     height, normal = jax.value_and_grad(f)(centre)
     arm = -radius * normal
-    return Meeting(centre + arm, arm, height - radius, jnp.sqrt(jnp.sum(normal**2)), normal)
+    return Touch(centre + arm, arm, height - radius, jnp.sqrt(jnp.sum(normal**2)), normal)
 
 
-def searched(f: Callable, centre: Array, shape: Array) -> Meeting:
+def searched(f: Callable, centre: Array, shape: Array) -> Touch:
     """The point of contact of any of these bodies, given its `shape` S (2, 3) or (3, 3)."""
     start = -unit(shape @ jax.grad(f)(lax.stop_gradient(centre)))
     u, height = least_of(lambda u: f(centre + u @ shape), lax.stop_gradient(start))
     arm = u @ shape
     gradient = jax.grad(f)(centre + arm)
     slope = jnp.sqrt(jnp.sum(gradient**2))
-    return Meeting(centre + arm, arm, height, slope, gradient / slope)
+    return Touch(centre + arm, arm, height, slope, gradient / slope)
 
 
 def least_of(f: Callable, start: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:

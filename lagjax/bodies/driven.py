@@ -60,21 +60,21 @@ class Driven(NamedTuple):
         """A constraint that reads these bodies' poses, as one of the coordinates."""
         if not self.bodies:
             return joint
-        seen = Seen(joint.function, self.placed)
+        seen = OfPlaced(joint.function, self.placed)
         return Holonomic(seen.of_positions) if isinstance(joint, Holonomic) else Nonholonomic(seen)
 
     def seen_by_all(self, function: Callable | None) -> Callable | None:
         """A function of (t, q, v, params) that reads these bodies' poses and rates, as one of the coordinates."""
         if function is None or not self.bodies:
             return function
-        return Seen(function, self.placed)
+        return OfPlaced(function, self.placed)
 
 
 @dataclass(frozen=True, eq=False)
-class Seen(SystemFunction):
+class OfPlaced(SystemFunction):
     """A function of the poses and rates that `placed(t, q, v, params)` gives, as one of q and v.
 
-    >>> height = Seen(lambda t, q, params: q["bob"], lambda t, q, v, params: ({"bob": 2.0 * q}, v))
+    >>> height = OfPlaced(lambda t, q, params: q["bob"], lambda t, q, v, params: ({"bob": 2.0 * q}, v))
     >>> height.of_positions(0.0, 3.0, None)
     6.0
     """

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, SystemFunction, ground, valued
-from lagjax.bodies.contact_point import Meeting, below, on_plane, searched
+from lagjax.bodies.contact_point import Touch, below, on_plane, searched
 from lagjax.bodies.joints import check_two
 from lagjax.bodies.shapes import disk, ellipsoid, level, sphere
 from lagjax.display import Shape
@@ -211,7 +211,7 @@ class Touching(SystemFunction):
     def _is_plane(self) -> bool:
         return not isinstance(self.floor, Surface)
 
-    def _meeting(self, q: PyTree, params: PyTree) -> Meeting:
+    def _meeting(self, q: PyTree, params: PyTree) -> Touch:
         """The point of contact in the frame of the floor."""
         axes = self.at.axes(q)
         centre = axes @ (self.wheel.position(q, params) - self.at.position(q, params))

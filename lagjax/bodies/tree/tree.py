@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies
-from lagjax.bodies.driven import Seen
+from lagjax.bodies.driven import OfPlaced
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
@@ -307,5 +307,5 @@ def _of_growth(geometry: Geometry, given: LinkNumbers) -> Array:
 
 def _closure(dynamics: Dynamics, constraint: Holonomic | Nonholonomic) -> Holonomic | Nonholonomic:
     """A constraint of poses as one of joint coordinates."""
-    seen = Seen(constraint.function, dynamics.placed)
+    seen = OfPlaced(constraint.function, dynamics.placed)
     return Holonomic(seen.of_positions) if isinstance(constraint, Holonomic) else Nonholonomic(seen)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.elements.complementarity import ContactProblem, Forces, directions, lengths, pseudo_inverse
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
-from lagjax.integrate.elements.redundant import AtBound, Held, within_laws
+from lagjax.integrate.elements.redundant import AtBound, HeldRows, within_laws
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -342,7 +342,7 @@ class Meeting(eqx.Module):
         mu = jnp.where(lengths(slides, self.laws.partners) > 0, moving, resting)
         free = rows.jacobian @ a - every.gamma[mine]
         problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
-        return problem, Held(rows.jacobian, held, multipliers, rows.of_constraints)
+        return problem, HeldRows(rows.jacobian, held, multipliers, rows.of_constraints)
 
     def _contact_forces(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> ContactForces:
         """The forces at accelerations."""

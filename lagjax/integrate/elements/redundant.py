@@ -37,7 +37,7 @@ class AtBound(NamedTuple):
         return problem._replace(may_push=problem.may_push & ~self.lifted, slides=slides)
 
 
-class Held(NamedTuple):
+class HeldRows(NamedTuple):
     """What may be held: the rows of contacts (k, n), and of what always is (m_b, n), with λ_b = constant + λ of_forces.
 
     Forces of contacts that slide, or are at their bound, follow from the normal forces.
@@ -72,7 +72,7 @@ class Held(NamedTuple):
         return forces, jnp.where(on & (jnp.diag(null)[:k] > small), beyond, 0.0)
 
 
-class Trial(NamedTuple):
+class BoundsTried(NamedTuple):
     """The forces with what is at its bound, the next such choice, and whether that is to be tried."""
 
     bound: AtBound
@@ -82,7 +82,7 @@ class Trial(NamedTuple):
     count: Int[Array, ""]
 
 
-def within_laws(problem: ContactProblem, held: Held, holds: Callable) -> tuple[AtBound, Forces]:
+def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tuple[AtBound, Forces]:
     """The forces of contacts, and what has the bound of its law since the shortest forces would break that.
 
     `holds(bound, solution)`: which rows are held then, and below which size each force is zero.
@@ -92,7 +92,7 @@ def within_laws(problem: ContactProblem, held: Held, holds: Callable) -> tuple[A
     if problem.free.size == 1:
         return none, solved(problem)
 
-    def attempt(before: Trial) -> Trial:
+    def attempt(before: BoundsTried) -> BoundsTried:
         bound, tried = before.next, before.next.on(problem)
         solution = solved(tried)
         on, no_force = holds(bound, solution)
@@ -105,9 +105,9 @@ def within_laws(problem: ContactProblem, held: Held, holds: Callable) -> tuple[A
         better = solution.found | (before.count == 0)
         goes_on = better & solution.found & (worst > 0) & (before.count < problem.free.size)
         chosen = where(better, (bound, solution), (before.bound, before.solution))
-        return Trial(*chosen, further, goes_on, before.count + 1)
+        return BoundsTried(*chosen, further, goes_on, before.count + 1)
 
     nothing = Forces(jnp.zeros_like(problem.free), jnp.asarray(False))
-    first = Trial(none, nothing, none, jnp.asarray(True), jnp.asarray(0))
+    first = BoundsTried(none, nothing, none, jnp.asarray(True), jnp.asarray(0))
     found = lax.while_loop(lambda trial: trial.goes_on, attempt, first)
     return found.bound, found.solution

@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.elements.complementarity import ContactProblem, lengths
-from lagjax.integrate.elements.redundant import Held, within_laws
+from lagjax.integrate.elements.redundant import HeldRows, within_laws
 from tests.integrate.elements.test_motions import moved
 
 G, MU, BOX = 9.81, 0.5, (1.0, 1.0, 2 / 3)
@@ -23,7 +23,7 @@ def resting(rows, of_normals, mass, load, mu=MU, partners=None):
         jnp.asarray(response @ rows.T), jnp.asarray(response @ np.asarray(load)), jnp.ones(gaps, bool),
         jnp.asarray(of_normals), jnp.zeros(slips), jnp.full(slips, mu), jnp.zeros(slips), partners,
     )  # fmt: skip
-    held = Held(jnp.asarray(rows), jnp.zeros((0, rows.shape[1])), jnp.zeros(0), jnp.zeros((len(rows), 0)))
+    held = HeldRows(jnp.asarray(rows), jnp.zeros((0, rows.shape[1])), jnp.zeros(0), jnp.zeros((len(rows), 0)))
 
     def holds(bound, solution):
         return jnp.concatenate([~bound.lifted, lengths(bound.leans, partners) == 0]), jnp.full(len(rows), 1e-9)
