@@ -43,6 +43,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.integrate.events.brackets import (
     Followed,
     GuardRoot,
+    GuardValue,
     Node,
     Pieces,
     Sight,
@@ -217,6 +218,12 @@ class EventController(diffrax.AbstractStepSizeController):
         later = _where(keep, small(later), small(watched._replace(part=part)))._replace(t=t, y=y)
         return takes, move.at, ended, later
 
+    def _at_last(self, t: Array, value: GuardValue, kind: EventKind) -> GuardValue:
+        """A guard that comes within round-off of zero at the last time has crossed: a motion that continues from there
+        starts on the guard, and does not cross it."""
+        crossed = (t >= self.last) & self.sight.is_on(value) & (value.g * value.rate < 0) & (not kind.holds)
+        return value._replace(g=jnp.where(crossed, -value.g, value.g))
+
     def _move(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
         """The decision about a step from t0 to t1; and the acceleration and the guards at its end."""
         part, begins, kinds = watched.part, ~watched.begun, self.kinds
@@ -228,6 +235,7 @@ class EventController(diffrax.AbstractStepSizeController):
         turns = [x & (t == part.turns_at) for x in part.turns]
         right = right._replace(values=tuple(v._replace(turns=x) for v, x in zip(right.values, turns)))
         values, times, inner = apart(self.sight.sample, left, right, args)
+        values = tuple(self._at_last(t, value, kind) for value, kind in zip(values, kinds))
         right = right._replace(values=values)
         # A guard that holds counts as above zero from the start on: if it leaves zero below, it has crossed.
         touching = [jnp.asarray(kind.holds) & (f.sign == 0) for kind, f in zip(kinds, watched.followed)]

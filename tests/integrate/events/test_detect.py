@@ -90,7 +90,7 @@ floor = {"floor": lj.Crossing(lambda t, q, v, p: q - p)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", [0.0, 1e-15, 1e-14, 1e-12, -1e-11])
+@pytest.mark.parametrize("level", [0.0, 1e-15, -1e-15, 1e-14, 1e-12, -1e-11])
 def test_at_the_last_time(level):
     """A crossing at `ts[-1]` is found once, there or when continuing from there: q = 5 (1 - t²) is zero at 1."""
     first = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 1.0], events=floor)
