@@ -98,8 +98,9 @@ def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     batch = jax.vmap(run)(lengths)
     alone = run(1.25)
     np.testing.assert_allclose(batch.q[1], alone.q, rtol=1e-9)
-    # Round-off may decide over one step more: for three lengths of eleven.
-    assert abs(int(batch.stats["num_steps"][1]) - int(alone.stats["num_steps"])) <= 1
+    # Not of the second lane: for three lengths of eleven round-off decides over one step more.
+    for lane in (0, 3):
+        assert int(batch.stats["num_steps"][lane]) == int(run(lengths[lane]).stats["num_steps"])
     good = np.asarray(batch.result == lj.RESULTS.successful)
     assert good.tolist() == [True, True, False, True]
     assert bool((batch.result == lj.RESULTS.start_not_finite)[2])
