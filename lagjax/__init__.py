@@ -153,6 +153,7 @@ if TYPE_CHECKING:
         cylindrical,
         disk,
         fixed,
+        gear,
         ground,
         line,
         mesh,
@@ -160,6 +161,7 @@ if TYPE_CHECKING:
         multibody,
         planar,
         prismatic,
+        rack_and_pinion,
         revolute,
         rod,
         rolling,
@@ -215,9 +217,9 @@ LATER = {
     ),
     "lagjax.analysis.symmetry": "Symmetries SymmetryTest is_symmetry symmetries",
     "lagjax.bodies": (
-        "Body Load Marker Pose Surface Tree applied box cylinder cylindrical disk fixed ground line mesh motor "
-        "multibody planar prismatic revolute rod rolling rolling_ellipsoid rolling_sphere sphere spherical "
-        "spring torsion trail universal weight"
+        "Body Load Marker Pose Surface Tree applied box cylinder cylindrical disk fixed gear ground line mesh "
+        "motor multibody planar prismatic rack_and_pinion revolute rod rolling rolling_ellipsoid rolling_sphere sphere "
+        "spherical spring torsion trail universal weight"
     ),
     "lagjax.exchange": "export from_sympy result_codes",
     "lagjax.models": "RobotModel read_mjcf read_urdf",
@@ -273,6 +275,8 @@ __all__ = [
     "rolling",
     "rolling_ellipsoid",
     "rolling_sphere",
+    "gear",
+    "rack_and_pinion",
     "Load",
     "weight",
     "spring",

@@ -2,6 +2,7 @@
 
 from lagjax.bodies.assemble import multibody
 from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
+from lagjax.bodies.gears import gear, rack_and_pinion
 from lagjax.bodies.joints import (
     cylindrical,
     fixed,
@@ -32,6 +33,7 @@ __all__ = [
     "cylindrical",
     "disk",
     "fixed",
+    "gear",
     "ground",
     "line",
     "mesh",
@@ -39,6 +41,7 @@ __all__ = [
     "multibody",
     "planar",
     "prismatic",
+    "rack_and_pinion",
     "revolute",
     "rod",
     "rolling",

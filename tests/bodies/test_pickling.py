@@ -50,7 +50,12 @@ def cases() -> dict:
         "shoulder": lj.revolute(lj.ground.at(axis=ACROSS), arm.at((0.0, 0.0, 0.5), axis=ACROSS)),
         "elbow": lj.revolute(arm.at((0.0, 0.0, -0.5), axis=ACROSS), hand.at((0.0, 0.0, 0.5), axis=ACROSS)),
     }
-    closed = {"end": lj.planar(lj.ground.at(), hand.at()), "rolls": lj.rolling_sphere(hand.at(), lj.ground.at(), 1.0)}
+    closed = {
+        "end": lj.planar(lj.ground.at(), hand.at()),
+        "rolls": lj.rolling_sphere(hand.at(), lj.ground.at(), 1.0),
+        "gear": lj.gear(lj.ground.at(axis=ACROSS), hand.at(axis=ACROSS), 3.0, carrier=arm),
+        "rack": lj.rack_and_pinion(arm.at(axis=ACROSS), hand.at(), 0.5),
+    }
     touching = lj.rolling_sphere(ball.at(), lj.ground.at(), 1.0)["touches"].function
     model = lj.read_urdf(FILE)
     still, spun = ({"ball": x.moving((0.3, 0.0, 0.0), (0.1, 0.2, 0.3))} for x in (near, far))
