@@ -1,10 +1,10 @@
 """Small dense linear solves that XLA can fuse; larger ones by LAPACK.
 
-`solve(matrix, rhs)` inverts by Gauss-Jordan elimination with scaled partial pivoting and follows with one
-step of iterative refinement in the same precision. Refinement is what makes the answer accurate *component
-by component*: after it the computed x solves `(K + dK) x = b + db` with `|dK| <= c eps |K|` and
-`|db| <= c eps |b|` entrywise (Skeel, Math. Comp. 35 (1980) 817), so an acceleration of 1e-17 next to
-one of 10 keeps its digits if the entries of K and b carry them.
+`solve(matrix, rhs)` inverts by Gauss-Jordan elimination with scaled partial pivoting, or takes LAPACK's factors of a
+larger matrix, and follows with one step of iterative refinement in the same precision. Refinement is what makes the
+answer accurate *component by component*: after it the computed x solves `(K + dK) x = b + db` with `|dK| <= c eps |K|`
+and `|db| <= c eps |b|` entrywise (Skeel, Math. Comp. 35 (1980) 817), so an acceleration of 1e-17 next to one of 10
+keeps its digits if the entries of K and b carry them.
 
 The elimination acts on whole rows, one column at a time, in a loop. Unrolled it ran a fifth faster, but made up half of
 the code to compile in a constrained system, where it is only the fallback of the fast solve (`Saddle`). It is faster
@@ -33,7 +33,6 @@ INDEPENDENT_ABOVE = 1e-10
 SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
-@jax.custom_jvp
 def solve(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solve `matrix @ x = rhs`; a singular matrix gives NaN or infinity, never a plausible number.
 
@@ -45,6 +44,15 @@ def solve(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, 
 
     **Returns:** x, shape (n,), `[rhs]/[matrix]`.
     """
+    if rhs.shape[0] <= ELIMINATE_INSIDE_UP_TO:
+        return _by_inverse(matrix, rhs)
+    # Of 60 equations the inverse, by as many right-hand sides, takes ten times as long. XLA factors the matrix once.
+    x = jnp.linalg.solve(matrix, rhs)
+    return x + jnp.linalg.solve(matrix, rhs - matrix @ x)
+
+
+@jax.custom_jvp
+def _by_inverse(matrix: Array, rhs: Array):
     return _solution(matrix, rhs)[0]
 
 
@@ -58,8 +66,8 @@ def _solution(matrix: Array, rhs: Array):
 
 # x comes from the same code with and without a derivative: JAX's batching of custom rules under `jit` requires that
 # both have their batch axis in the same position.
-@solve.defjvp
-def _solve_jvp(primals: Sequence, tangents: Sequence):
+@_by_inverse.defjvp
+def _by_inverse_jvp(primals: Sequence, tangents: Sequence):
     (matrix, rhs), (d_matrix, d_rhs) = primals, tangents
     x, solve_for = _solution(matrix, rhs)
     return x, solve_for(d_rhs - d_matrix @ x)
