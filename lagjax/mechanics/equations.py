@@ -179,7 +179,7 @@ class Equations(eqx.Module):
         return None if self.model.m < 2 else _independent(self.form, self.model, t, q, v, dependent_below)
 
     def displacement(self, t: Array, q: PyTree, v: PyTree):
-        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
+        """`displacement(r)`: the shortest one, in the metric of M, that changes the residuals by r (m,)."""
         return self.form.displacement(self.model, t, *self.model.vectors(q, v))
 
     def row_sizes(self, t: Array, q: PyTree, v: PyTree) -> Float[Array, " m"]:
@@ -260,8 +260,8 @@ def _from_given(equations: Equations, t: Array, given: Float[Array, "2 n"], last
 
     def step(state: Float[Array, "2 n"], i: Array):
         (results, known) = equations._known_at(t, state)
-        moved, off = corrected(equations.model, t, *state, known), tuple(map(slightly_off, state))
-        return jnp.where(i < last, jnp.stack(moved), jnp.stack(off)), (state, (results, known))
+        moved, off = corrected(equations.model, t, state, known), jax.vmap(slightly_off)(state)
+        return jnp.where(i < last, moved, off), (state, (results, known))
 
     return lax.scan(step, given, jnp.arange(last + 2))[1]
 

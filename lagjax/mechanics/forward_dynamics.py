@@ -90,10 +90,10 @@ class ForwardDynamics(NamedTuple):
         return chosen(model, constraints.jacobian(model, t, x, u), dependent_below)
 
     def displacement(self, *state) -> Callable:
-        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
+        """`displacement(r)`: the shortest one, in the metric of M, that changes the residuals by r."""
         solver = _solver(*state, None)
         matrix = jnp.where(solver.independent[None], solver.responses.T @ dense.inverse(solver.schur), 0.0)
-        return lambda which, r: matrix[:, which] @ r
+        return lambda r: matrix @ r
 
     def row_sizes(self, *state) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation."""

@@ -11,7 +11,7 @@ massless coordinate (M singular) is no obstacle. Positions are moved only where 
 Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §IV.4 and §VII.1.2.
 """
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jaxtools import compiled, jitted, stop_gradient
 from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.mechanics.first_order import resolved
+from lagjax.numerics import newton
 from lagjax.system import InModes, Model, constraints, coordinates, given_in
 
 # With a fixed matrix, an iteration multiplies the residual by about the initial one: one iteration is enough if that is
@@ -57,59 +58,30 @@ def to_manifold(equations: Equations, t: Array, q: PyTree, v: PyTree, rtol: Arra
     if not model.m:
         return Projected(q, model.tree(resolved(model, t, *y)), jnp.asarray(True))
     # Not differentiated: where the residual vanishes, the derivative of the matrix does not contribute.
-    frozen, at = stop_gradient(equations), stop_gradient((t, q, v))
-    displacement, (slopes, size) = frozen.displacement(*at), _slopes(model, frozen.row_sizes(*at), *at[1:])
-    first_level = model.holonomic.sum()
+    frozen, at, start = stop_gradient((equations, (t, q, v), y))
+    # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
+    step, slope = jax.vmap(frozen.displacement(*at)), frozen.row_sizes(*at)[None]
 
-    def step(r: Array):
-        of_positions, of_velocities = jnp.split(r, [first_level])
-        # Positions move only in directions that the velocity constraints allow: a rolling body keeps rolling.
-        along_q = displacement(model.holonomic, of_positions) if first_level else jnp.zeros_like(y[0])
-        return jnp.stack([along_q, displacement(np.ones(model.m, bool), of_velocities)])
+    def size(r: Array):
+        return jnp.max(jnp.abs(r) / jnp.where(slope > 0, slope, jnp.inf), axis=1)
 
-    def sizes(r: Array):
-        return jnp.max(jnp.abs(r)[:, None] / jnp.where(slopes > 0, slopes, jnp.inf), axis=0)
+    def last(y: Array, moves: Array):
+        r = _residuals(model, t, y)
+        return y - step(jnp.where(moves, r, 0.0)), r
 
-    y, r = _newton(_residuals, (model, t), y, step, sizes)
-    holds = jnp.all(jnp.abs(r) <= slopes @ _allowed(size, rtol, atol))
+    of_y = partial(_residuals, frozen.model, at[0])
+    near = newton(of_y, lambda y, r, i: step(r), start, ITERATIONS, size=size, enough=ONE_IS_ENOUGH_BELOW)
+    # Two steps are differentiated, as velocities follow the positions that the first moves, and one moves nothing: the
+    # residuals are in the program twice, where four copies made up half of a vehicle's.
+    y, residuals = lax.scan(last, near + (y - start), jnp.asarray([True, True, False]))
+    holds = jnp.all(jnp.abs(residuals[-1]) <= _allowed(start, rtol, atol) * slope)
     return Projected(model.tree(y[0]), model.tree(resolved(model, t, *y)), lax.stop_gradient(holds))
 
 
 # Jitted, so that JAX traces it once for all the places of a program that need it.
 @jitted
-def _residuals(problem: tuple, y: Float[Array, "2 n"]) -> Array:
-    """The residuals of positions, and after them those of velocities."""
-    return jnp.concatenate([constraints.position_residual(*problem, y[0]), constraints.velocity_residual(*problem, *y)])
-
-
-def _newton(residual: Callable, problem: PyTree, y: Array, step: Callable, sizes: Callable):
-    """Iterate `y - step(r(problem, y))` for positions and velocities together; return y and what is left of r.
-
-    `sizes(r)`: of both levels. Only the last two iterations are differentiated, enough where r vanishes: velocities
-    follow the positions that the first of them moves. The residual is in the program twice: four copies made up half
-    of a vehicle's.
-    """
-    fixed, start = stop_gradient((problem, y))
-
-    def iterate(state):
-        i, _, y, first, _ = state
-        r = residual(fixed, y)
-        first = jnp.where(i == 0, sizes(r), first)
-        going = jnp.any(sizes(r) > ONE_IS_ENOUGH_BELOW * jnp.maximum(jnp.max(jnp.abs(y), axis=1), first))
-        return i + 1, y, y - step(r), first, going
-
-    def unfinished(state):
-        return (state[0] <= ITERATIONS) & state[4]
-
-    at_start = jnp.asarray(0), start, start, jnp.zeros(2, y.dtype), jnp.asarray(True)
-    near = lax.while_loop(unfinished, iterate, at_start)[1]
-
-    def last(y: Array, moves: Array):
-        r = residual(problem, y)
-        return y - step(jnp.where(moves, r, 0.0)), r
-
-    y, residuals = lax.scan(last, near + (y - lax.stop_gradient(y)), jnp.asarray([True, True, False]))
-    return y, residuals[-1]
+def _residuals(model: Model, t: Array, y: Float[Array, "2 n"]) -> Float[Array, "2 m"]:
+    return constraints.residuals(model, t, *y)
 
 
 def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array):
@@ -117,7 +89,7 @@ def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array)
 
     `change` (m,): that of `constraints.velocity_residual`. The result has the structure of v, to be added to it.
     """
-    return model.tree(equations_of(model).displacement(t, q, v)(np.ones(change.size, bool), change))
+    return model.tree(equations_of(model).displacement(t, q, v)(change))
 
 
 def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes | None = None):
@@ -131,17 +103,17 @@ def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes 
 
     def at(t: Array, q: PyTree, v: PyTree, row: InModes | None):
         here = equations if row is None else equations_of(model.of(given_in(row, model.params.params)))
-        return residuals_and_slopes(here, t, q, v)
+        return *residuals_and_slopes(here, t, q, v), level_size(jnp.stack(model.vectors(q, v)))
 
     residual, slope, size = jax.vmap(at)(t, q, v, given)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
-    scale = slope @ level_size(jnp.nanmax(size, axis=0))
+    scale = jnp.nanmax(size, axis=0, keepdims=True) * slope
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
 
 
-def level_size(size: Array):
+def level_size(y: Float[Array, "2 n"]) -> Float[Array, "2 1"]:
     """Return the largest coordinate and the largest velocity; a single coordinate may be zero and sets no scale."""
-    return jnp.max(size.reshape(2, -1), axis=1)
+    return jnp.max(jnp.abs(y), axis=1, keepdims=True)
 
 
 def within(
@@ -152,39 +124,35 @@ def within(
     `known`: the residuals and A at this state, if they have been computed.
     """
     if known is None:
-        residual, slope, size = residuals_and_slopes(equations, t, q, v)
+        residual, slope = residuals_and_slopes(equations, t, q, v)
     else:
-        residual, slope, size = known[0], *_slopes(equations.model, jnp.sum(jnp.abs(known[1]), axis=1), q, v)
-    return jnp.all(jnp.abs(residual) <= slope @ _allowed(size, rtol, atol))
+        residual, slope = known[0], jnp.sum(jnp.abs(known[1]), axis=1)[None]
+    return jnp.all(jnp.abs(residual) <= _allowed(jnp.stack(equations.model.vectors(q, v)), rtol, atol) * slope)
 
 
-def _allowed(size: Array, rtol: Array, atol: Array):
-    """Return the displacements of coordinates and of velocities that count as zero, for a state of these sizes."""
-    return jnp.broadcast_to(atol, 2) + jnp.broadcast_to(rtol, 2) * level_size(size)
+def _allowed(y: Float[Array, "2 n"], rtol: Array, atol: Array) -> Float[Array, "2 1"]:
+    """Return the displacements of coordinates and of velocities that count as zero at a state."""
+    rtol, atol = (jnp.broadcast_to(tolerance, 2)[:, None] for tolerance in (rtol, atol))
+    return atol + rtol * level_size(y)
 
 
 @compiled
 def residuals_and_slopes(equations: Equations, t: Array, q: PyTree, v: PyTree):
-    """Return the residuals of both levels, the sums of their slopes over q and over v (two columns), and `|(q, v)|`."""
-    model, (x, u) = equations.model, equations.model.vectors(q, v)
-    return _residuals((model, t), jnp.stack([x, u])), *_slopes(model, equations.row_sizes(t, q, v), q, v)
+    """Return the residuals of positions and of velocities (2, m), and the sums of their slopes (1, m).
 
-
-def _slopes(model: Model, slope: Array, q: PyTree, v: PyTree):
-    x, u = model.vectors(q, v)
-    # ∂(dg/dt)/∂v = ∂g/∂q: the holonomic rows serve both levels.
-    of_q = slope[model.holonomic]
-    columns = [jnp.concatenate([of_q, jnp.zeros_like(slope)]), jnp.concatenate([jnp.zeros_like(of_q), slope])]
-    return jnp.stack(columns, axis=1), jnp.abs(jnp.concatenate([x, u]))
+    ∂(dg/dt)/∂v = ∂g/∂q: the rows of A serve both levels.
+    """
+    y = jnp.stack(equations.model.vectors(q, v))
+    return _residuals(equations.model, t, y), equations.row_sizes(t, q, v)[None]
 
 
 def departures(model: Model, s: coordinates.State, rtol: Array, atol: Array) -> str:
     """Name the constraints that a state violates by more than a displacement `atol + rtol |y|`; else ''."""
-    residual, slope, size = (np.asarray(part) for part in residuals_and_slopes(equations_of(model), *s[:3]))
-    allowed = np.asarray(_allowed(size, rtol, atol))
-    # NaN is a violation too.
-    off = np.flatnonzero(~(np.abs(residual) <= slope @ allowed))
+    residual, slope = (np.asarray(part) for part in residuals_and_slopes(equations_of(model), *s[:3]))
+    allowed = np.asarray(_allowed(jnp.stack(model.vectors(s.q, s.v)), rtol, atol))
+    # NaN is a violation too; constraints of velocities ask nothing of positions.
+    off = ~(np.abs(residual) <= allowed * slope) & np.stack([model.holonomic, np.ones_like(model.holonomic)])
     equations = list(zip(model.equation_names, model.holonomic))
-    labels = [f"'{name}'" for name, holonomic in equations if holonomic]
+    labels = [f"'{name}'" for name, _ in equations]
     labels += [f"d/dt '{name}'" if holonomic else f"'{name}'" for name, holonomic in equations]
-    return ", ".join(f"{labels[i]} = {residual[i]:.3g}" for i in off)
+    return ", ".join(f"{labels[i]} = {residual.flat[i]:.3g}" for i in np.flatnonzero(off))

@@ -61,7 +61,7 @@ class Verdict(NamedTuple):
     singular: Bool[Array, ""]
     contradictory: Bool[Array, ""]
     mass: Float[Array, " n"]
-    given: tuple[Float[Array, " k"], Float[Array, "m n"]] | None = None
+    given: tuple[Float[Array, "2 m"], Float[Array, "m n"]] | None = None
 
 
 def slightly_off(y: Array):
@@ -89,13 +89,12 @@ class Known(NamedTuple):
     lagrangian: Float[Array, ""]
     mass: Float[Array, "n n"]
     jacobian: Float[Array, "m n"]
-    residuals: Float[Array, " k"]
+    residuals: Float[Array, "2 m"]
 
 
 def known_at(model: Model, t: Array, x: Array, u: Array, mass: Array, jacobian: Array) -> Known:
     """What is known of a state, given M and A."""
-    position, velocity = constraints.position_residual(model, t, x), constraints.velocity_residual(model, t, x, u)
-    return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, jnp.concatenate([position, velocity]))
+    return Known(jnp.asarray(model.lagrangian(t, x, u)), mass, jacobian, constraints.residuals(model, t, x, u))
 
 
 class Dense(NamedTuple):
@@ -150,11 +149,11 @@ class Dense(NamedTuple):
         return self._chosen(model, linear_equations(model, t, x, u)[1].jacobian, dependent_below)
 
     def displacement(self, *state) -> Callable:
-        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
+        """`displacement(r)`: the shortest one, in the metric of M, that changes the residuals by r."""
         linear, (jacobian, _) = linear_equations(*state)
         # The rows are chosen here and not at the step's start, as the step may have come near a singular position.
         matrix = displacement_map(linear.mass, jacobian, self._chosen(state[0], jacobian))
-        return lambda which, r: matrix[:, which] @ r
+        return lambda r: matrix @ r
 
     def row_sizes(self, *state) -> Float[Array, " m"]:
         """`Σ_j |A_ij|` of each constraint equation."""
@@ -279,18 +278,15 @@ def displacement_map(mass: Array, jacobian: Array, independent: Array | None):
     return _spread(inverted[:n, n:], independent)
 
 
-def corrected(model: Model, t: Array, x: Array, u: Array, known):
+def corrected(model: Model, t: Array, y: Float[Array, "2 n"], known):
     """The state after one of Newton's iterations to all constraints, the shortest in the metric of M.
 
     `known`: M, A and the residuals there.
     """
-    if not model.m:
-        return x, resolved(model, t, x, u)
-    used = jnp.ones(model.m, bool) if model.off is None else ~model.off
-    displacement = displacement_map(known.mass, known.jacobian, used)
-    of_positions, of_velocities = jnp.split(known.residuals, [known.residuals.size - model.m])
-    x = x - displacement[:, model.holonomic] @ of_positions
-    return x, resolved(model, t, x, u - displacement @ of_velocities)
+    if model.m:
+        used = jnp.ones(model.m, bool) if model.off is None else ~model.off
+        y = y - known.residuals @ displacement_map(known.mass, known.jacobian, used).T
+    return jnp.stack([y[0], resolved(model, t, *y)])
 
 
 def _pick(x: Array, independent: Array, n: int):

@@ -209,13 +209,13 @@ class Banded(NamedTuple):
         return _independent(self.plan, operators_at(self.plan, model, t, x, u), dependent_below)
 
     def displacement(self, model: Model, t: Array, x: Array, u: Array) -> Callable:
-        """`displacement(which, r)`: the shortest one, in the metric of M, that changes the residuals `which` by r."""
+        """`displacement(r)`: the shortest one, in the metric of M, that changes the residuals by r."""
         operators = operators_at(self.plan, model, t, x, u)
         kept = _independent(self.plan, operators)
         schur, invert = _schur(self.plan, operators, kept)
 
-        def of_residuals(which: np.ndarray, r: Array):
-            r = jnp.where(kept, jnp.zeros(which.size, r.dtype).at[np.flatnonzero(which)].set(r), 0.0)
+        def of_residuals(r: Array):
+            r = jnp.where(kept, r, 0.0)
             multipliers = lax.custom_linear_solve(schur, r, lambda _, r: invert(r), symmetric=True)
             return operators.mass_inverse(operators.pull(multipliers))
 

@@ -44,40 +44,46 @@ def largest(r: Array) -> Array:
 def newton(
     residual: Callable[[Array], Array],
     step: Callable[[Array, Array, Array], Array],
-    y0: Float[Array, " n"],
+    y0: Float[Array, "*levels n"],
     most: int,
     *,
     size: Callable[[Array], Array] = largest,
+    enough: float = 0.0,
     falls: float | None = None,
     fractions: np.ndarray | None = None,
-) -> Float[Array, " n"]:
+) -> Float[Array, "*levels n"]:
     """Repeat `y - f step(y, r, i)` with `r = residual(y)`, at most `most` times. Not differentiable in reverse mode.
 
     >>> print(newton(lambda y: y**2 - 2.0, lambda y, r, i: r / (2 * y), jnp.array([1.0]), 6).round(6))
     [1.414214]
 
     **Arguments:** f is the first of the `fractions` for which `size(r)` is least, or 1. The iteration ends when
-    `size(r)` is zero or, with `falls`, when it is no longer below `falls` times the one before.
+    `size(r)`, of each of several levels, is zero, or at most `enough` times the size of y or the first one; or, with
+    `falls`, when it is no longer below `falls` times the one before. The program contains `residual` and `step` once.
     """
 
-    def unfinished(state):
-        i, y, r, before = state
-        going = (i < most) & (size(r) > 0.0)
-        return going if falls is None else going & (size(r) < falls * before)
-
     def iterate(state):
-        i, y, r, _ = state
-        whole, before = step(y, r, i), size(r)
+        i, y, whole, first, before, _ = state
         if fractions is None:
-            return i + 1, y - whole, residual(y - whole), before
-        trials = y[None] - fractions.astype(y.dtype)[:, None] * whole[None]
-        residuals = jax.vmap(residual)(trials)
-        sizes = jax.vmap(size)(residuals)
-        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
-        return i + 1, trials[best], residuals[best], before
+            y = y - whole
+            r = residual(y)
+        else:
+            trials = y[None] - fractions.astype(y.dtype)[:, None] * whole[None]
+            residuals = jax.vmap(residual)(trials)
+            sizes = jax.vmap(size)(residuals)
+            best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+            y, r = trials[best], residuals[best]
+        now = size(r)
+        first = jnp.where(i == 0, now, first)
+        going = jnp.any(now > (enough * jnp.maximum(jnp.max(jnp.abs(y), axis=-1), first) if enough else 0.0))
+        going = going if falls is None else going & (now < falls * before)
+        return i + 1, y, step(y, r, i), first, now, going
 
-    r = residual(y0)
-    return lax.while_loop(unfinished, iterate, (0, y0, r, jnp.full_like(size(r), jnp.inf)))[1]
+    def unfinished(state):
+        return (state[0] <= most) & state[-1]
+
+    unknown = jnp.full(y0.shape[:-1], jnp.inf, y0.dtype)
+    return lax.while_loop(unfinished, iterate, (0, y0, jnp.zeros_like(y0), unknown, unknown, jnp.asarray(True)))[1]
 
 
 def last_step(near: Array, y0: Array, step: Callable[[Array], Array]) -> Array:

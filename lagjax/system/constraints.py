@@ -117,6 +117,16 @@ def velocity_residual(model, t: Array, x: Array, u: Array) -> Float[Array, " m"]
     return _stack(_velocities(model, t, x, u), x.dtype)
 
 
+def residuals(model, t: Array, x: Array, u: Array) -> Float[Array, "2 m"]:
+    """What each constraint asks to vanish of positions, `g` or nothing, and of velocities, `dg/dt` or `phi`."""
+    if not model.m:
+        return jnp.zeros((2, 0), x.dtype)
+    position, velocities = iter(_positions(model, t, x)), _velocities(model, t, x, u)
+    given = zip(model.system.constraints.values(), velocities)
+    positions = [next(position) if c.of_positions else jnp.zeros_like(velocity) for c, velocity in given]
+    return jnp.stack([_stack(positions, x.dtype), _stack(velocities, x.dtype)])
+
+
 def jacobian(model, t: Array, x: Array, u: Array) -> Float[Array, "m n"]:
     """`A` of all constraints."""
     return jax.jacfwd(lambda u: velocity_residual(model, t, x, u))(u)

@@ -46,7 +46,7 @@ def test_the_three_ways_say_the_same(monkeypatch):
     r = jnp.array([1e-3, -2e-3])
 
     def said(one, t, q, v):
-        slopes, moved = one.row_sizes(t, q, v), one.displacement(t, q, v)(np.ones(2, bool), r)
+        slopes, moved = one.row_sizes(t, q, v), one.displacement(t, q, v)(r)
         return one.accelerations(t, q, v), slopes, moved, one.independent(t, q, v), one.verdict(t, q, v)[2:5]
 
     @jax.jit
@@ -100,7 +100,7 @@ def test_in_arrays_they_are_the_same_or_nan():
         model, q = model_of(system, *s).of(s.params | {"turn": turn}), s.q + shift * jnp.array([[1.0, 2.0], [3.0, 4.0]])
         robust, regular = equations_of(model), equations_of(model, fallback=False)
         assert regular.are_taken_for_regular and not robust.are_taken_for_regular and not regular.are_written
-        of = lambda one: (one.accelerations(s.t, q, s.v), one.displacement(s.t, q, s.v)(np.ones(3, bool), jnp.ones(3)))
+        of = lambda one: (one.accelerations(s.t, q, s.v), one.displacement(s.t, q, s.v)(jnp.ones(3)))
         (begun, verdict), moved = regular.begin(s.t, q, s.v, True), to_manifold(robust, s.t, q, s.v, 1e-12, 1e-12)
         valid = verdict.finite & ~verdict.singular
         return of(regular), of(robust), robust.independent(s.t, q, s.v), (begun, valid), moved
@@ -136,7 +136,7 @@ def test_a_start_is_returned_and_judged_in_one_loop():
     np.testing.assert_allclose(q, [0.6 * 1.003, -0.8 * 1.003], rtol=1e-15)
     np.testing.assert_allclose(v, [1.6, 1.2], rtol=1e-14)
     assert moved.finite and as_given.finite and not moved.singular
-    np.testing.assert_allclose(moved.given[0], [1.0 - 1.003**2, -2.0], rtol=1e-12)
+    np.testing.assert_allclose(moved.given[0], [[1.0 - 1.003**2], [-2.0]], rtol=1e-12)
     assert still == ((s.q["x"], s.q["y"]), (s.v["x"], s.v["y"]))
     assert not begun(8.0)[0][1].finite
 
