@@ -194,6 +194,19 @@ def lagrangian(t, q, v, p):
     return 0.5 * jnp.sum(weight * jnp.cos(q[:, None] - q) * v[:, None] * v) + p["g"] * (n - np.arange(n)) @ jnp.cos(q)
 system, params, start = lj.System(lagrangian), {"g": 9.81}, (np.array([0.4, 0.5, 0.8, 1.1]), np.zeros(4))
 """
+LOOPS = """
+# Thirty-two links in absolute angles, in two loops of Python: 9,728 operations, of which 9,152 are repeats.
+def lagrangian(t, q, v, p):
+    found = 0.0
+    for i in range(32):
+        x = y = height = 0.0
+        for j in range(i + 1):
+            x, y = x + jnp.cos(q[j]) * v[j], y + jnp.sin(q[j]) * v[j]
+            height = height - jnp.cos(q[j])
+        found = found + 0.5 * (x**2 + y**2) - p["g"] * height
+    return found
+system, params, start = lj.System(lagrangian), {"g": 9.81}, (np.linspace(0.5, 0.7, 32), np.zeros(32))
+"""
 LINKS = """
 # Four links as places and angles with pins written as constraints on single numbers.
 def lagrangian(t, q, v, p):
@@ -297,6 +310,7 @@ CASES = {
     "three massless links": Case(MASSLESS, 5.0),
     "four links": Case(LINKS, None),
     "four angles": Case(ANGLES, None),
+    "32 angles in loops": Case(LOOPS, None),
     "four-bar with ledger": Case(FOUR_BAR, 12.0, LEDGER),
     "Bricard": Case(MECHANISM.format(name="bricard", end=0.5, varied="g"), 15.0),
     "Fekete": Case(MECHANISM.format(name="fekete", end=10.0, varied="alpha"), 20.0),

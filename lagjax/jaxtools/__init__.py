@@ -51,6 +51,7 @@ from lagjax.jaxtools.jaxpr_identity import (
     rule_follows,
     rules_of,
     with_own_constants,
+    without_repeats,
 )
 from lagjax.jaxtools.linearity import is_linear
 from lagjax.jaxtools.open_jumps import (

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from lagjax.jaxtools.jaxpr import bodies, equations, evaluate, once_per_program
+from lagjax.jaxtools.jaxpr import anywhere, bodies, equations, evaluate, once_per_program
 
 # The rules of functions with rules of their own, and what only belongs to these.
 RULES = {
@@ -73,6 +73,35 @@ def meaning_of(jaxpr: Jaxpr) -> tuple:
 def _meaning_inside(jaxpr: Jaxpr) -> Meaning:
     """The meaning of a program inside another one, which is often one that JAX has traced before."""
     return Meaning(meaning_of(jaxpr))
+
+
+@once_per_program
+def without_repeats(jaxpr: Jaxpr) -> Jaxpr:
+    """The program with an operation on the same operands written once, as where a loop in Python builds a partial sum
+    anew for each body. Operations of several results stay, and functions with their own rule of differentiation."""
+    first, same, kept = {}, {}, []
+    for equation in jaxpr.eqns:
+        operands = [x if isinstance(x, Literal) else same.get(x, x) for x in equation.invars]
+        equation = equation if operands == equation.invars else equation.replace(invars=operands)
+        is_alone = len(equation.outvars) != 1 or equation.effects or _follows_rules(equation)
+        earlier = equation if is_alone else first.setdefault(_operation(equation), equation)
+        if earlier is equation:
+            kept.append(equation)
+        else:
+            same[equation.outvars[0]] = earlier.outvars[0]
+    return jaxpr.replace(eqns=kept, outvars=[x if isinstance(x, Literal) else same.get(x, x) for x in jaxpr.outvars])
+
+
+def _operation(equation: JaxprEqn) -> tuple:
+    operands = ((x.aval, content_of(x.val)) if isinstance(x, Literal) else x for x in equation.invars)
+    return equation.primitive, *operands, *map(_key, equation.params.values())
+
+
+_holds_rules = anywhere(lambda equation: equation.primitive.name in RULES)
+
+
+def _follows_rules(equation: JaxprEqn) -> bool:
+    return equation.primitive.name in RULES or any(map(_holds_rules, bodies(equation)))
 
 
 def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:

@@ -33,6 +33,7 @@ from lagjax.jaxtools import (
     once,
     rules_of,
     with_own_constants,
+    without_repeats,
 )
 
 # Arrays of up to so many numbers, or of so many whole numbers (indices), that are read from outside are part of the
@@ -98,7 +99,7 @@ class TracedProgram:
         own = list(given)
         if signature_of(args) != self.signature:
             return self.function_with(arrays)(*args)
-        results = eval_jaxpr(self.jaxpr, constants, *own, *arrays_of(args))
+        results = eval_jaxpr(without_repeats(self.jaxpr), constants, *own, *arrays_of(args))
         return jtu.tree_unflatten(self._structure, results)
 
     @property

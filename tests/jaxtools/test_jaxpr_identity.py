@@ -13,6 +13,7 @@ from lagjax.jaxtools.jaxpr_identity import (
     rule_follows,
     rules_of,
     with_own_constants,
+    without_repeats,
 )
 
 TABLE = np.arange(300.0)
@@ -95,3 +96,63 @@ def test_rules_of_differentiation_count():
     rules = lambda function: rules_of(function, jax.make_jaxpr(function)(1.0), 1.0)
     assert meaning(right) == meaning(wrong) and rules(right) != rules(wrong)
     assert rules(right) == rules(with_rule(lambda x: 2 * x)) and rules(jnp.sin) == ()
+
+
+def repeated(q, n=8):
+    """Sums of squares of partial sums, each built anew: the double loop of a chain."""
+    total = 0.0
+    for i in range(n):
+        partial_sum = 0.0
+        for j in range(i + 1):
+            partial_sum = partial_sum + jnp.where(q[j] > 0, jnp.cos(q[j]), 1.0)
+        total = total + partial_sum**2
+    return total
+
+
+def test_repeats_are_written_once():
+    """A double loop has as many operations as a single one, and gives the same bits; derivatives differ by round-off,
+    as they are summed in another order."""
+    q = jnp.linspace(-0.3, 1.2, 8)
+    closed = jax.make_jaxpr(repeated)(q)
+    short = closed.replace(jaxpr=without_repeats(closed.jaxpr))
+    assert len(closed.eqns) > 36 * 5 and len(short.eqns) < 8 * 9
+    again = lambda q: jaxpr_as_fun(short)(q)[0]
+    assert again(q) == repeated(q)
+    for order in (jax.grad, jax.hessian):
+        np.testing.assert_allclose(order(again)(q), order(repeated)(q), rtol=1e-13, atol=1e-13)
+
+
+@jax.custom_jvp
+def bent(x):
+    """A square whose rule of differentiation says 5."""
+    return x**2
+
+
+@jax.custom_jvp
+def bent_otherwise(x):
+    """The same with 7."""
+    return x**2
+
+
+bent.defjvp(lambda x, dx: (bent(*x), 5.0 * dx[0]))
+bent_otherwise.defjvp(lambda x, dx: (bent_otherwise(*x), 7.0 * dx[0]))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jnp.arctan2(x * 0.0, -1.0) - jnp.arctan2(x * -0.0, -1.0),
+        lambda x: bent(x) + bent_otherwise(x),
+        lambda x: jax.jit(bent)(x) + jax.jit(bent_otherwise)(x),
+        lambda x: jnp.sum(jnp.sort(jnp.stack([x, -x]))[:1]) + x.astype(jnp.float32),
+        lambda x: sum(jax.lax.top_k(jnp.stack([x, 2 * x]), k)[0][0] for k in (1, 2)),
+    ],
+    ids=["signs of zero", "rules", "rules inside", "dtypes", "parameters"],
+)
+def test_what_differs_is_not_a_repeat(function):
+    """Zeros of other signs, rules of differentiation, dtypes and parameters keep operations apart."""
+    closed = jax.make_jaxpr(function)(1.5)
+    short = closed.replace(jaxpr=without_repeats(closed.jaxpr))
+    again = lambda x: jaxpr_as_fun(short)(x)[0]
+    assert np.array_equal(again(1.5), function(jnp.asarray(1.5)))
+    np.testing.assert_array_equal(jax.grad(again)(1.5), jax.grad(function)(1.5))

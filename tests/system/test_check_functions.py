@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import lagjax as lj
+from lagjax.system import prepare
 from tests.behaviour.test_bad_input import refusal
 from tests.systems import TS
 
@@ -35,3 +37,34 @@ def test_not_hashable_in_params():
         np.testing.assert_allclose(call(frozenset), -2.0, rtol=1e-9)
         with refusal(TypeError, r"'rules\.axes' of params is \{'psi'\}", "frozenset"):
             call(set)
+
+
+def chain_in_loops(t, q, v, params):
+    """A chain of rods of length and mass one, whose points are summed anew for each rod."""
+    found = 0.0
+    for i in range(len(q)):
+        x = y = height = 0.0
+        for j in range(i + 1):
+            x, y = x + jnp.cos(q[j]) * v[j], y + jnp.sin(q[j]) * v[j]
+            height = height - jnp.cos(q[j])
+        found = found + 0.5 * (x**2 + y**2) - params["g"] * height
+    return found
+
+
+def chain_at_once(t, q, v, params):
+    """The same, for all rods at once."""
+    x, y, height = (jnp.cumsum(z) for z in (jnp.cos(q) * v, jnp.sin(q) * v, -jnp.cos(q)))
+    return jnp.sum(0.5 * (x**2 + y**2) - params["g"] * height)
+
+
+def test_loops_in_python():
+    """Of a chain in loops the user is told, once, what its first answer costs; twins: in arrays, and a short one."""
+    state = 0.0, np.linspace(0.1, 0.7, 32), np.full(32, 0.3), {"g": 10.0}
+    with pytest.warns(
+        UserWarning, match=r"L\(t, q, v, params\) consists of 5\d\d operations(.|\n)*some 30 s(.|\n)*vmap"
+    ):
+        prepare(lj.System(chain_in_loops), *state)
+    prepare(lj.System(chain_in_loops), *state)
+    prepare(lj.System(chain_at_once), *state)
+    prepare(lj.System(chain_in_loops), 0.0, state[1][:8], state[2][:8], state[3])
+    np.testing.assert_allclose(chain_in_loops(*state), chain_at_once(*state), rtol=1e-14)
