@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -103,13 +104,13 @@ class BodiesLagrangian(SystemFunction):
     @property
     def drawing(self) -> Drawing:
         """How the system is drawn: as given, or bodies as boxes between their joints."""
-        return self.drawn or Drawing(self._shapes)
+        return self.drawn or (Drawing(self._shapes, self._poses) if self.driven.bodies else Drawing(self._shapes))
 
     def _shapes(self, params: PyTree) -> tuple[Shape, ...]:
-        # Without what is fixed in driven bodies, whose poses q does not have.
-        names = {body.name for body in self.driven.bodies}
-        found = usual_shapes(self.bodies, self.looks_like, params)
-        return tuple(shape for shape in found if not any(anchor.body in names for anchor in shape.anchors))
+        return usual_shapes(self.bodies, self.looks_like, params)
+
+    def _poses(self, t: Any, q: PyTree, params: PyTree) -> PyTree:
+        return self.driven.placed(t, q, {}, params)[0]
 
 
 def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:

@@ -153,8 +153,8 @@ class Body:
     of params.
 
     Where all of them are zero it is a frame, as between two joints of a `lj.Tree`. `motion`, a function of (t, params)
-    that returns a `lj.Pose`, is for a body of `lj.multibody` that moves as given, a turning table: it has no entry in
-    q, nor mass and inertia, and bodies are joined to it as to any other.
+    that returns a `lj.Pose`, is for a body that moves as given, a turning table: it has no entry in q, nor mass and
+    inertia, and bodies are joined to it as to any other; in a `lj.Tree` it is one from which others hang.
 
     >>> table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
 
@@ -250,7 +250,7 @@ class Body:
             if self.motion is not None:
                 raise TypeError(
                     f"'{self.name}' moves as given, and has no entry in q and v.\n"
-                    f"Fix: its pose is {self.name}.motion(t, params); joints and loads of lj.multibody know it."
+                    f"Fix: its pose is {self.name}.motion(t, params); joints and loads know it, elements of lj.multibody do not."
                 )
         else:
             entry = q[self.name]

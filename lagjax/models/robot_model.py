@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -236,7 +237,7 @@ class RobotModel:
         armature = {x.name: x.armature for x in self.joints.values() if x.armature}
         return Tree(list(bodies.values()), equations, armature)
 
-    def _drawn_poses(self, q: PyTree, params: PyTree) -> dict[str, Pose]:
+    def _drawn_poses(self, t: Any, q: PyTree, params: PyTree) -> dict[str, Pose]:
         return self._poses(q)
 
     def _looks(self, params: PyTree) -> tuple[Shape, ...]:

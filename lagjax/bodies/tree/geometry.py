@@ -7,12 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import valued
+from lagjax.bodies.driven import Driven
 from lagjax.bodies.tree.links import Entry, Link, Slots, slots_of
 
 
@@ -34,10 +36,20 @@ class FixedNumbers(NamedTuple):
     root: Float[Array, " n"]
 
 
-class LinkNumbers(NamedTuple):
-    """The numbers of links for some params: `a` and `b` are the places of joints on parents and on links.
+class GivenMotion(NamedTuple):
+    """How the links that are driven move, R, r and their rates; zero for the others."""
 
-    `armature`: the inertia that the rate of each freedom has besides, of its rotor.
+    turn: Float[Array, "n 3 3"]
+    centre: Float[Array, "n 3"]
+    spin: Float[Array, "n 3"]
+    velocity: Float[Array, "n 3"]
+    acceleration: Float[Array, "n 6"]
+
+
+class LinkNumbers(NamedTuple):
+    """The numbers of links for some t and params: `a` and `b` are the places of joints on parents and on links.
+
+    `armature`: the inertia that the rate of each freedom has besides, of its rotor. `driven`: None where no body is.
     """
 
     fixed: FixedNumbers
@@ -47,6 +59,7 @@ class LinkNumbers(NamedTuple):
     a: Float[Array, "n 3"]
     b: Float[Array, "n 3"]
     armature: Float[Array, "n k"]
+    driven: GivenMotion | None
 
 
 class Geometry:
@@ -64,7 +77,7 @@ class Geometry:
         first = np.arange(self.k) == 0
         self.turns = (((kinds == "turn")[:, None] & first) | (kinds == "ball")[:, None]).astype(float)
         self.slides = ((kinds == "slide")[:, None] & first).astype(float)
-        self.free, self.ball = kinds == "free", kinds == "ball"
+        self.free, self.ball, self.driven = kinds == "free", kinds == "ball", kinds == "driven"
         self.root = np.array([link.parent < 0 for link in links], float)
         self.slots: Slots = slots_of([link.parent for link in links])
         self.body_at = {link.body.name: i for i, link in enumerate(links) if link.body is not None}
@@ -111,9 +124,10 @@ class Geometry:
         has = np.flatnonzero(self.ball | self.free)
         return has[np.argsort(self.quaternions[has])]
 
-    def at(self, params: PyTree, dtype: DTypeLike) -> LinkNumbers:
+    def at(self, t: Any, params: PyTree, dtype: DTypeLike) -> LinkNumbers:
         """The numbers of links for these params."""
-        bodies = [link.body for link in self.links]
+        # What is driven needs no inertia.
+        bodies = [None if link.kind == "driven" else link.body for link in self.links]
 
         def inertia(x: Any) -> Any:
             of = np if isinstance(x, np.ndarray) else jnp
@@ -139,7 +153,25 @@ class Geometry:
             values([link.a.place for link in self.links]),
             values([link.b.place for link in self.links]),
             jnp.asarray(self._armatures(params), dtype),
+            self._given_motion(t, params, dtype) if self.driven.any() else None,
         )
+
+    def _given_motion(self, t: Any, params: PyTree, dtype: DTypeLike) -> GivenMotion:
+        links = np.flatnonzero(self.driven)
+        bodies = [body for i in links if (body := self.links[i].body) is not None]
+        driven = Driven(tuple(bodies))
+
+        def moving(t: Array) -> tuple[Array, ...]:
+            q, v = driven.placed(t, {}, {}, params)
+            poses, rates = [x.pose(q) for x in bodies], [x.rates(v) for x in bodies]
+            spins = [x.spin(rate) for x, rate in zip(poses, rates)]
+            rows = [x.matrix for x in poses], [x.position for x in poses], spins, [x.position for x in rates]
+            return tuple(jnp.zeros((self.n, *row[0].shape)).at[links].set(jnp.stack(row)) for row in rows)
+
+        t = jnp.asarray(t, float)
+        now, rate = jax.jvp(moving, (t,), (jnp.ones_like(t),))
+        every = *now, jnp.concatenate(rate[2:], axis=1)
+        return GivenMotion(*(x.astype(dtype) for x in every))
 
     def _armatures(self, params: PyTree) -> Any:
         """Those of the freedoms of each link, (n, k)."""

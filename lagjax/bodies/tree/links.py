@@ -40,8 +40,8 @@ CROSSED = replace(BETWEEN, frame=((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 
 class Link:
     """A body, or None where it has no mass, and how it moves from its parent (-1: the ground).
 
-    `kind`: "turn" and "slide" about or along the axis of a, "ball", "free" or "held"; `a` is a place on the parent and
-    `b` on the body. `place`: of its coordinate among all numbers, or among all quaternions.
+    `kind`: "turn" and "slide" about or along the axis of a, "ball", "free", "held" or "driven"; `a` is a place on the
+    parent and `b` on the body. `place`: of its coordinate among all numbers, or among all quaternions.
     """
 
     body: Body | None
@@ -88,6 +88,12 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
         of_all = kinds.pop()
         for joined, kinds in row:
             child = joined.b.body
+            if child.motion is not None:
+                raise ValueError(
+                    f"body '{child.name}' moves as given, and hangs on the joint '{name}'.\n"
+                    "Usual cause: the places of the joint in the wrong order, which is the parent's first.\n"
+                    f"Fix: leave the joint out, or give it to tree.system(closures={{'{name}': ...}})."
+                )
             if child.name in held_by:
                 raise ValueError(
                     f"body '{child.name}' hangs on two joints, '{held_by[child.name][0]}' and '{name}'.\n"
@@ -103,7 +109,9 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
         if of_all != ("held",):
             entries.append(Entry(name, of_all, len(row) if listed else None))
     for body in bodies:
-        if body.name not in held_by:
+        if body.motion is not None:
+            held_by[body.name] = body.name, Joined(ground.at(), body.at(), ()), ("driven",), 0
+        elif body.name not in held_by:
             held_by[body.name] = body.name, Joined(ground.at(), body.at(), ()), ("free",), quaternions
             entries.append(Entry(body.name, ("free",), None))
             quaternions += 1
@@ -173,7 +181,7 @@ def _along(marker: Marker, i: int) -> Marker:
 
 def _check_masses(body: Body, kinds: tuple[str, ...], mass: bool):
     """`mass`: whether the body, or one that hangs on it, has any."""
-    if kinds != ("held",) and not mass:
+    if kinds not in (("held",), ("driven",)) and not mass:
         raise ValueError(
             f"the body '{body.name}' moves and has no mass, and nothing that has some hangs on it.\n"
             "Usual cause: a frame that should be fixed.\nFix: its mass and inertia, or lj.fixed(parent, child)."

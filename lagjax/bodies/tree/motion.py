@@ -44,7 +44,7 @@ class Joints(NamedTuple):
     """The links as seen from their parents.
 
     `turn` E, `offset` o and `arm` b' as above; `axes` (n, 3, k) those of the freedoms along the parent's, `turning` and
-    `sliding` (n, k) their rates. `spin` and `velocity` are those of free bodies, None without any.
+    `sliding` (n, k) their rates. `spin` and `velocity` are those of free and driven bodies, None without any.
     """
 
     turn: Float[Array, "n 3 3"]
@@ -247,6 +247,13 @@ def seen_from_parents(geometry: Geometry, given: LinkNumbers, q: Coordinates, v:
         if v is not None:
             spin = of_links(spins(q.quaternions, v.quaternions), geometry.quaternions)
             spin, velocity = (jnp.where(free, x, 0.0) for x in (spin, of_links(v.positions, geometry.quaternions)))
+    if given.driven is not None:
+        turn = jnp.where(geometry.driven[:, None, None], given.driven.turn, turn)
+        offset = offset + given.driven.centre
+        if v is not None:
+            spin, velocity = (
+                x if y is None else x + y for x, y in zip((given.driven.spin, given.driven.velocity), (spin, velocity))
+            )
     still = jnp.zeros_like(turns)
     turning, sliding = (still, still) if rates is None else (turns * rates, slides * rates)
     return Joints(turn, offset, -given.b, axes, turning, sliding, spin, velocity)

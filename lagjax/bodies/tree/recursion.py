@@ -15,7 +15,7 @@ velocities alone accelerate:
 
 S has a column for each freedom of the joint. A column of zeros stands for one that is not there, with D = 1. A rotor
 that turns with a joint has an inertia on its diagonal of D, and no part in what the joint passes on. A free body has
-a = -I⁻¹ p.
+a = -I⁻¹ p; one that moves as given has its acceleration for c.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes; §9.6 (rotors).
 """
@@ -55,6 +55,8 @@ def accelerated(
     if geometry.slides.any() or geometry.free.any():
         centripetal = centripetal + 2 * cross(before, motion.joint_slide)
     bias = jnp.concatenate([gamma, centripetal], axis=1)
+    if given.driven is not None:
+        bias = jnp.where(geometry.driven[:, None], given.driven.acceleration, bias)
     inertia = times(times(motion.turn, given.inertia), jnp.swapaxes(motion.turn, 1, 2))
     gyroscopic = cross(spin, applied(inertia, spin))
     mass = given.mass[:, None, None] * jnp.eye(3, dtype=dtype)[None]

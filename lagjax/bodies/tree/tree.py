@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies
+from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies, floats
 from lagjax.bodies.driven import OfPlaced
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
@@ -76,11 +76,18 @@ class Tree:
 
     An array of these for a list. A body on which no joint ends is free, and `q[body.name]` its `lj.Pose`.
 
-    Bodies without mass and inertia are frames, for joints that follow on each other at one place.
+    Bodies without mass and inertia are frames, for joints that follow on each other at one place. A body with a
+    `motion` moves as given and has no coordinates; what hangs on it is carried along. No joint ends on it.
+
+    >>> turning = lj.Body("turning", motion=lambda t, params: lj.Pose.at(angle=3.0 * t))
+    >>> slide = lj.prismatic(turning.at(axis=(1.0, 0.0, 0.0)), rod.at(axis=(1.0, 0.0, 0.0)))
+    >>> away = Tree([turning, rod], {"slide": slide})
+    >>> print(away.rates({"slide": 0.5}, {"slide": 2.0}, None, 0.0)["rod"].position)
+    [2.  1.5 0. ]
 
     **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,
-    two things of one name, armature of no joint, a body whose motion is given, and for a body without mass that moves
-    and carries none.
+    two things of one name, armature of no joint, a joint that ends on a body whose motion is given, and for a body
+    without mass that moves and carries none.
 
     `tree.bodies` and `tree.joints` are what it was made of.
 
@@ -95,11 +102,6 @@ class Tree:
     ):
         bodies = check_bodies("lj.Tree", bodies)
         names = [body.name for body in bodies]
-        if driven := [body.name for body in bodies if body.motion is not None]:
-            raise ValueError(
-                f"'{driven[0]}' moves as given, which is not there in lj.Tree.\n"
-                "Fix: lj.multibody, with the same bodies and joints."
-            )
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise ValueError(f"two bodies are called '{twice}'.\nFix: a name for each.")
@@ -124,18 +126,26 @@ class Tree:
         e = jnp.zeros((count, 4)).at[:, 0].set(1.0)
         return unflat(geometry, Coordinates(jnp.zeros(len(geometry.links_of_numbers)), e, jnp.zeros((count, 3))))
 
-    def poses(self, q: PyTree, params: PyTree = None) -> dict[str, PoseOnTree]:
+    def poses(self, q: PyTree, params: PyTree = None, t: Any = None) -> dict[str, PoseOnTree]:
         """The poses of all bodies by name, `position`, `quaternion` and the rotation's `matrix`; `params` where places
-        of joints are functions of them."""
+        of joints are functions of them, `t` where a body moves as given."""
+        if t is None and self._geometry.driven.any():
+            raise TypeError(
+                "a body of this tree moves as given, and where it is depends on the time.\n"
+                "Fix: tree.poses(q, params, t), tree.rates(q, v, params, t)."
+            )
         q = jax.tree.map(jnp.asarray, q)
-        placed = _placed(self._geometry, q, params)
+        placed = _placed(self._geometry, t, q, params)
         return {body.name: placed[body.name] for body in self.bodies}
 
-    def rates(self, q: PyTree, v: PyTree, params: PyTree = None) -> dict[str, PoseOnTree]:
+    def rates(self, q: PyTree, v: PyTree, params: PyTree = None, t: Any = None) -> dict[str, PoseOnTree]:
         """The rates of their poses by name, for `body.velocity(q, v)` and the like."""
         # As the derivative of the poses, which shows that it is linear in v; 0.0 makes whole numbers floats.
         q, v = (jax.tree.map(lambda x: jnp.asarray(x) + 0.0, x) for x in (q, v))
-        return jax.jvp(lambda q: self.poses(q, params), (q,), (v,))[1]
+        if t is None:
+            return jax.jvp(lambda q: self.poses(q, params), (q,), (v,))[1]
+        t = jnp.asarray(t) + 0.0
+        return jax.jvp(lambda t, q: self.poses(q, params, t), (t, q), (jnp.ones_like(t), v))[1]
 
     def system(
         self,
@@ -198,10 +208,11 @@ class TreeLagrangian(SystemFunction):
         return self.drawn or Drawing(self._shapes, self._poses)
 
     def _shapes(self, params: PyTree) -> tuple[Shape, ...]:
-        return usual_shapes(self.tree.bodies, self.looks_like, params)
+        bodies = [body for body in self.tree.bodies if body.motion is None]
+        return usual_shapes(bodies, self.looks_like, params)
 
-    def _poses(self, q: PyTree, params: PyTree) -> dict[str, Pose]:
-        return {name: Pose(pose.position, pose.quaternion) for name, pose in self.tree.poses(q, params).items()}
+    def _poses(self, t: Any, q: PyTree, params: PyTree) -> dict[str, Pose]:
+        return {name: Pose(pose.position, pose.quaternion) for name, pose in self.tree.poses(q, params, t).items()}
 
 
 class Dynamics(NamedTuple):
@@ -214,7 +225,7 @@ class Dynamics(NamedTuple):
     def lagrangian(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
         """T - V. The growth of quaternions has an inertia, for a regular mass matrix, and no part in the rest."""
         geometry = self.geometry
-        given, motion = _moving(geometry, q, v, params)
+        given, motion = _moving(geometry, t, q, v, params)
         kinetic = _kinetic(geometry, given, motion, flat(geometry, q), flat(geometry, v))
         total = kinetic
         if self.loads:
@@ -227,7 +238,7 @@ class Dynamics(NamedTuple):
         if self.potential is not None:
             slope = jax.grad(self.potential, argnums=1)(t, q, params)
             force = jax.tree.map(lambda x, y: x - y, force, slope)
-        given, motion = _moving(geometry, q, v, params)
+        given, motion = _moving(geometry, t, q, v, params)
         wrench = jnp.zeros_like(motion.turn[:, :2].reshape(-1, 6))
         if any(load.potential is not None for load in self.loads):
             wrench = wrenches(geometry, given, self.loads, motion, (t, q, v, params))
@@ -237,19 +248,22 @@ class Dynamics(NamedTuple):
     def placed(self, t, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Any]:
         """q and v as loads and closures read them; with no rates at all, q alone."""
         if not v:
-            return _placed(self.geometry, q, params), v
-        return jax.jvp(lambda q: _placed(self.geometry, q, params), (q,), (v,))
+            return _placed(self.geometry, t, q, params), v
+        if not self.geometry.driven.any():
+            return jax.jvp(lambda q: _placed(self.geometry, t, q, params), (q,), (v,))
+        t = jnp.asarray(t, floats(q))
+        return jax.jvp(lambda t, q: _placed(self.geometry, t, q, params), (t, q), (jnp.ones_like(t), v))
 
 
-def _placed(geometry: Geometry, q: PyTree, params: PyTree) -> Placed:
+def _placed(geometry: Geometry, t: Any, q: PyTree, params: PyTree) -> Placed:
     """Where bodies are."""
     x = flat(geometry, q)
-    return Placed(geometry, poses_of(*placing(geometry, geometry.at(params, x.numbers.dtype), x)), q)
+    return Placed(geometry, poses_of(*placing(geometry, geometry.at(t, params, x.numbers.dtype), x)), q)
 
 
-def _moving(geometry: Geometry, q: PyTree, v: PyTree, params: PyTree) -> tuple[LinkNumbers, LinkMotion]:
+def _moving(geometry: Geometry, t: Any, q: PyTree, v: PyTree, params: PyTree) -> tuple[LinkNumbers, LinkMotion]:
     x, u = flat(geometry, q), flat(geometry, v)
-    given = geometry.at(params, x.numbers.dtype)
+    given = geometry.at(t, params, x.numbers.dtype)
     return given, moving(geometry, given, x, u)
 
 

@@ -75,7 +75,7 @@ class Shape:
         return next((anchor.body for anchor in self.anchors if anchor.body is not None), None)
 
 
-def poses_in_q(q: PyTree, params: PyTree) -> Any:
+def poses_in_q(t: Any, q: PyTree, params: PyTree) -> Any:
     """Where bodies are whose entries in q are their poses."""
     return q
 
@@ -85,7 +85,7 @@ class Drawing(NamedTuple):
 
     - `shapes`: `lj.box(...)` and the like, or a function of params that gives them. Functions
       `positions(t, q, params)` may be among them.
-    - `poses`: `poses(q, params)` -> by the names of bodies, the centre of mass (3,) and the unit quaternion
+    - `poses`: `poses(t, q, params)` -> by the names of bodies, the centre of mass (3,) and the unit quaternion
       (w, x, y, z); by default they are the entries of q.
 
     A system is drawn by itself if its Lagrangian has one as the attribute `drawing`.
@@ -93,14 +93,14 @@ class Drawing(NamedTuple):
     >>> import lagjax as lj
     >>> import jax.numpy as jnp
     >>> arm = lj.Body("arm", 1.0, (0.1, 0.1, 0.01))
-    >>> def poses(q, params):
+    >>> def poses(t, q, params):
     ...     return {"arm": lj.Pose.at((0.0, 0.0, -0.5)).turned((1.0, 0.0, 0.0), q)}
     >>> Drawing([lj.box(arm, (0.1, 0.1, 1.0))], poses).shapes
     [Shape(a solid on 'arm')]
     """
 
     shapes: Sequence[Shape | Callable] | Callable[[PyTree], Sequence[Shape | Callable]]
-    poses: Callable[[PyTree, PyTree], Any] = poses_in_q
+    poses: Callable[[Any, PyTree, PyTree], Any] = poses_in_q
 
 
 def _three(x: Any, params: PyTree, what: str) -> np.ndarray:

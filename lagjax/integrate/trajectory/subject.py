@@ -38,15 +38,15 @@ class Subject(NamedTuple):
         return InSpace(self.shapes, self._poses(names, t, q), points)
 
     def _poses(self, names: tuple[str, ...], t: np.ndarray, q: PyTree) -> dict[str, np.ndarray]:
-        def at(q: PyTree):
-            found = self.poses(q, self.params)
+        def at(t: Any, q: PyTree):
+            found = self.poses(t, q, self.params)
             return [_pose_of(name, found) for name in names]
 
         # In whole blocks, so that all calls for one film are compiled once.
         count = BLOCK * -(-len(t) // BLOCK)
-        padded = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], count - len(t), axis=0)]), q)
+        padded = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], count - len(t), axis=0)]), (t, q))
         poses = {}
-        for name, pose in zip(names, (at if self.poses is poses_in_q else jax.jit(jax.vmap(at)))(padded)):
+        for name, pose in zip(names, (at if self.poses is poses_in_q else jax.jit(jax.vmap(at)))(*padded)):
             position, quaternion = (np.asarray(x, float)[: len(t)] for x in pose)
             if position.shape[1:] != (3,) or quaternion.shape[1:] != (4,):
                 raise ValueError(
@@ -70,7 +70,7 @@ def _pose_of(name: str, poses: Any) -> tuple[Any, Any]:
         raise ValueError(
             f"it is not known where the body '{name}' is.\n"
             "Usual cause: a body of another system, or coordinates that are not poses.\n"
-            "Fix: lj.Drawing(shapes, poses), with poses(q, params) -> {name: (position, quaternion)}."
+            "Fix: lj.Drawing(shapes, poses), with poses(t, q, params) -> {name: (position, quaternion)}."
         ) from error
     return position, quaternion
 
@@ -87,6 +87,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
             )
     # Where its bodies are is known of a system whatever is drawn of it.
     poses = (what if isinstance(what, Drawing) else known_drawing(system) or Drawing(())).poses
+    check_arguments(Call("poses", poses, ("t", "q", "params")), "an argument left out that is not needed")
     parts = what.shapes if isinstance(what, Drawing) else [what] if callable(what) else what
     parts = parts(params) if callable(parts) else parts
     parts = [parts] if isinstance(parts, Shape) else parts

@@ -136,7 +136,7 @@ ROD = lj.Body("rod", 1.0, (0.1, 0.1, 0.01))
 SHAPES = [lj.box(ROD, (0.1, 0.1, 1.0)), lj.trail(ROD.at((0.0, 0.0, -0.5))), lj.line(lj.ground, ROD)]
 
 
-def swung(q, params):
+def swung(t, q, params):
     """The rod of a pendulum in the plane y = 0: down at q = 0, turned about -y."""
     return {"rod": lj.Pose.at((0.5 * jnp.sin(q), 0.0, -0.5 * jnp.cos(q)), axis=(0.0, -1.0, 0.0), angle=q)}
 
@@ -150,7 +150,7 @@ def test_bodies_by_their_poses(traj):
     end = drawn.place(drawn.shapes[1].anchors[0])
     np.testing.assert_allclose(end, drawn.points["tip"][:, 0], atol=1e-12)
     # Twin: turned the other way it is elsewhere.
-    other = traj.animate(lj.Drawing(SHAPES, lambda q, params: swung(-q, params)), seconds=4.0, rate=20.0)
+    other = traj.animate(lj.Drawing(SHAPES, lambda t, q, params: swung(t, -q, params)), seconds=4.0, rate=20.0)
     assert np.abs(other.points.place(drawn.shapes[1].anchors[0]) - drawn.points["tip"][:, 0]).max() > 0.1
 
 
@@ -177,9 +177,9 @@ def test_shapes_that_cannot_be_drawn(traj):
     with refused("some in space"):
         traj.animate(lj.Drawing([*SHAPES, bob], swung))
     with pytest.raises(ValueError, match="'rod' is NaN or infinite at t = 0"):
-        traj.animate(lj.Drawing(SHAPES, lambda q, params: {"rod": lj.Pose.at((jnp.nan * q, 0.0, 0.0))}))
+        traj.animate(lj.Drawing(SHAPES, lambda t, q, params: {"rod": lj.Pose.at((jnp.nan * q, 0.0, 0.0))}))
     with pytest.raises(ValueError, match=r"has the shapes \(\) and \(\)"):
-        traj.animate(lj.Drawing(SHAPES, lambda q, params: {"rod": (q, q)}))
+        traj.animate(lj.Drawing(SHAPES, lambda t, q, params: {"rod": (q, q)}))
     for wrong, word in ((ROD, "not Body"), ([ROD], "list of Body"), ([], "not list")):
         with pytest.raises(TypeError, match=word):
             traj.animate(wrong)

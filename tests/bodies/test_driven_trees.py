@@ -1,0 +1,137 @@
+"""Trees on bodies that move as given, against closed forms in frames that move, and Lagrange's equations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax as lj
+from tests.bodies.test_tree import a_body, a_place, like
+
+
+def shaken(t, params):
+    """The motion of a table that turns faster and faster about its normal, which is z, and is shaken."""
+    angle = params["rate"] * t + 0.3 * t**2
+    return lj.Pose.at((jnp.sin(2.0 * t), 0.5 * t**2, jnp.cos(t)), angle=angle)
+
+
+TABLE, PLATE = lj.Body("table", motion=shaken), lj.Body("plate", 2.0, (1.0, 1.0, 1.5))
+
+
+@pytest.mark.slow
+def test_a_plate_on_a_table_that_turns_and_is_shaken():
+    """r'' = -R^T p'' - 2 w x r' - w x (w x r) - w' x r in the table's frame, to 1e-12; without Coriolis it is not."""
+    tree = lj.Tree([TABLE, PLATE], {"on": lj.planar(TABLE.at((0.0, 0.0, 0.2)), PLATE.at())})
+    recursion = tree.system().forward_dynamics
+    assert recursion is not None
+    t, params = 0.7, {"rate": 1.1}
+    q, v = {"on": jnp.array([0.4, -0.3, 0.2])}, {"on": jnp.array([0.5, 0.8, -0.1])}
+    a = jax.jit(recursion)(t, q, v, {"on": jnp.zeros(3)}, params)["on"]
+    angle, spin, faster = 1.1 * t + 0.3 * t**2, 1.1 + 0.6 * t, 0.6
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shake = np.array([-4.0 * np.sin(2.0 * t), 1.0])
+    # w x (x, y) = w (-y, x).
+    across = lambda r: np.array([-r[1], r[0]])
+    r, rate = np.asarray(q["on"][:2]), np.asarray(v["on"][:2])
+    coriolis = -2.0 * spin * across(rate)
+    expected = -turn.T @ shake + coriolis + spin**2 * r - faster * across(r)
+    np.testing.assert_allclose(a, [*expected, -faster], atol=1e-12)
+    assert np.abs(a[:2] - (expected - coriolis)).max() > 0.1
+    # Where the plate is, and how it moves: p + R r, and its derivative.
+    place = tree.poses(q, params, t)["plate"].position
+    np.testing.assert_allclose(
+        place, [*(np.array([np.sin(2 * t), 0.5 * t**2]) + turn @ r), np.cos(t) + 0.2], atol=1e-14
+    )
+    moving = np.array([2.0 * np.cos(2.0 * t), t]) + turn @ (rate + spin * across(r))
+    np.testing.assert_allclose(tree.rates(q, v, params, t)["plate"].position, [*moving, -np.sin(t)], atol=1e-14)
+
+
+def test_refused_trees_on_driven_bodies():
+    """A joint that ends on what moves as given, poses without a time."""
+    hinge = lj.revolute(TABLE.at(), PLATE.at())
+    tree = lj.Tree([PLATE, TABLE], {"hinge": hinge})
+    assert repr(tree) == "Tree(2 bodies; hinge)" and list(tree.reference()) == ["hinge"]
+    with pytest.raises(TypeError, match="a body of this tree moves as given"):
+        tree.poses({"hinge": 0.1}, {"rate": 1.0})
+    with pytest.raises(ValueError, match="body 'table' moves as given, and hangs on the joint 'hinge'"):
+        lj.Tree([PLATE, TABLE], {"hinge": lj.revolute(PLATE.at(), TABLE.at())})
+
+
+def test_driven_bodies_in_pictures():
+    """What is fixed in a turning table is drawn where it is at the time of the picture."""
+    hinge = lj.revolute(TABLE.at((1.0, 0.0, 0.0)), PLATE.at())
+    expected = [np.sin(1.0) + np.cos(0.625), 0.125 + np.sin(0.625), np.cos(0.5)]
+    pose = lj.Pose.at(expected)
+    for system, q in (
+        (lj.Tree([TABLE, PLATE], {"hinge": hinge}).system(), {"hinge": 0.0}),
+        (lj.multibody([TABLE, PLATE], {"hinge": hinge}), {"plate": pose}),
+    ):
+        picture = lj.draw(system, q, {"rate": 1.1}, t=0.5)
+        (dot,) = (shape for shape in picture.points.shapes if shape.kind == "dot")
+        assert dot.anchors[0].body == "table"
+        np.testing.assert_allclose(np.atleast_2d(picture.points.place(dot.anchors[0]))[0], expected, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("count", [2, 4], ids=["written out", "in a loop"])
+def test_the_recursion_solves_lagranges_equations(count):
+    """d/dt dL/dv - dL/dq = Q - dR/dv on a base that moves and tumbles, with loads; with the base at rest it is not."""
+    rng = np.random.default_rng(5)
+
+    def tumbling(t, params):
+        turned = lj.Pose.at((jnp.sin(params["w"] * t), 0.3 * t**2, 0.2), (1.0, 2.0, 0.5), jnp.cos(2.0 * t))
+        return turned.turned((0.0, 0.3, 1.0), params["w"] * t)
+
+    base, bodies = lj.Body("base", motion=tumbling), [a_body(rng, f"b{i}") for i in range(count)]
+    kinds = lj.revolute, lj.prismatic, lj.spherical, lj.universal
+    parents = base, bodies[0], base, *bodies[2:3]
+    joints = {f"j{i}": kinds[i](a_place(rng, parents[i]), a_place(rng, body)) for i, body in enumerate(bodies)}
+    free = [a_body(rng, "free")] if count == 4 else []
+    tree = lj.Tree([*bodies, base, *free], joints)
+    loads = [
+        lj.weight(bodies),
+        lj.spring(a_place(rng, base), a_place(rng, bodies[-1]), 3.0, 0.2, damping=0.4),
+        lj.motor(a_place(rng, base), a_place(rng, bodies[0]), 0.7),
+    ]
+    system = tree.system(loads)
+    dissipation, force, recursion = system.dissipation, system.force, system.forward_dynamics
+    assert dissipation is not None and force is not None and recursion is not None
+
+    @jax.jit
+    def missed(t, q, v, params, of_recursion):
+        def momentum_and_slope(t, q, v):
+            slope, momentum = jax.grad(system.lagrangian, argnums=(1, 2))(t, q, v, params)
+            return momentum, slope
+
+        lost = jax.grad(dissipation, argnums=2)(t, q, v, params)
+        beside = jax.tree.map(lambda x, y: x - y, force(t, q, v, params), lost)
+        a = recursion(t, q, v, beside, of_recursion)
+        _, change, slope = jax.jvp(momentum_and_slope, (t, q, v), (jnp.ones_like(t), v, a), has_aux=True)
+        found = jax.tree.map(lambda x, y, z: x - y - z, change, slope, beside)
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(x)) for x in jax.tree.leaves(found)]))
+
+    q = like(rng, tree.reference())
+    v, t = like(rng, q), jnp.asarray(0.6)
+    moves, rests = {"w": jnp.asarray(1.7)}, {"w": jnp.asarray(0.0)}
+    assert missed(t, q, v, moves, moves) < 1e-11
+    assert missed(t, q, v, moves, rests) > 0.1
+
+
+@pytest.mark.exhaustive
+def test_a_bead_on_a_turning_rod():
+    """x = x0 cosh wt + v0/w sinh wt, its gradient by w in both modes, lanes, and h = T2 + V that stays."""
+    bead = lj.Body("bead", 2.0, (1.0, 1.0, 1.0))
+    rod = lj.Body("rod", motion=lambda t, params: lj.Pose.at(angle=params * t))
+    along = (1.0, 0.0, 0.0)
+    system = lj.Tree([rod, bead], {"x": lj.prismatic(rod.at(axis=along), bead.at(axis=along))}).system()
+    q, v = {"x": jnp.asarray(0.5)}, {"x": jnp.asarray(0.2)}
+    end = lambda w: lj.integrate(system, q, v, w, ts=jnp.array([0.0, 1.0]), rtol=1e-12, atol=1e-12).q["x"][-1]
+    exact = lambda w: 0.5 * jnp.cosh(w) + 0.2 / w * jnp.sinh(w)
+    rates = jnp.array([1.0, 3.0])
+    np.testing.assert_allclose(jax.vmap(end)(rates), exact(rates), rtol=1e-11)
+    slope = jax.grad(exact)(3.0)
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(mode(end)(3.0), slope, rtol=1e-10)
+    start, later = ((0.5, 0.2), (exact(3.0), 1.5 * np.sinh(3.0) + 0.2 * np.cosh(3.0)))
+    h = [lj.jacobi_integral(system, 0.3, {"x": x}, {"x": rate}, 3.0) for x, rate in (start, later)]
+    np.testing.assert_allclose(h, [0.2**2 - 9.0 * 0.5**2] * 2, rtol=1e-11)
