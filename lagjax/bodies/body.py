@@ -250,8 +250,8 @@ class Body:
             if self.motion is not None:
                 raise TypeError(
                     f"'{self.name}' moves as given, and has no entry in q and v.\n"
-                    f"Fix: its pose is {self.name}.motion(t, params), which joints and loads know, and functions of q alone "
-                    "do not."
+                    f"Fix: its pose is {self.name}.motion(t, params), which joints and loads know, and functions of q "
+                    "alone do not."
                 )
         else:
             entry = q[self.name]
