@@ -97,7 +97,7 @@ def vectors(functions: Sequence[Callable], args: tuple) -> list[Float[Array, " m
         if len(alike) > 1 and (len(alike) - 1) * length(alike[0].program.jaxpr) >= SAVED:
             found = _in_lanes([function.program for function in alike], arrays_of(args))
         else:
-            found = [jnp.atleast_1d(function(*args)) for function in alike]
+            found = [jnp.ravel(function(*args)) for function in alike]
         for i, value in zip(places, found):
             results[i] = value
     return results

@@ -4,6 +4,7 @@ A front door makes a `Model` once (`check_functions.prepare`). Everything below 
 form, (t, x, u), and does not ask again for the user's structure, the shapes of constraints or their number.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ class Residual(NamedTuple):
     @property
     def size(self) -> int:
         """How many equations it is."""
-        return self.shape[0] if self.shape else 1
+        return math.prod(self.shape)
 
 
 class FirstOrder(NamedTuple):
@@ -135,7 +136,7 @@ class Model(eqx.Module):
         """The name of each constraint equation, in the order in which they are stacked."""
 
         def places(residual: Any) -> list[str]:
-            return [f"[{i}]" for i in range(residual.size)] if residual.shape else [""]
+            return [str(list(i)) if i else "" for i in np.ndindex(residual.shape)]
 
         return [residual.name + place for residual in self.form.residuals for place in places(residual)]
 

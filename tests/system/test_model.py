@@ -37,6 +37,14 @@ def test_counts_and_names():
     assert alone.equation_names == ["table"] and alone.m == 1 and list(alone.system.constraints) == ["table"]
 
 
+def test_equations_in_rows():
+    """What slides at several points in a plane has an equation for each component; twin: as many as there are rows."""
+    rows = lj.Nonholonomic(lambda t, q, v, params: jnp.outer(v["place"], v["place"]))
+    model = model_of(lj.System(SYSTEM.lagrangian, {"rows": rows}), np.float64(0.5), Q, V, PARAMS)
+    assert model.m == 4 and model.equation_names == ["rows[0, 0]", "rows[0, 1]", "rows[1, 0]", "rows[1, 1]"]
+    assert model.split(np.arange(4.0))["rows"].tolist() == [[0.0, 1.0], [2.0, 3.0]]
+
+
 def test_there_and_back():
     """States and multipliers become vectors and the same again, also in batches; twin: another order would not."""
     for found, expected in zip(MODEL.vectors(Q, V), (X, U)):

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from lagjax.integrate.elements.complementarity import directions
 from lagjax.integrate.elements.compliant import Compliant
 from lagjax.integrate.elements.laws import CLOSED, LEANS, STICKS, Laws, Tangent
 from lagjax.integrate.elements.laws_of_elements import laws_of
@@ -72,7 +73,8 @@ class WithElements(eqx.Module):
             side = side * slip / speed if law.plane else side
             leans, pressed = mode == LEANS, law.normal_forces(t, q, v, forces, params)
             mu = jnp.where(leans, law.sticking(speed, params), law.kinetic(speed, params))
-            against = jnp.where(leans, -given.slack[slice(*law.at)].astype(t.dtype), side)
+            held = directions(given.slack[slice(*law.at)].astype(t.dtype), law.partners)
+            against = jnp.where(leans, -held, side)
             found[law.name] = back(-against * mu * pressed)[0]
         return found
 
@@ -87,7 +89,7 @@ class OneGuard(eqx.Module):
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        slack = given.slack[: self.laws.guarded]
+        slack = self.laws.slack(given)
         size = jnp.where(slack > 0, slack, 1.0)
         return jnp.min((self.laws.last(t, q, v, multipliers, given) + slack) / size)
 

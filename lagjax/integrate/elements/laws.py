@@ -2,8 +2,8 @@
 
 A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
 side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. Or it rests since others hold it (3),
-with a force of size μ N and a fixed direction (`redundant.py`), which stands in the place of its slack. A spring behind
-a gap is apart (0) or pressed (1), with a force (`compliant.py`).
+with a force of size μ N and a fixed direction (`redundant.py`), that of its slack. Where others hold it no more it
+begins to move, and the mode ends. A spring behind a gap is apart (0) or pressed (1), with a force (`compliant.py`).
 
 A sliding velocity in a plane is two rows with one mode: it slides (1) with a force -μ N s/|s|, which has no limit at
 s = 0. Its sliding ends at a speed δ, the slack of its mode, and begins with 2 δ in the direction of the acceleration: a
@@ -12,7 +12,7 @@ step that passes zero and meets the opposite force is then longer than what the 
 The guard of a mode is above zero as long as it lasts:
 
     open: the gap        closed: λ_N        slides: ± the sliding velocity, or |s| - δ        sticks: μ N - |λ_T|
-    apart: -m            pressed: m
+    held by others: δ - |s|        apart: -m            pressed: m
 
 Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
 """
@@ -30,12 +30,12 @@ from lagjax.integrate.elements.coefficients import coefficient
 from lagjax.integrate.elements.complementarity import lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
-from lagjax.integrate.trajectory.parts import mode_in_words
+from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, mode_in_words
 from lagjax.jaxtools import is_traced, stop_gradient
 from lagjax.system import InModes, State
 
 OPEN, CLOSED = 0, 1
-FREE, STICKS, LEANS = 0, 2, 3
+FREE, STICKS, LEANS = 0, 2, HELD_BY_OTHERS
 ALL_CLOSED = {"where contacts stick": STICKS, "where contacts slide": 1}
 
 
@@ -256,12 +256,21 @@ class Laws(eqx.Module):
             mode, slips = given.modes[slice(*law.at)], law.slips(t, q, v, params)
             most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params)
             holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
-            slides = law.speeds(slips) - 2 * given.slack[slice(*law.at)] if law.plane else mode * slips
-            # More than the direction that LEANS has as its slack.
-            found.append(jnp.where(mode == STICKS, holds, jnp.where((mode == FREE) | (mode == LEANS), 2.0, slides)))
+            slack = given.slack[slice(*law.at)]
+            slides = law.speeds(slips) - 2 * slack if law.plane else mode * slips
+            rests = lengths(slack, law.partners) - lengths(slips, law.partners)
+            moves = jnp.where(mode == FREE, 2.0, jnp.where(mode == LEANS, rests, slides))
+            found.append(jnp.where(mode == STICKS, holds, moves))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
+
+    def slack(self, given: InModes) -> Float[Array, " k"]:
+        """How far below zero the guard of each mode may be: its slack, or the size of that where it is a vector."""
+        rows, (normals, _) = len(self.rows), self.count
+        tangents = given.slack[normals:rows]
+        size = jnp.where(given.modes[normals:rows] == LEANS, lengths(tangents, self.partners), tangents)
+        return given.slack.at[normals:rows].set(size)[: self.guarded]
 
     def pressed(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"]

@@ -177,11 +177,12 @@ class Meeting(eqx.Module):
     ) -> tuple[PyTree, Met, Int[Array, ""]]:
         """What happens at the end of a leg: q, and the first of the modes that end there, or are at an `instant`."""
         guards = self.laws.last(end.t, end.q, end.v, end.multipliers, given)
-        size = jnp.where(given.slack > 0, given.slack, 1.0)[: guards.size]
+        slack = self.laws.slack(given)
+        size = jnp.where(slack > 0, slack, 1.0)
         in_slacks = jnp.concatenate([guards / size, jnp.full(1, jnp.inf)])
         least = jnp.argmin(in_slacks)
         holds = jnp.concatenate([self.laws.holds(given.modes), jnp.zeros(guards.size - len(self.laws.rows), bool)])
-        zero = jnp.where(holds, -given.slack[: guards.size] / 2, 0.0)
+        zero = jnp.where(holds, -slack / 2, 0.0)
         fired = (guards <= zero) | (in_slacks[:-1] == in_slacks[least]) & ~instant
         q, after = self.laws.acted(end.t, end.q, end.v, given)
         acts = after.modes[guards.size :] != given.modes[guards.size :]
@@ -319,6 +320,8 @@ class Meeting(eqx.Module):
         modes, slack = (x[normals : len(laws.rows)] for x in (at.given.modes, at.given.slack))
         in_plane = 1.5 * jnp.where(modes == 1, jnp.maximum(contacts.ends, slack), contacts.ends)
         slow = jnp.where(laws.in_planes, in_plane, contacts.velocity[normals:])
+        # What others held began to move as they let it: it is still, and moves as its own friction lets it.
+        slow = jnp.where(modes == LEANS, 3 * contacts.ends, slow)
         slips = self._velocities(at)[normals:]
         return jnp.where(lengths(slips, laws.partners) > slow, directions(slips, laws.partners), 0.0)
 
@@ -388,9 +391,11 @@ class Meeting(eqx.Module):
         ends_at, least = self._ends_at(at.u.dtype), ENDS_AT_ROUND_OFFS * jnp.finfo(at.u.dtype).eps
         slower = jnp.maximum(BEGINS_AT, least) / jnp.maximum(ends_at, BEGINS_AT)
         ends = jnp.where(begins, slower * contacts.ends, contacts.ends)
-        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, jnp.nan)])
+        released = (at.given.modes[normals : len(laws.rows)] == LEANS) & (jnp.abs(modes[normals:]) == 1)
+        released = jnp.where(released & ~solution.problem.given, 0.0, jnp.nan)
+        onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, released)])
         slowest = jnp.where(laws.in_planes, ends, _round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]))
-        slowest = jnp.where(modes[normals:] == LEANS, solution.bound.leans, slowest)
+        slowest = jnp.where(modes[normals:] == LEANS, contacts.ends * solution.bound.leans, slowest)
         slack = jnp.where(holds, solution.no_force, jnp.concatenate([contacts.gap, slowest]))
         return Decided(modes, slack, jnp.where(holds, 0.0, onto), solution.found)
 

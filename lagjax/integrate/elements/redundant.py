@@ -89,7 +89,7 @@ def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tup
     """
     gaps = problem.may_push.size
     none = AtBound(jnp.zeros(gaps, bool), jnp.zeros_like(problem.slides))
-    if problem.free.size == 1:
+    if problem.free.size == 1 and not held.always.size:
         return none, solved(problem)
 
     def attempt(before: BoundsTried) -> BoundsTried:

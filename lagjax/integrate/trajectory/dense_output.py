@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
-from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot, SolveOptions
+from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
 from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of
 from lagjax.mechanics import accelerations
@@ -104,6 +104,11 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         here = jax.tree.map(lambda x: x[: rows.size], (times, given.modes))
         for name, x in of_springs(trajectory, here[0], new.q, new.v, here[1]).items():
             found.multipliers[name][rows] = x
+        # Where others hold what would slide, the direction of its friction is known at outputs alone.
+        slips = np.array(trajectory.switches.kinds) == "sliding velocity"
+        held = np.any((np.asarray(here[1]) == HELD_BY_OTHERS) & slips, axis=1)
+        for x in found.multipliers.values():
+            x[rows[held]] = np.nan
     for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
         old[rows] = x
 

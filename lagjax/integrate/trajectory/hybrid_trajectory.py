@@ -110,8 +110,10 @@ class HybridTrajectory(Trajectory):
     - `switches`: the `Switches`.
     - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
       `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
-      gap is open); of a spring 0 (apart) or 1 (pressed); of a sampled control the number of its next instant.
-    - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint.
+      gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a sampled control the number of its
+      next instant.
+    - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint, and of `at(t)`
+      between outputs while others hold what would slide (mode 3): which friction is at its bound is known at outputs.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
     - `jacobi_integral()`, `residual()`: of each output's own phase. `drift()` is NaN: over all phases, in which forces
       and impacts do work, nothing has to be conserved.

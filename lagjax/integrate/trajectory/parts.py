@@ -11,12 +11,14 @@ from lagjax.numerics import EqualSteps
 
 # The phase of an output that was not reached, and the number in unused places for switches.
 NO_PHASE = -1
+# The mode of a sliding velocity that rests since others hold it (`elements/redundant.py`).
+HELD_BY_OTHERS = 3
 
 
 # What modes are called, by the kind of what they are modes of.
 MODES = {
     "gap": {0: "open", 1: "closed"},
-    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks", 3: "is held by others"},
+    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks", HELD_BY_OTHERS: "is held by others"},
     "spring": {0: "apart", 1: "pressed"},
 }
 

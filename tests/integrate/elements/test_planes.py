@@ -101,6 +101,27 @@ def test_thrown_obliquely_on_a_tilted_plane():
     np.testing.assert_allclose(slid.q[-1], [0.0, -0.5 * 0.1 * G * 9.0], atol=1e-8)
 
 
+@pytest.mark.slow
+def test_two_blocks_in_planes():
+    """Each of two blocks, (k, 2) velocities with k normal forces, slides straight with μ N and stops after |v|/(μ N).
+    Twin: with the other's normal force."""
+    throw, normal, mu = np.array([[3.0, 4.0], [-1.0, 2.0]]), np.array([1.0, 2.0]), 0.3
+    floor = lj.Friction(lambda t, q, v, p: v, mu, normal=normal)
+    blocks = lj.System(lambda t, q, v, p: jnp.sum(v**2) / 2, elements={"floor": floor})
+    ts = np.linspace(0.0, 20.0, 5)
+    traj = lj.integrate(blocks, np.zeros((2, 2)), throw, None, ts=ts, rtol=1e-10, estimate_error=False)
+    assert isinstance(traj, lj.HybridTrajectory) and traj.multipliers["floor"].shape == (5, 2, 2)
+    speed = np.linalg.norm(throw, axis=1)
+    np.testing.assert_allclose(traj.switches.t[:2], np.sort(speed / (mu * normal)), rtol=1e-8)
+
+    def places(normal):
+        slides = np.minimum(ts[:, None], speed / (mu * normal))[:, :, None]
+        return throw * slides - (mu * normal / speed)[:, None] * throw * slides**2 / 2
+
+    np.testing.assert_allclose(traj.q, places(normal), atol=1e-9)
+    assert np.abs(places(normal) - places(normal[::-1])).max() > 1.0
+
+
 @pytest.mark.exhaustive
 def test_derivatives_of_a_place_of_rest():
     """The derivative of the place of rest by μ, in both modes, against differences of SciPy's."""

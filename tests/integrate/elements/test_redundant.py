@@ -7,7 +7,9 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.elements.complementarity import ContactProblem, lengths
+from lagjax.integrate.elements.in_modes import in_modes
 from lagjax.integrate.elements.redundant import HeldRows, within_laws
+from lagjax.system import State
 from tests.integrate.elements.test_motions import moved
 
 G, MU, BOX = 9.81, 0.5, (1.0, 1.0, 2 / 3)
@@ -166,3 +168,50 @@ def test_a_box_that_is_pushed():
     back = pushed({"push": 0.45, "rate": -0.25})
     assert np.asarray(back.modes[0])[2:].tolist() == [3, 2] and float(back.q["x"][-1]) == 0.0
     np.testing.assert_allclose(back.multipliers["floor"][0], G * np.array([0.55, 1.45]) / 2, rtol=1e-9)
+
+
+def brake() -> lj.System:
+    """A block on a rail along y, pushed across it, with a brake along a line that turns from across to along it."""
+
+    def energy(t, q, v, p):
+        return (v[0] ** 2 + v[1] ** 2) / 2 + p["across"] * q[0] + p["along"] * q[1]
+
+    turning = lj.Friction(lambda t, q, v, p: jnp.cos(t) * v[0] + jnp.sin(t) * v[1], 0.3, normal=1.0)
+    rail = {"rail": lj.Holonomic(lambda t, q, p: q[0])}
+    return lj.System(energy, rail, elements=lj.Elements({"brake": turning}, most_switches=8))
+
+
+def test_what_others_hold_lasts_while_it_is_still():
+    """Its guard is above zero up to its slack's size, whatever the direction of that, and below zero beyond twice it.
+    Twin: in mode 2, 0.3 less the force, of which the velocity is no part."""
+    start = State(jnp.asarray(0.3), jnp.zeros(2), jnp.zeros(2), {"across": 1.0, "along": 0.0})
+    _, laws = in_modes(brake(), start)
+    given = {mode: laws.given(start.params, jnp.array([mode]), jnp.array([-0.1])) for mode in (2, 3)}
+    force = {"rail": jnp.zeros(()), "brake": jnp.asarray(0.05)}
+
+    def guard(mode, slip):
+        v = jnp.array([0.0, slip / np.sin(0.3)])
+        return float((laws.last(start.t, start.q, v, force, given[mode]) + laws.slack(given[mode]))[0])
+
+    np.testing.assert_allclose([guard(3, slip) for slip in (0.0, 0.1, -0.3)], [0.2, 0.1, -0.1], atol=1e-12)
+    np.testing.assert_allclose([guard(2, slip) for slip in (0.0, -0.3)], 0.3 - 0.05 - 0.1, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_what_others_hold_no_more():
+    """The rail holds the brake at first; as that turns, it sticks, or slides where it is pushed, with the force
+    μ sin t: v = push t - μ (1 - cos t) until sin t = push/μ. Twin: the brake drives the block with μ sin t.
+
+    Between outputs `traj.at` has no forces while others hold it.
+    """
+    system, ts, zero = brake(), jnp.array([0.0, 0.5, 1.5]), np.zeros(2)
+    for across, along in ((1.0, 0.0), (-1.0, 0.0), (1.0, 0.1), (-1.0, 0.1)):
+        given = {"across": across, "along": along}
+        traj = lj.integrate(system, zero, zero, given, ts=ts, rtol=1e-10, estimate_error=False)
+        assert isinstance(traj, lj.HybridTrajectory)
+        assert np.ravel(traj.modes).tolist() == [3, 1 if along else 2, 2]
+        slid = along * 0.5 - 0.3 * (1 - np.cos(0.5)) if along else 0.0
+        np.testing.assert_allclose(traj.v[:, 1], [0.0, slid, 0.0], atol=1e-7)
+        np.testing.assert_allclose(traj.multipliers["rail"][0], -across + 0.3 * np.sign(across), atol=1e-9)
+        assert np.isnan(traj.at(1e-6).multipliers["rail"]) and np.isfinite(traj.at(0.4).multipliers["rail"])
+    assert 0.3 * (1 - np.cos(0.5)) > 0.01
