@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.display import InSpace
 from tests.bodies.test_tree import a_body, a_place, like
 
 
@@ -67,6 +68,7 @@ def test_driven_bodies_in_pictures():
         (lj.multibody([TABLE, PLATE], {"hinge": hinge}), {"plate": pose}),
     ):
         picture = lj.draw(system, q, {"rate": 1.1}, t=0.5)
+        assert isinstance(picture.points, InSpace)
         (dot,) = (shape for shape in picture.points.shapes if shape.kind == "dot")
         assert dot.anchors[0].body == "table"
         np.testing.assert_allclose(np.atleast_2d(picture.points.place(dot.anchors[0]))[0], expected, atol=1e-12)

@@ -296,6 +296,39 @@ def test_a_singular_tree():
 
 
 @pytest.mark.exhaustive
+def test_fixed_bodies_are_one_by_steiner():
+    """Links with tools fixed to them accelerate as their sums by Steiner, to 1e-12; without its term they do not."""
+    away, rates = np.array([0.2, 0.1, 0.0]), np.array([1.3, -0.8])
+    of_link, of_tool, mass, tool_mass = np.diag([0.1, 0.12, 0.05]), np.diag([0.02, 0.03, 0.04]), 1.0, 0.5
+    reduced = mass * tool_mass / (mass + tool_mass)
+    steiner = reduced * (away @ away * np.eye(3) - np.outer(away, away))
+    common = tool_mass * away / (mass + tool_mass)
+
+    def accelerated(is_one: bool, steiner) -> np.ndarray:
+        bodies, joints, centre = [], {}, common if is_one else np.zeros(3)
+        at = lj.ground.at(axis=Y)
+        for i, axis in enumerate((Y, (1.0, 0.0, 0.0))):
+            total, inertia = (mass + tool_mass, of_link + of_tool + steiner) if is_one else (mass, of_link)
+            link = lj.Body(f"link {i}", total, tuple(map(tuple, inertia)))
+            joints[f"hinge {i}"] = lj.revolute(at, link.at(np.array([0.0, 0.0, 0.5]) - centre, axis))
+            bodies.append(link)
+            if not is_one:
+                bodies.append(lj.Body(f"tool {i}", tool_mass, tuple(map(tuple, of_tool))))
+                joints[f"weld {i}"] = lj.fixed(link.at(away), bodies[-1].at())
+            at = link.at(np.array([0.0, 0.0, -0.5]) - centre, (1.0, 0.0, 0.0))
+        tree = lj.Tree(bodies, joints)
+        assert list(tree.reference()) == ["hinge 0", "hinge 1"]
+        recursion = tree.system([lj.weight(bodies)]).forward_dynamics
+        assert recursion is not None
+        q, v = ({f"hinge {i}": jnp.asarray(x) for i, x in enumerate(row)} for row in ((0.3, 0.7), rates))
+        return np.array(list(recursion(0.0, q, v, jax.tree.map(jnp.zeros_like, q), None).values()))
+
+    expected = accelerated(True, steiner)
+    np.testing.assert_allclose(accelerated(False, steiner), expected, rtol=1e-12)
+    assert np.abs(accelerated(True, 0.0 * steiner) - expected).max() > 1e-3
+
+
+@pytest.mark.exhaustive
 def test_a_closed_loop():
     """A four-bar closed by a joint moves as with angles solved by hand: a parallelogram's coupler does not turn."""
     rods = [lj.Body(name, 1.0, (0.1, 0.1, 0.1)) for name in ("crank", "coupler", "rocker")]

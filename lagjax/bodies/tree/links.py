@@ -88,7 +88,7 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
         of_all = kinds.pop()
         for joined, kinds in row:
             child = joined.b.body
-            if child.motion is not None:
+            if isinstance(child, Body) and child.motion is not None:
                 raise ValueError(
                     f"body '{child.name}' moves as given, and hangs on the joint '{name}'.\n"
                     "Usual cause: the places of the joint in the wrong order, which is the parent's first.\n"
