@@ -29,6 +29,8 @@ from lagjax.scenes import SCENES
 from lagjax.sweep import usable_cores
 
 STABILITY = "stability"
+# The parts that take longest start first, so that no core waits for one of them.
+LONGEST = "mass_distributions", STABILITY, "cross_rails"
 
 FULL = {
     "methods": None,
@@ -81,8 +83,8 @@ def _parts(options, folder) -> Iterator[JobPart]:
         return
     pool = ProcessPoolExecutor(at_a_time, get_context("spawn"))
     try:
-        # The stability report takes long and is printed last: it starts first, so that no core waits for it.
-        running = {task: pool.submit(_part, *task) for task in sorted(tasks, key=lambda task: task[0] != STABILITY)}
+        order = sorted(tasks, key=lambda task: LONGEST.index(task[0]) if task[0] in LONGEST else len(LONGEST))
+        running = {task: pool.submit(_part, *task) for task in order}
         for task in tasks:
             _progress(f"{task[0]}: {sum(f.done() for f in running.values())} of {len(tasks)} done")
             part = running[task].result()

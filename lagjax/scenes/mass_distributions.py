@@ -22,6 +22,8 @@ a/(a+b)) along y. A circular orbit around c has the speed a √(2πGρ) at every
 speed w, the particle is back, with the same velocity, after 4 w/(2πGσ).
 """
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -223,9 +225,12 @@ def _two_balls_run():
 
 def charges_along(name: str, trajectory):
     """`charges` at every output of a trajectory."""
-    return jax.jit(jax.vmap(lambda q, v, params: charges(name, q, v, params), in_axes=(0, 0, None)))(
-        trajectory.q, trajectory.v, trajectory.params
-    )
+    return _charges(name, trajectory.q, trajectory.v, trajectory.params)
+
+
+@partial(jax.jit, static_argnums=0)
+def _charges(name: str, q: PyTree, v: PyTree, params: PyTree):
+    return jax.vmap(partial(charges, name), in_axes=(0, 0, None))(q, v, params)
 
 
 def cases():

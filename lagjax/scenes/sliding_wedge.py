@@ -153,16 +153,17 @@ def _worst(got, exact):
 
 def over_mass_ratios(ratios, **settings):
     """Accelerations and normal force over m/M, as a sweep; m is that of `PARAMS`."""
+    return sweep(_at_ratio, {"m_over_M": ratios}, progress=False, **settings)
 
-    def at(point):
-        a, multipliers = accelerations(system, 0.0, Q0, V0, PARAMS | {"M": PARAMS["m"] / point["m_over_M"]})
-        return a | {"normal force": multipliers["incline"]}
 
-    return sweep(at, {"m_over_M": ratios}, progress=False, **settings)
+def _at_ratio(point):
+    a, multipliers = accelerations(system, 0.0, Q0, V0, PARAMS | {"M": PARAMS["m"] / point["m_over_M"]})
+    return a | {"normal force": multipliers["incline"]}
 
 
 def _ratio_case():
-    ratios = 2.0 ** np.arange(-40, 41)
+    # As many as in the picture: one program serves both.
+    ratios = 2.0 ** np.linspace(-40, 40, 161)
     swept = over_mass_ratios(ratios)
     exact = exact_accelerations(PARAMS | {"M": PARAMS["m"] / ratios})
     got = [swept.values[name] for name in ("X", "x", "y", "normal force")]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import Trajectory, integrate, reporting, runs_backward
-from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition
+from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of
 from lagjax.numerics import EqualSteps
 from lagjax.system import State, System
 
@@ -41,7 +41,8 @@ class TimedProgram:
     """The trajectory of a motion by one method, as a function of (tolerance, ts, q, v); the number of times is fixed.
     For a method of equal steps the tolerance is the length of a step.
 
-    `compile_seconds` is the time of tracing and compiling. Like `integrate`, the program first assumes that the
+    `compile_seconds` is the time of tracing and compiling; motions that differ in nothing but numbers share a program,
+    and its time. Like `integrate`, the program first assumes that the
     equations are regular; if they turn out singular, the robust program is compiled, too, and used from then on.
     """
 
@@ -89,26 +90,32 @@ class TimedProgram:
     def _compile(self, robust: bool):
         motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])
         _, static = hashable_partition(given)
+        # Decreasing times must be known at compile time.
+        backward = motion.ts if runs_backward(motion.ts) else None
 
         def solve(args: Sequence[Array]):
             tolerance, ts, q, v, params = static.combine(args)
-            # Decreasing times must be known at compile time.
-            ts = motion.ts if runs_backward(motion.ts) else ts
             steps = {"dt0" if isinstance(self._method, EqualSteps) else "rtol": tolerance}
             return integrate(
-                motion.system, q, v, params, ts=ts, method=self._method, throw=False, **steps, **motion.options
-            )
+                motion.system, q, v, params, ts=ts if backward is None else backward, method=self._method,
+                throw=False, **steps, **motion.options,
+            )  # fmt: skip
 
         def program(args: Sequence[Array]):
             trajectory, _, regular = reporting(solve)(args)
             return trajectory, regular
 
-        started = time.perf_counter()
-        with REGULAR_FIRST(not robust):
-            lowered = jax.jit(program, compiler_options=compiler_options()).lower(self._arguments(1e-3))
-        compiled = lowered.compile()
-        self.compile_seconds += time.perf_counter() - started
-        self._returned = lowered.out_info
+        def made():
+            started = time.perf_counter()
+            with REGULAR_FIRST(not robust):
+                lowered = jax.jit(program, compiler_options=compiler_options()).lower(self._arguments(1e-3))
+            return lowered.compile(), lowered.out_info, time.perf_counter() - started
+
+        constants, rest = hashable_partition((motion.system, self._method, motion.options, backward))
+        key = TimedProgram, rest, static, robust, kinds(self._arguments(1e-3))
+        # Numbers that are not arguments are constants of a program, which no other motion may share.
+        compiled, self._returned, seconds = made() if constants else program_of(key, made)
+        self.compile_seconds += seconds
         return compiled
 
 

@@ -143,8 +143,8 @@ def test_departures_of_other_starts():
         "downhill": (1.0, 1.25, -1.5, 1e-10),
         "uphill": (1.0, 1.25, 0.75, 1e-10),
     }
-    times, angles, left, _ = map(np.asarray, hoop.departures(*hoop.batch(starts.values())))
-    assert left.all()
+    times, angles, left, _ = zip(*map(hoop.departure, starts.values()))
+    assert all(left)
     for (key, (beta, theta0, rate0, _)), t, angle in zip(starts.items(), times, angles):
         sine = hoop.departure_sine(PARAMS | {"beta": beta}, theta0, rate0)
         assert np.sin(angle) == pytest.approx(float(sine), rel=1e-9), key
@@ -154,7 +154,7 @@ def test_departures_of_other_starts():
     assert angles[-2] == pytest.approx(reference("s2.hoop.theta0=1.25,thetadot0=-1.5.depart_rad"), rel=1e-9)
     # Without the start's own velocity the departure would be another one.
     assert np.sin(angles[-2]) != pytest.approx(float(hoop.departure_sine(PARAMS, 1.25)), rel=1e-2)
-    assert hoop._top(len(starts)).passed
+    assert hoop._top().passed
 
 
 @pytest.mark.parametrize("theta, theta_rate", [(1.25, -3.0), (-0.5, 0.0), (3.5, 0.0)])

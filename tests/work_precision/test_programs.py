@@ -1,8 +1,37 @@
-"""Times of calls: taken in turn, by their median, without the overhead of a call."""
+"""Programs that motions share; times of calls, taken in turn, by their median, without the overhead of a call."""
 
 import time
 
-from lagjax.work_precision.programs import RESOLVED, VERY_LONG, interleaved_times, seconds_of, without_overhead
+import numpy as np
+import pytest
+
+from lagjax import System, Tsit5
+from lagjax.system import coordinates
+from lagjax.work_precision.programs import (
+    RESOLVED,
+    VERY_LONG,
+    ComparedMotion,
+    TimedProgram,
+    interleaved_times,
+    seconds_of,
+    without_overhead,
+)
+
+oscillator = System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params["omega"] * q) ** 2)
+
+
+def test_motions_that_differ_in_numbers_share_a_program():
+    """Each has its own motion, cos ωt; twin: a jump's time is part of the program, which is then another."""
+
+    def program(omega, options):
+        start = coordinates.state(0.0, 1.0, 0.0, {"omega": omega})
+        return TimedProgram(ComparedMotion(oscillator, start, np.array([0.0, 1.0]), options), Tsit5())
+
+    one, other, jumped = program(1.0, {}), program(2.0, {}), program(2.0, {"jump_ts": np.array([0.5])})
+    assert one._compiled is other._compiled is not jumped._compiled
+    assert one.compile_seconds == other.compile_seconds > 0
+    for omega, found in ((1.0, one), (2.0, other), (2.0, jumped)):
+        assert float(found(1e-10).q[-1]) == pytest.approx(np.cos(omega), abs=1e-8)
 
 
 def test_a_call_takes_its_time():
