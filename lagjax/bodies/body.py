@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned
-from lagjax.jaxtools import numpy_of
+from lagjax.jaxtools import is_traced, numpy_of
 from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
 # By how much of their sum moments of inertia may miss the triangle inequality: those of thin plates reach it.
@@ -39,8 +39,14 @@ class Pose(NamedTuple):
 
     @classmethod
     def at(cls, position: ArrayLike = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0), angle: ArrayLike = 0.0):
-        """The pose at a position, turned by an angle about an axis through it, both in space."""
-        return cls(jnp.asarray(position, float), about(axis, angle))
+        """The pose at a position, turned by an angle about an axis through it, of any length, both in space.
+
+        **Raises:** `ValueError` unless both are three numbers, and for an axis that is zero.
+        """
+        along = _three("the axis of a pose", axis)
+        if not is_traced(along) and not np.any(np.asarray(along)):
+            raise ValueError("the axis of a pose must not be zero.\nFix: axis=(0.0, 0.0, 1.0), of any length.")
+        return cls(_three("the position of a pose", position), about(along, angle))
 
     def turned(self, axis: ArrayLike, angle: ArrayLike) -> "Pose":
         """The pose after a further turn about an axis of space through the centre of mass."""
@@ -49,8 +55,9 @@ class Pose(NamedTuple):
     def moving(self, velocity: ArrayLike = (0.0, 0.0, 0.0), spin: ArrayLike = (0.0, 0.0, 0.0)) -> "Pose":
         """The rates, for `v`, of a body here, by its centre's velocity and its angular velocity in space."""
         dtype = floats(self)
-        spin = jnp.concatenate([jnp.zeros(1, dtype), jnp.asarray(spin, dtype)])
-        return Pose(jnp.asarray(velocity, dtype), product(spin, self.quaternion) / 2)
+        velocity = _three("the velocity of a pose", velocity).astype(dtype)
+        spin = jnp.concatenate([jnp.zeros(1, dtype), _three("the spin of a pose", spin).astype(dtype)])
+        return Pose(velocity, product(spin, self.quaternion) / 2)
 
     @property
     def matrix(self) -> Float[Array, "3 3"]:
@@ -159,7 +166,7 @@ class Body:
     >>> table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
 
     **Raises:** `ValueError` for a mass or an inertia that no body has: each principal moment is at most the sum of the
-    two others.
+    two others; `TypeError` for numbers that JAX is tracing, which belong into params.
 
     Source: Goldstein, *Classical Mechanics*, §5.3.
     """
@@ -172,19 +179,20 @@ class Body:
     def __post_init__(self):
         check_takes_params("mass", f"'{self.name}'", self.mass)
         check_takes_params("inertia", f"'{self.name}'", self.inertia)
+        _check_not_traced(f"mass and inertia of '{self.name}'", "mass", self.mass, self.inertia)
         if not callable(self.inertia):
             given = np.asarray(self.inertia, float)
-            object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
             _check_inertia(self.name, given)
+            object.__setattr__(self, "inertia", tuple(tuple(x) if np.ndim(x) else x for x in given.tolist()))
         massless = not callable(self.inertia) and not np.any(self.inertia)
         if self.motion is not None:
             check_arguments(
                 Call("motion", self.motion, ("t", "params"), f" of '{self.name}'"),
                 "an argument left out that is not needed",
             )
-        if not callable(self.mass) and not (self.mass > 0 or massless and self.mass == 0):
+        if not callable(self.mass) and not _is_mass(self.mass, massless):
             raise ValueError(
-                f"the mass of '{self.name}' must be positive, and is {self.mass}.\n"
+                f"the mass of '{self.name}' must be a positive number, and is {self.mass!r}.\n"
                 "Fix: its mass; of a frame in a lj.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)."
             )
 
@@ -388,6 +396,7 @@ class Marker:
     @classmethod
     def on(cls, body: Body | Ground, point: ArrayLike | Callable, axis: ArrayLike) -> "Marker":
         """A marker on a body."""
+        _check_not_traced(f"place and axis of a marker on '{body.name}'", "point", point, axis)
         along = np.asarray(axis, float)
         size = np.sqrt(np.sum(along**2))
         if along.shape != (3,) or not size > 0:
@@ -398,8 +407,8 @@ class Marker:
         first = first / np.sqrt(np.sum(first**2))
         rows = np.stack([first, np.cross(along, first), along])
         check_takes_params("a point", f"'{body.name}'", point)
-        place = point if callable(point) else tuple(np.asarray(point, float).tolist())
-        if not callable(place) and len(place) != 3:
+        place = point if callable(point) else tuple(np.ravel(np.asarray(point, float)).tolist())
+        if not callable(place) and (np.shape(place) != (3,) or not np.all(np.isfinite(place))):
             raise ValueError(f"a point of '{body.name}' must be three numbers, not {point}.")
         return cls(body, place, tuple(map(tuple, rows.tolist())))
 
@@ -439,8 +448,34 @@ def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
     return bodies
 
 
+def _three(what: str, given: ArrayLike) -> Float[Array, "3"]:
+    """A vector; a `ValueError` that begins with `what`, unless it has three numbers."""
+    found = jnp.asarray(given, float)
+    if found.shape != (3,):
+        raise ValueError(
+            f"{what} must be three numbers, and has shape {found.shape}.\n"
+            "Usual cause: a plane, or one number about an axis.\nFix: all of them, (0.0, 0.0, 1.0)."
+        )
+    return found
+
+
+def _check_not_traced(what: str, role: str, *given: Any):
+    if is_traced(given):
+        raise TypeError(
+            f"{what} must be numbers, and JAX is tracing what was given.\n"
+            "Usual cause: a body made inside of jit, vmap or grad, compiled again for each value.\n"
+            f"Fix: {role}=lambda params: params['{role}'], with the value among the parameters."
+        )
+
+
+def _is_mass(given: Any, massless: bool) -> bool:
+    number = np.ndim(given) == 0 and np.issubdtype(np.asarray(given).dtype, np.number)
+    return bool(number and np.isfinite(given) and (given > 0 or massless and given == 0))
+
+
 def _check_inertia(name: str, given: np.ndarray):
-    if given.shape not in ((3,), (3, 3)) or (given.ndim == 2 and not np.allclose(given, given.T)):
+    is_symmetric = given.ndim == 1 or given.shape == (3, 3) and np.allclose(given, given.T)
+    if given.shape not in ((3,), (3, 3)) or not is_symmetric or not np.all(np.isfinite(given)):
         raise ValueError(
             f"the inertia of '{name}' must be three principal moments or a symmetric matrix (3, 3), and is "
             f"{given.tolist()}."

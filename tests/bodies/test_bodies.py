@@ -179,7 +179,7 @@ def test_bad_bodies_and_joints():
         lj.Body("rod", 1.0, (3.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="three principal moments or a symmetric matrix"):
         lj.Body("rod", 1.0, ((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    with pytest.raises(ValueError, match="mass of 'rod' must be positive"):
+    with pytest.raises(ValueError, match="mass of 'rod' must be a positive number"):
         lj.Body("rod", 0.0, (1.0, 1.0, 1.0))
     rod = lj.Body("rod", 1.0, (1.0, 1.0, 2.0))
     with pytest.raises(ValueError, match="both places are on 'rod'"):
@@ -330,3 +330,34 @@ def test_a_loop_that_cannot_close():
     by = {side: np.sqrt(sum(x**2 for name, x in missed if name.startswith(side))) for side in ("left", "right")}
     np.testing.assert_allclose(by["left"] + by["right"], 0.5, rtol=5e-3)
     assert all(abs(x) < 1e-5 for name, x in missed if name == "rod is turned")
+
+
+def test_numbers_that_no_body_has():
+    """Numbers of another kind or shape are refused in words where they were passed on, as NaN or to JAX. Twin: ints and
+    other lengths of the axis are taken."""
+    made = lambda mass=1.0, inertia=(1.0, 1.0, 1.0): lj.Body("b", mass, inertia)
+    for inertia in ((1.0, np.nan, 1.0), (np.inf,) * 3, 1.0, (1.0, 2.0)):
+        with pytest.raises(ValueError, match="three principal moments"):
+            made(inertia=inertia)
+    for mass in (np.inf, "1", np.ones(1)):
+        with pytest.raises(ValueError, match="mass of 'b' must be a positive number"):
+            made(mass)
+    with pytest.raises(TypeError, match=r"mass=lambda params: params\['mass'\]"):
+        jax.jit(lambda x: made(x).kinetic({}, {}))(2.0)
+    with pytest.raises(TypeError, match="JAX is tracing"):
+        jax.jit(lambda x: made(inertia=(x, x, x)).kinetic({}, {}))(2.0)
+    with pytest.raises(TypeError, match=r"point=lambda params: params\['point'\]"):
+        jax.jit(lambda x: made().at((x, 0.0, 0.0)).position({}))(2.0)
+    with pytest.raises(ValueError, match="a point of 'b'"):
+        made().at((0.0, 0.0, np.nan))
+    with pytest.raises(ValueError, match="position of a pose must be three numbers"):
+        lj.Pose.at((1.0, 2.0))
+    with pytest.raises(ValueError, match="axis of a pose must not be zero"):
+        lj.Pose.at(axis=(0.0, 0.0, 0.0), angle=1.0)
+    pose = lj.Pose.at((0, 0, 1), axis=(0, 0, 10), angle=1)
+    for rates in ({"velocity": 3.0}, {"spin": 3.0}, {"spin": (1.0, 2.0)}):
+        with pytest.raises(ValueError, match="must be three numbers, and has shape"):
+            pose.moving(**rates)
+    np.testing.assert_allclose(pose.quaternion, [np.cos(0.5), 0.0, 0.0, np.sin(0.5)], atol=1e-15)
+    np.testing.assert_allclose(pose.spin(pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
+    assert made(1, (1, 1, 1)).kinetic({"b": pose}, {"b": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5

@@ -280,7 +280,7 @@ def test_armature_and_frames_that_are_none_are_refused():
     ):
         with pytest.raises(ValueError, match=said):
             lj.Tree(bodies, joints, armature)
-    with pytest.raises(ValueError, match="the mass of 'x' must be positive"):
+    with pytest.raises(ValueError, match="the mass of 'x' must be a positive number"):
         lj.Body("x", 0.0, (1.0, 1.0, 1.0))
 
 
