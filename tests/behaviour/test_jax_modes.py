@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.tiers import exhaustive_but
 
 # A number that stands in each mode's Lagrangian, so that no program of another mode serves it.
 MODES = {
@@ -21,7 +22,8 @@ TS = np.array([0.0, 0.4, 0.9])
 TOLERANCE = {"rtol": 1e-8, "atol": 1e-8}
 
 
-@pytest.fixture(params=MODES)
+# Looking for infinities is left by the same rule as looking for NaN.
+@pytest.fixture(params=exhaustive_but(set(MODES) - {"debug_infs"}, MODES))
 def mode(request):
     """Whether JAX is in this mode, in a context of its own, and its number."""
     context, number = MODES[request.param]
@@ -96,7 +98,7 @@ def test_nothing_is_transferred_by_a_program():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["debug_nans", "disable_jit", "strict dtypes"], indirect=True)
+@pytest.mark.parametrize("mode", exhaustive_but(("debug_nans", "strict dtypes"), MODES), indirect=True)
 def test_failures_sweeps_and_fits_in_a_mode(mode):
     """A motion that fails says why, a sweep has NaN for it alone, a stiff method and a fit do their work."""
     context, m = mode
