@@ -114,7 +114,8 @@ def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cau
 def _warn_of_length(call: str, program: TracedProgram) -> None:
     """Warn, once, of a function that a loop in Python has written term by term; those of the library have no loops."""
     count = length(without_repeats(program.jaxpr))
-    if count <= MANY or type(program.function).__module__.startswith("lagjax."):
+    owner = getattr(program.function, "__self__", program.function)
+    if count <= MANY or type(owner).__module__.startswith("lagjax."):
         return
     seconds = float(f"{SECONDS_EACH * count:.1g}")
     warn(
