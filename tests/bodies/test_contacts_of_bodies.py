@@ -55,6 +55,7 @@ def test_thrown_bodies_come_to_roll():
 
     moments, spins = (np.array(x) for x in zip(*thrown_as.values()))
     traj = motion(moments, spins)
+    assert isinstance(traj, lj.HybridTrajectory)
     k = moments[:, 1]
     first = speed + np.stack([-spins[:, 1], spins[:, 0]], axis=1) * RADIUS
     lost = first * (k / (1 + k))[:, None]

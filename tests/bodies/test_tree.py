@@ -371,3 +371,17 @@ def test_a_tree_is_drawn_by_itself():
     middle = film.points.place(box.anchors[0])
     np.testing.assert_allclose(np.sqrt(np.sum(middle**2, axis=1)), 0.5, rtol=1e-6)
     np.testing.assert_allclose(middle[0], [-0.5 * np.sin(0.3), 0.0, -0.5 * np.cos(0.3)], atol=1e-6)
+
+
+def test_one_link_is_a_physical_pendulum():
+    """a = -m g l sin φ/(I + m l²), by mass, inertia and place from params, and no warning of loops in Python, which the
+    recursion has not. Twin: without I."""
+    rod = lj.Body("rod", lambda p: p["m"], lambda p: (p["I"], p["I"], 0.1 * p["I"]))
+    across = (0.0, 1.0, 0.0)
+    hinge = lj.revolute(lj.ground.at(axis=across), rod.at(lambda p: jnp.array([0.0, 0.0, p["l"]]), axis=across))
+    pendulum = lj.Tree([rod], {"hinge": hinge}).system([lj.weight([rod])])
+    p = {"m": 2.0, "I": 0.3, "l": 0.75}
+    a, _ = lj.accelerations(pendulum, 0.0, {"hinge": 0.4}, {"hinge": 0.0}, p)
+    torque = -2.0 * 9.81 * 0.75 * np.sin(0.4)
+    np.testing.assert_allclose(a["hinge"], torque / (0.3 + 2.0 * 0.75**2), rtol=1e-13)
+    assert abs(float(a["hinge"]) - torque / (2.0 * 0.75**2)) > 0.5
