@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import EventKind, Guards
@@ -390,7 +391,8 @@ class Sight(eqx.Module):
         if not self.guards.long:
             return [push(*x) for x in zip(places, directions)]
         together = jtu.tree_map(lambda *x: jnp.stack(x), *zip(places, directions))
-        found = jax.vmap(push)(*together)
+        # One place after the other: in lanes XLA copies what operations share, and takes a quarter longer.
+        found = lax.map(lambda along: push(*along), together)
         return [jtu.tree_map(lambda x: x[i], found) for i in range(len(places))]
 
     def _known(self, g, rate):
