@@ -31,6 +31,7 @@ jax.config.update("jax_enable_x64", True)
 import lagjax as lj
 from lagjax.mechanics import equations, scalar_equations
 from lagjax.system.coordinates import state
+from lagjax.system import traced_system
 from lagjax.system.model import model_of
 if WAY == "arrays":
     equations.is_small = lambda model: False
@@ -59,7 +60,7 @@ while len(times) < 3 or len(times) < 50 and sum(times) < 1.0:
     done(found)
     times.append(time.perf_counter() - before)
 s = state(0.0, *start, params)
-found_equations = equations.equations_of(model_of(system, *s), fast=True)
+found_equations = equations.equations_of(model_of(traced_system(system, s), *s), fast=True)
 print(json.dumps({
     "first": first, "wall": wall, "xla": in_xla, "memory": memory, "again": 1e3 * min(times),
     "steps": int(getattr(found, "stats", {}).get("num_steps", 0)), "written": found_equations.are_written,

@@ -15,7 +15,6 @@ from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.mechanics.saddle_point import Dense, examined
-from lagjax.mechanics.scalar_equations import LONG
 from lagjax.system import (
     Model,
     State,
@@ -69,10 +68,7 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
     # A value that a function closes over may be traced where no argument is.
     given = s, eqx.filter(model, eqx.is_array)
     if not is_eager() or is_traced(given):
-        equations = equations_of(model, fast=True)
-        if is_differentiated(given) and equations.written and equations.written.equations.length > LONG:
-            # The derivative of a long program takes XLA longer than the arrays', and both would be compiled.
-            equations = equations_of(model)
+        equations = equations_of(model, fast=True, differentiated=is_differentiated(given))
         a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
         return equations.outside(a), multipliers
     equations = equations_of(model)

@@ -25,7 +25,15 @@ from lagjax.jaxtools import WATCHED, compiled, decided, jitted, kept_as_call, le
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.mechanics.saddle_point import Dense, Verdict, corrected, is_regular, largest_of_rows, slightly_off
-from lagjax.mechanics.scalar_equations import UP_TO, WrittenOut, has_networks, is_small, is_tiny, write_out
+from lagjax.mechanics.scalar_equations import (
+    LONG_TO_DIFFERENTIATE,
+    UP_TO,
+    WrittenOut,
+    has_networks,
+    is_small,
+    is_tiny,
+    write_out,
+)
 from lagjax.mechanics.scalar_form import in_numbers
 from lagjax.mechanics.sparse_saddle_point import Banded, plan
 from lagjax.mechanics.structure import is_diagonal
@@ -66,7 +74,7 @@ class Equations(eqx.Module):
     def operations(self, t: Array, q: PyTree, v: PyTree) -> int:
         """How many operations the accelerations have; written out, with those of the return to the constraints."""
         if self.written is not None:
-            return sum(numbers.length for numbers in (self.written.equations, self.written.project) if numbers)
+            return self.written.length
         # JAX looks for what it traces among what it has traced: bound methods would compare traced arrays.
         return length(jax.make_jaxpr(lambda *state: self.accelerations(*state))(t, q, v).jaxpr)
 
@@ -187,20 +195,25 @@ class Equations(eqx.Module):
         return self.form.row_sizes(self.model, t, *self.model.vectors(q, v))
 
 
-def equations_of(model: Model, *, fast: bool = False, fallback: bool = True) -> Equations:
+def equations_of(model: Model, *, fast: bool = False, fallback: bool = True, differentiated: bool = False) -> Equations:
     """The equations of a model.
 
     With `fast` the equations of a small system are also written out, and take states number by number
-    (`Equations.inside`). Without `fallback` they are assumed regular; the caller deals with states where they are not.
+    (`Equations.inside`); not if they are to be `differentiated` and are long. Without `fallback` they are assumed
+    regular; the caller deals with states where they are not.
     """
     written, users, prepared = None, None, (None, None)
     model = with_first_order(model)
     if fast and is_small(model):
-        model, users = in_numbers(model), model.form
-        leaves, structure = jtu.tree_flatten(model)
+        numbers = in_numbers(model)
+        leaves, structure = jtu.tree_flatten(numbers)
         leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
         # In a watched motion a failed check of the user's becomes NaN in the equations.
         written = _written(structure, leaves, WATCHED.value)
+        if differentiated and written is not None and written.length > LONG_TO_DIFFERENTIATE:
+            written = None
+        else:
+            model, users = numbers, model.form
     if written is not None:
         both = written.equations, written.project
         prepared = tuple(None if numbers is None else numbers.prepare(model) for numbers in both)

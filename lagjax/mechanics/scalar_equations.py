@@ -42,6 +42,11 @@ MATRIX = 64
 # A program of more operations goes to arrays. With constraints, first answers in processor seconds, written out and in
 # arrays: 15 and 22 of a rattleback (1,600 operations); 56 and 40 of a vehicle (6,200), which is above it.
 LONG, CONSTRAINED_LONG = 3000, 6000
+# Of a longer one, with its return, XLA compiles the derivative in arrays sooner, as it copies what the lanes of several
+# directions share: by one number that of a pendulum of a body (3,700 operations) in 50 s of processor time in place of
+# 154, that of a rattleback (2,800) in 90 in place of more than 150; a fit of that pendulum in 70 s, written out in more
+# than 16 GB.
+LONG_TO_DIFFERENTIATE = 2000
 # What is not yet without its zeros may be so many times as long.
 ON_THE_WAY = 5
 # Two iterations are enough where the second one moves the state by less than this share of its size.
@@ -57,6 +62,11 @@ class WrittenOut(NamedTuple):
     equations: Numbers
     project: Numbers | None
     may_fail: bool
+
+    @property
+    def length(self) -> int:
+        """How many operations both programs have."""
+        return sum(numbers.length for numbers in (self.equations, self.project) if numbers)
 
 
 def has_networks(model: Model | PyTree) -> bool:

@@ -82,6 +82,18 @@ def test_the_robust_way_is_there_unless_they_are_taken_for_regular():
     np.testing.assert_allclose(*multipliers["rod"], rtol=1e-12)
 
 
+def test_a_long_program_is_differentiated_in_arrays(monkeypatch):
+    """Equations that are to be differentiated are written out only if they are short, and say the same either way."""
+    s = coordinates.state(0.0, *HORIZONTAL, PARAMS)
+    model = model_of(rod_pendulum, *s)
+    short = equations_of(model, fast=True, differentiated=True)
+    monkeypatch.setattr(equations, "LONG_TO_DIFFERENTIATE", short.operations(*s[:1], *map(short.inside, s[1:3])) - 1)
+    long, kept = equations_of(model, fast=True, differentiated=True), equations_of(model, fast=True)
+    assert short.are_written and kept.are_written and not long.are_written
+    a, multipliers = kept.rates(s.t, kept.inside(s.q), kept.inside(s.v))
+    np.testing.assert_allclose(flat((kept.outside(a), multipliers)), flat(long.rates(*s[:3])), rtol=1e-14)
+
+
 def test_in_arrays_they_are_the_same_or_nan():
     """Taken for regular, all equations are solved with: where the robust way leaves one out, the results are NaN.
 

@@ -156,7 +156,7 @@ def _guess(system: System, record: Record, r: int, params: PyTree) -> State:
                 "Fix: lj.Record(..., q0=..., v0=...), in the structure that lj.integrate takes."
             )
         if record.v0 is None and isinstance(q, dict) and isinstance(v, dict):
-            v = {name: np.zeros(np.shape(x), jnp.result_type(float)) for name, x in q.items()} | v
+            v = jax.tree.map(lambda x: np.zeros(np.shape(x), jnp.result_type(float)), q) | v
     v = with_rates(system, q, v)
     if is_traced((q, v, params)):
         if system.constraints:

@@ -100,7 +100,8 @@ def solved(
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom, EqualSteps))
     # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
     fast = ours and settings.event is None
-    equations = equations_of(model_of(system, ts[0], q0, v0, params), fast=fast, fallback=settings.robust)
+    model = model_of(system, ts[0], q0, v0, params)
+    equations = equations_of(model, fast=fast, fallback=settings.robust, differentiated=settings.differentiated)
     first_order = equations.model.form.first_order
     if first_order is not None and settings.drift == "none":
         # Velocities that are determined are returned to their values whatever becomes of constraints.

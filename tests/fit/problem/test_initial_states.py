@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.fit.problem.initial_states import _parabola
+from lagjax.fit.problem.initial_states import _guess, _parabola
 from lagjax.fit.problem.residuals import WHOLE
 from lagjax.numerics.windowed_least_squares import Unknowns
 from tests.fit.cases import CASES
@@ -44,6 +44,18 @@ def test_a_start_is_read_off_without_wild_values(wild):
 
 
 @pytest.mark.slow
+def test_coordinates_of_several_shapes_that_are_not_measured_start_at_rest():
+    """A record of the pose of one body gives its velocity too, and another one starts at rest."""
+    t = np.linspace(0.0, 1.0, 11)
+    pose = lj.Pose(np.stack([3.0 * t, 0 * t, t**2], axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (11, 1)))
+    body = lj.Body("body", 1.0, (1.0, 1.0, 1.0))
+    record = lj.Record(t, q={"body": pose}, v={})
+    guess = _guess(lj.multibody([body]), record, 0, None)
+    np.testing.assert_allclose(guess.v["body"].position, [3.0, 0.0, 0.0], atol=1e-12)
+    at_rest = _guess(lj.multibody([body]), lj.Record(t, q={"body": pose}, q0={"body": lj.Pose.at()}), 0, None)
+    assert jax.tree.map(np.shape, at_rest.v) == {"body": lj.Pose((3,), (4,))}
+
+
 def test_unknowns_of_a_start_keep_to_the_constraints():
     """A start satisfies the constraints for any unknowns and parameters."""
     case = CASES["pendulum on a rod"]
