@@ -80,10 +80,10 @@ def test_a_box_slides_and_stops():
     corners = np.array([[x, y, -1.0] for x in (1.0, -1.0) for y in (1.0, -1.0)]) * half
 
     def gaps(t, q, p):
-        return (box.pose(q).position + box.directions(q, corners))[:, 2]
+        return (box.pose(q).position[None] + box.directions(q, corners))[:, 2]
 
     def slips(t, q, v, p):
-        return (box.rates(v).position + jnp.cross(box.spin(q, v)[None], box.directions(q, corners)))[:, :2]
+        return (box.rates(v).position[None] + jnp.cross(box.spin(q, v)[None], box.directions(q, corners)))[:, :2]
 
     floor = lj.Contact(gaps, friction=mu, sliding=slips)
     system = lj.multibody([box], {}, [lj.weight([box])], elements={"floor": floor})
