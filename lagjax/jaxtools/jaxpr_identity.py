@@ -83,7 +83,8 @@ def without_repeats(jaxpr: Jaxpr) -> Jaxpr:
     for equation in jaxpr.eqns:
         operands = [x if isinstance(x, Literal) else same.get(x, x) for x in equation.invars]
         equation = equation if operands == equation.invars else equation.replace(invars=operands)
-        is_alone = len(equation.outvars) != 1 or equation.effects or _follows_rules(equation)
+        has_rules = _has_a_rule(equation) or any(map(_holds_rules, bodies(equation)))
+        is_alone = len(equation.outvars) != 1 or equation.effects or has_rules
         earlier = equation if is_alone else first.setdefault(_operation(equation), equation)
         if earlier is equation:
             kept.append(equation)
@@ -95,13 +96,6 @@ def without_repeats(jaxpr: Jaxpr) -> Jaxpr:
 def _operation(equation: JaxprEqn) -> tuple:
     operands = ((x.aval, content_of(x.val)) if isinstance(x, Literal) else x for x in equation.invars)
     return equation.primitive, *operands, *map(_key, equation.params.values())
-
-
-_holds_rules = anywhere(lambda equation: equation.primitive.name in RULES)
-
-
-def _follows_rules(equation: JaxprEqn) -> bool:
-    return equation.primitive.name in RULES or any(map(_holds_rules, bodies(equation)))
 
 
 def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
@@ -119,6 +113,9 @@ def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
 def _has_a_rule(equation: JaxprEqn) -> bool:
     inside = [e.params.get("name") for body in bodies(equation) for e in body.eqns]
     return equation.primitive.name in RULES and inside != [RULE_FOLLOWS]
+
+
+_holds_rules = anywhere(_has_a_rule)
 
 
 def rule_follows(function: Callable) -> jax.custom_jvp:

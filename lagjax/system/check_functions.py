@@ -104,7 +104,8 @@ def traced_call(call: Call, given: Mapping[str, Any], check: Callable, usual_cau
         with in_words(call, given):
             program = TracedProgram(call.function, call.takes, args)
         check(call, program.value)
-        _warn_of_length(str(call), program)
+        if length(program.jaxpr) > MANY:
+            _warn_of_length(str(call), program)
         return program
 
     return traced(call.function, args, make)

@@ -143,9 +143,9 @@ bent_otherwise.defjvp(lambda x, dx: (bent_otherwise(*x), 7.0 * dx[0]))
     [
         lambda x: jnp.arctan2(x * 0.0, -1.0) - jnp.arctan2(x * -0.0, -1.0),
         lambda x: bent(x) + bent_otherwise(x),
-        lambda x: jax.jit(bent)(x) + jax.jit(bent_otherwise)(x),
-        lambda x: jnp.sum(jnp.sort(jnp.stack([x, -x]))[:1]) + x.astype(jnp.float32),
-        lambda x: sum(jax.lax.top_k(jnp.stack([x, 2 * x]), k)[0][0] for k in (1, 2)),
+        lambda x: jax.jit(lambda y: bent(y))(x) + jax.jit(lambda y: bent_otherwise(y))(x),
+        lambda x: (x / 7).astype(jnp.float32).astype(float) - 2 * (x / 7).astype(jnp.float16).astype(float),
+        lambda x: x**2 - 2 * x**3,
     ],
     ids=["signs of zero", "rules", "rules inside", "dtypes", "parameters"],
 )
