@@ -1,10 +1,11 @@
 """`python -m lagjax`: every scene, checked, timed and drawn; then the stability report.
 
-For each scene: error against run time by method and tolerance, the time of the first answer, then the results of stiff
-and extreme cases; work-precision diagrams and a picture as PNG, all numbers as JSON. `python -m lagjax stability`
-prints the whole stability report, the main job only a part of it. The exit status is 1 if a scene misses its accuracy,
-or a row of the stability report is silently wrong or has another outcome than expected. Scenes run in parallel, one per
-core: most of their time is compilation, which uses one thread.
+For each scene: error against run time by method and tolerance beside a peer written by hand, the time of the first
+answer, the results of stiff and extreme cases, what its source gets wrong; work-precision diagrams and a picture as
+PNG, all numbers as JSON. `--full` adds what repeats this: second variations of a motion by all methods, slow peers,
+further cases, the whole stability report (`python -m lagjax stability` prints it alone). The exit status is 1 if a scene
+misses its accuracy, or a row of the stability report is silently wrong or has another outcome than expected. Parts run
+side by side, one per core: most of their time is compilation, which uses one thread. Each is printed as it ends.
 """
 
 import argparse
@@ -13,9 +14,9 @@ import platform
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_all_start_methods, get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,26 +26,28 @@ import jax
 from lagjax import report, stability
 from lagjax.display import plots
 from lagjax.numerics import Dopri8
+from lagjax.report import FULL, MAIN, QUICK
 from lagjax.scenes import SCENES
 from lagjax.sweep import usable_cores
+from lagjax.work_precision import table
 
 STABILITY = "stability"
-# The parts that take longest start first, so that no core waits for one of them.
-LONGEST = "mass_distributions", STABILITY, "cross_rails"
-
-FULL = {
-    "methods": None,
-    "tolerances": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
-    "repeats": 15,
+SETTINGS = {
+    QUICK: {"methods": {"Dopri8": Dopri8()}, "tolerances": (1e-6, 1e-10), "repeats": 3},
+    MAIN: {"methods": None, "tolerances": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12), "repeats": 15},
 }
-QUICK = {"methods": {"Dopri8": Dopri8()}, "tolerances": (1e-6, 1e-10), "repeats": 3}
+SETTINGS[FULL] = SETTINGS[MAIN]
+# Processor seconds of each part by tier, on the machine of `benchmarks/results`: what takes longest starts first, so
+# that no core waits for it, and a line says how long all will take.
+SECONDS = {}
 
 
 class JobPart(NamedTuple):
-    """A scene, or the stability report: its printed text, its numbers, and the requirements it missed."""
+    """A scene, or the stability report: its printed text, its numbers, its line of the summary, what it missed."""
 
     printed: str
     numbers: Any
+    summary: tuple[str, ...]
     missed: list[str]
 
 
@@ -54,42 +57,49 @@ def main(arguments=None) -> int:
     folder = Path(options.output)
     folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    note = f"; {_at_a_time(options)} scenes at a time, which slow each other down" if _at_a_time(options) > 1 else ""
-    print(f"{_machine()}{note}\n", flush=True)
-    numbers, missed, rows = {}, [], None
-    for name, part in zip(options.scenes, _parts(options, folder)):
+    print(f"{_machine()}\n{_plan(options)}\n", flush=True)
+    parts = {}
+    for name, part in _parts(options, folder):
         print(part.printed, end="\n\n", flush=True)
-        missed += part.missed
-        if name == STABILITY:
-            rows = part.numbers
-        else:
-            numbers[name] = part.numbers
-    if numbers:
-        (folder / "report.json").write_text(json.dumps({"machine": _machine(), "scenes": numbers}, indent=1))
-    if rows is not None:
-        (folder / "stability.json").write_text(json.dumps({"machine": _machine(), "rows": rows}, indent=1))
+        parts[name] = part
+    parts = {name: parts[name] for name in options.scenes}
+    _write(folder, parts)
+    print(_summary(parts, folder))
     print(f"{time.perf_counter() - started:.0f} s; pictures and numbers are in {folder}/")
+    missed = [line for part in parts.values() for line in part.missed]
     for line in missed:
         print(f"MISSED  {line}")
     return 1 if missed else 0
 
 
-def _parts(options, folder) -> Iterator[JobPart]:
-    """All requested parts, in order; several at a time, each in its own process."""
-    tasks = [(name, options.quick, options.tier, folder) for name in options.scenes]
+def _parts(options, folder) -> Iterator[tuple[str, JobPart]]:
+    """All requested parts by name, as they end; several at a time, each in its own process."""
+    tasks = {name: (name, options.tier, options.stability, folder) for name in options.scenes}
+    order = sorted(tasks, key=lambda name: -_seconds(name, options.tier))
     at_a_time = _at_a_time(options)
     if at_a_time == 1:
-        yield from (_part(*task) for task in tasks)
-        return
-    pool = ProcessPoolExecutor(at_a_time, get_context("spawn"))
-    try:
-        order = sorted(tasks, key=lambda task: LONGEST.index(task[0]) if task[0] in LONGEST else len(LONGEST))
-        running = {task: pool.submit(_part, *task) for task in order}
-        for task in tasks:
-            _progress(f"{task[0]}: {sum(f.done() for f in running.values())} of {len(tasks)} done")
-            part = running[task].result()
+        for name in options.scenes:
+            _progress(f"{name}: tracing and compiling")
+            part = _part(*tasks[name])
             _progress("")
-            yield part
+            yield name, part
+        return
+    # A server that has imported everything once is copied for each process.
+    context = get_context("forkserver" if "forkserver" in get_all_start_methods() else "spawn")
+    if context.get_start_method() == "forkserver":
+        context.set_forkserver_preload([__name__])
+    pool, started = ProcessPoolExecutor(at_a_time, context), time.perf_counter()
+    try:
+        running = {pool.submit(_part, *tasks[name]): name for name in order}
+        while running:
+            at_work = [name for future, name in running.items() if future.running()][:at_a_time]
+            left = sum(_seconds(name, options.tier) for name in running.values()) / at_a_time
+            about = f", about {left:.0f} s left" if left else ""
+            _progress(f"{', '.join(at_work)}: tracing and compiling; {len(tasks) - len(running)} of {len(tasks)} done{about}")
+            ended, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+            _progress("")
+            for future in ended:
+                yield running.pop(future), future.result()
     finally:
         # After an interruption no further parts are started.
         pool.shutdown(cancel_futures=True)
@@ -99,10 +109,15 @@ def _at_a_time(options):
     return max(1, min(options.jobs, len(options.scenes)))
 
 
-def _part(name, quick, tier, folder) -> JobPart:
+def _seconds(name, tier):
+    """Processor seconds that a part takes."""
+    return dict(zip((QUICK, MAIN, FULL), SECONDS.get(name, (0, 0, 0))))[tier]
+
+
+def _part(name, tier, of_stability, folder) -> JobPart:
     # The job is an application: the library itself never sets JAX's options.
     jax.config.update("jax_enable_x64", True)
-    return _stability(tier) if name == STABILITY else _scene(SCENES[name], quick, folder)
+    return _stability(of_stability) if name == STABILITY else _scene(SCENES[name], tier, folder)
 
 
 def _parse(arguments):
@@ -117,11 +132,17 @@ def _parse(arguments):
         f"{', '.join(SCENES)}",
     )
     parser.add_argument("-o", "--output", default="lagjax-report", help="folder for pictures and numbers")
-    parser.add_argument(
+    how_much = parser.add_mutually_exclusive_group()
+    how_much.add_argument(
         "--quick",
-        action="store_true",
-        help="one run per scene, one method, two tolerances, no scene pictures, few stability rows; under a minute",
-    )
+        action="store_const", const=QUICK, default=MAIN, dest="tier",
+        help="one run per scene, one method, two tolerances, one picture, few cases and stability rows",
+    )  # fmt: skip
+    how_much.add_argument(
+        "--full",
+        action="store_const", const=FULL, dest="tier",
+        help="also variations of each motion by all methods, slow peers, further cases, the whole stability report",
+    )  # fmt: skip
     parser.add_argument(
         "-j", "--jobs", type=int, default=usable_cores(), metavar="N",
         help="scenes at a time, each in its own process; by default one per core. With -j 1 times vary less",
@@ -130,21 +151,15 @@ def _parse(arguments):
     unknown = [name for name in options.scenes if name not in (*SCENES, STABILITY)]
     if unknown:
         parser.error(f"no scene named {', '.join(unknown)}; there are: {', '.join(SCENES)}, and {STABILITY}")
-    tier = stability.FULL if options.scenes else stability.REDUCED
-    options.tier = stability.QUICK if options.quick else tier
-    short = [name for name, scene in SCENES.items() if not (options.quick and scene.long)]
-    options.scenes = options.scenes or [*short, STABILITY]
+    # Asked for by name, the stability report is whole.
+    options.stability = FULL if options.scenes and options.tier == MAIN else options.tier
+    options.scenes = options.scenes or [*SCENES, STABILITY]
     return options
 
 
 def _stability(tier) -> JobPart:
     """The stability report, with the rows that do not have the expected outcome."""
-    _progress("stability")
-    rows, outcomes = stability.trials(tier), []
-    for i, row in enumerate(rows):
-        _progress(f"stability, row {i + 1} of {len(rows)}")
-        outcomes.append(row.attempt())
-    _progress("")
+    outcomes = [row.attempt() for row in stability.trials(tier)]
     title = "Stability: accurate, degraded with a warning, or refused with a reason"
     printed = f"{title}\n{'=' * len(title)}\n\n{stability.stability_table(outcomes)}"
     numbers = [asdict(outcome) | {"verdict": outcome.verdict} for outcome in outcomes]
@@ -153,48 +168,44 @@ def _stability(tier) -> JobPart:
         for o in outcomes
         if not o.passed
     ]
-    return JobPart(printed, numbers, missed)
+    return JobPart(printed, numbers, ("-", "-", "-", _share([o.passed for o in outcomes]), "-"), missed)
 
 
-def _scene(scene, quick, folder) -> JobPart:
+def _scene(scene, tier, folder) -> JobPart:
     """Check, time and draw a scene."""
-    found, cases = _run_scene(scene, quick)
-    _draw(scene, found, folder, with_picture=not quick)
+    found = [(run, report.work_precision(run, tier, **SETTINGS[tier])) for run in scene.runs() if run.tier <= tier]
+    cases = scene.cases(tier)
+    picture = _draw(scene, found, folder, tier)
     rows = [row for run, of_run in found for row in report.rows_of(run, of_run)]
-    _progress("")
     missed = [f"{scene.name}: {row.run}, error {row.error:.1e} > {row.required:.0e}" for row in rows if not row.passed]
     missed += [
         f"{scene.name}: {case.name}, error {case.error:.1e} > {case.allowed:.0e}" for case in cases if not case.passed
     ]
     numbers = {"runs": [asdict(row) for row in rows], "cases": [asdict(case) for case in cases]}
-    return JobPart(_described(scene, rows, cases), numbers, missed)
+    summary = *report.judged(rows), _share([case.passed for case in cases]), picture
+    return JobPart(_described(scene, rows, cases), numbers, summary, missed)
 
 
-def _run_scene(scene, quick):
-    settings = QUICK if quick else FULL
-    runs, found, with_others = scene.runs(), [], not quick
-    for run in runs[:1] if quick else runs:
-        _progress(f"{scene.name}: {run.name}")
-        # Other tools are compared once per scene: they take as long as all other runs together.
-        found.append((run, report.work_precision(run, others=with_others, **settings)))
-        with_others = with_others and run.by_hand is None
-    _progress(f"{scene.name}: stiff and extreme cases")
-    return found, scene.cases()
+def _share(passed):
+    return f"{sum(passed)} of {len(passed)}"
 
 
-def _draw(scene, found, folder, with_picture):
-    _progress(f"{scene.name}: pictures")
+def _draw(scene, found, folder, tier) -> str:
+    """Save the pictures; returns the name of the one to look at first."""
     try:
         plots.import_matplotlib()
     except ImportError as error:
         print(f"no pictures: {error}", file=sys.stderr)
-        return
-    panels = [of_run.against_time(run.name) for run, of_run in found if run.drawn]
+        return "-"
     # Run times of motions shorter than a call, or without an error, are not drawn.
+    panels = [of_run.against_time(run.name) for run, of_run in found if run.drawn]
+    work, motion = f"{scene.name}_work_precision.png", f"{scene.name}.png"
     if panels:
-        plots.work_precision(panels).savefig(folder / f"{scene.name}_work_precision.png")
-    if with_picture:
-        scene.picture().savefig(folder / f"{scene.name}.png")
+        plots.work_precision(panels).savefig(folder / work)
+    if tier == QUICK and panels:
+        return work
+    scene.picture().savefig(folder / motion)
+    return motion
 
 
 def _described(scene, rows, cases):
@@ -209,10 +220,38 @@ def _described(scene, rows, cases):
     ])  # fmt: skip
 
 
+def _write(folder, parts):
+    numbers = {name: part.numbers for name, part in parts.items()}
+    rows = numbers.pop(STABILITY, None)
+    if numbers:
+        (folder / "report.json").write_text(json.dumps({"machine": _machine(), "scenes": numbers}, indent=1))
+    if rows is not None:
+        (folder / "stability.json").write_text(json.dumps({"machine": _machine(), "rows": rows}, indent=1))
+
+
+def _summary(parts, folder):
+    """A line for each part."""
+    header = "", "error at 1e-10", "ms", "first answer/s", "cases", "picture"
+    rows = [
+        (name, *part.summary[:-1], part.summary[-1] if part.summary[-1] == "-" else str(folder / part.summary[-1]))
+        for name, part in parts.items()
+    ]
+    width = max(len(row[-1]) for row in [header, *rows])
+    return table((*header[:-1], header[-1].ljust(width)), [(*row[:-1], row[-1].ljust(width)) for row in rows])
+
+
 def _progress(text):
     """Overwrite one line of text, only in a terminal."""
     if sys.stderr.isatty() and parent_process() is None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _plan(options):
+    """What happens next, and for how long."""
+    at_a_time, total = _at_a_time(options), sum(_seconds(name, options.tier) for name in options.scenes)
+    side_by_side = f", {at_a_time} at a time, which slow each other down" if at_a_time > 1 else ""
+    about = f", about {total / at_a_time:.0f} s in all, most of them of tracing and compiling" if total else ""
+    return f"{len(options.scenes)} part{'s' * (len(options.scenes) > 1)}{side_by_side}{about}; each is printed as it ends"
 
 
 def _machine():

@@ -110,8 +110,10 @@ def positive_definite(
 ) -> Float[Array, "n n"]:
     """Return a positive definite matrix made of any numbers, for a mass or damping matrix.
 
-    >>> import jax.numpy as jnp
-    >>> print(positive_definite(jnp.array([0.0, 0.0, 0.5]), sizes=jnp.array([1.0, 4.0]), floor=0.0))
+    >>> import jax
+    >>> import numpy as np
+    >>> matrix = jax.jit(lambda numbers: positive_definite(numbers, sizes=np.array([1.0, 4.0]), floor=0.0))
+    >>> print(matrix(np.array([0.0, 0.0, 0.5])))
     [[1. 1.]
      [1. 5.]]
 
@@ -191,7 +193,7 @@ def same_motion(
     >>> import lagjax as lj
     >>> swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
     >>> disguised = lj.System(lambda t, q, v, params: 1.5 * v**2 + 3.0 * jnp.cos(q) + v * jnp.exp(q) - 7.0)
-    >>> same_motion(swing, disguised, jnp.linspace(-1.0, 1.0, 5), jnp.linspace(2.0, 0.0, 5))
+    >>> same_motion(swing, disguised, np.linspace(-1.0, 1.0, 5), np.linspace(2.0, 0.0, 5))
     SameMotion: yes; the other L is 3 times the first, up to a total derivative
 
     The motion does not distinguish L from `c L + dF(t, q)/dt`: a multiple of L, an added constant, or added terms that

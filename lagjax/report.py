@@ -23,6 +23,8 @@ JUDGED_AT = 1e-10
 JUDGED_METHOD = "Dopri8"
 # If a solve by another tool takes longer than this, in seconds, its tighter tolerances are not tried.
 PATIENCE = 0.4
+# How much the job runs: `--quick`, by default, `--full`; each includes the ones before it.
+QUICK, MAIN, FULL = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Run:
     - `events`: `Crossing`s by name that end the motion.
     - `by_hand`: accelerations and multipliers derived by hand, as a function of `(t, q, v, params)`, for other tools.
     - `drawn`: whether the run is long enough for meaningful run times.
+    - `tier`: the least that includes it: `QUICK`, `MAIN`, or `FULL` for a variation of another run.
     """
 
     name: str
@@ -50,6 +53,7 @@ class Run:
     events: Mapping[str, Crossing] | None = None
     by_hand: Callable | None = None
     drawn: bool = True
+    tier: int = MAIN
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class Case:
 class Scene:
     """A worked system: where it comes from, what the source gets wrong, and how it is checked.
 
-    `runs`, `cases` and `picture` are functions, so that importing a scene computes nothing.
+    `runs`, `cases` and `picture` are functions, so that importing a scene computes nothing; `cases` takes a tier.
     """
 
     name: str
@@ -82,10 +86,8 @@ class Scene:
     source: str
     misprints: tuple[str, ...]
     runs: Callable[[], Sequence[Run]]
-    cases: Callable[[], Sequence[Case]]
+    cases: Callable[[int], Sequence[Case]]
     picture: Callable[[], Any]
-    # Left out of `--quick`, since it compiles for longer than everything else there.
-    long: bool = False
 
 
 @dataclass(frozen=True)
@@ -111,11 +113,13 @@ class Row:
         return self.required is None or bool(self.error <= self.required)
 
 
-def work_precision(run: Run, others: bool = True, **settings: Any) -> WorkPrecision:
-    """Compare methods on a run; with `others` also with other tools. `settings` are those of `lj.work_precision`."""
+def work_precision(run: Run, tier: int = FULL, **settings: Any) -> WorkPrecision:
+    """Compare methods on a run, and with other tools where accelerations by hand are there: above `QUICK` with
+    diffrax, in `FULL` also with SciPy, slower by a hundred. `settings` are those of `lj.work_precision`."""
     instead, by_hand = None, run.by_hand
-    if others and by_hand is not None:
+    if tier > QUICK and by_hand is not None:
         instead = usual_others(lambda *state: by_hand(*state)[0], run.q0, run.v0, run.params, run.ts)
+        instead = instead if tier == FULL else dict([*instead.items()][:1])
     return compared(
         run.system, run.q0, run.v0, run.params,
         ts=run.ts, events=run.events, error=run.error, others=instead, patience_with_others=PATIENCE, **settings,
@@ -166,6 +170,15 @@ def first_answer(rows: Sequence[Row]) -> str:
         f"first answer: {row.compile_seconds or 0.0:.1f} s of tracing and compiling for '{row.run}' by {row.method}; "
         f"then {in_ms(row.seconds)} ms per solve"
     )
+
+
+def judged(rows: Sequence[Row]) -> tuple[str, str, str]:
+    """Of the run that came nearest to missing its error: that error and what is allowed, its ms, its first answer."""
+    asked = [row for row in rows if row.required is not None]
+    if not asked:
+        return "-", "-", "-"
+    row = max(asked, key=lambda row: np.nan_to_num(row.error / row.required, nan=np.inf))
+    return f"{row.error:.0e} (<= {row.required:.0e})", in_ms(row.seconds), f"{row.compile_seconds or 0.0:.1f}"
 
 
 def case_table(cases: Sequence[Case]) -> str:

@@ -1,6 +1,7 @@
 """Strict numerics for all tests: float64, no silent rank promotion, warnings are errors.
 
-Two tiers of tests, and an option; `.ci/run` runs the scenes and both tiers:
+At its end pytest prints what was compiled and how much memory a worker had; the fast tier has a budget of both
+(`tests/counting.py`). Two tiers of tests, and an option; `.ci/run` runs the scenes and both tiers:
 
     python -m lagjax    the scenes: error against exact motions by method and tolerance, stiff and extreme cases,
                         pictures; the reduced stability report. The exit status is 1 if anything is missed, which
@@ -20,6 +21,7 @@ import gc
 import inspect
 import itertools
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,7 @@ from jax._src import compiler  # noqa: E402
 
 from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
 from lagjax.jaxtools.compiled import are_known  # noqa: E402
+from tests import counting  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -43,8 +46,9 @@ PROGRAMS.most = 1_000
 
 # Each compiled program takes some fifty memory maps. Linux gives a process 65,530, and XLA crashes without one.
 MAPS, MOST_MAPS = Path("/proc/self/maps"), 30_000
-# Two workers share the memory of a small machine.
-SIZE, MOST_PAGES = Path("/proc/self/statm"), 4 * 2**30 // os.sysconf("SC_PAGE_SIZE")
+# Of a worker; above `MOST_PAGES` it lets go of its programs.
+GIGABYTES = 2.5
+SIZE, MOST_PAGES = Path("/proc/self/statm"), 2 * 2**30 // os.sysconf("SC_PAGE_SIZE")
 # Freed memory is not always returned to the system.
 allowed = [MOST_PAGES]
 # The maps are counted once in ten tests: the list of 30,000 takes the kernel 10 ms.
@@ -58,7 +62,8 @@ COMPILED_FASTER = [(name, value) for name, value in COMPILED_FASTER if are_known
 
 
 def compile_faster(backend, module, devices, options, callbacks):
-    """Compile with `COMPILED_FASTER` where few optimisations are asked for."""
+    """Compile with `COMPILED_FASTER` where few optimisations are asked for, and count."""
+    counting.about_to_compile(module)
     if jax.config.read("jax_disable_most_optimizations"):
         # By JAX's own function: `XLA_FLAGS` would change the optimised tests too, which run in the same process.
         options.env_option_overrides = [*options.env_option_overrides, *COMPILED_FASTER]
@@ -111,9 +116,14 @@ def pytest_runtest_setup(item):
     jax.config.update("jax_disable_most_optimizations", not optimised)
 
 
+# The processor seconds of this process until its tests were collected.
+collected: list[float] = []
+
+
 def pytest_collection_finish():
     """Objects imported by now stay, so garbage collection need not scan them."""
     gc.freeze()
+    collected.append(time.process_time())
 
 
 @pytest.fixture(autouse=True)
@@ -127,3 +137,66 @@ def room_for_programs():
         jax.clear_caches()
         gc.collect()
         allowed[0] = pages() + MOST_PAGES // 2
+
+
+# What the tests cost, by test, and of each process the seconds until all were collected and the most memory, in GB.
+COSTS: dict[str, counting.Cost] = {}
+METER = pytest.StashKey[counting.Meter]()
+PROCESSES: list[tuple[float, float]] = []
+
+
+def pytest_xdist_auto_num_workers(config):
+    """As many workers as cores, if there is memory for them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(cores, int(counting.free_memory() / GIGABYTES)))
+
+
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Begin to meter a test."""
+    item.stash[METER] = counting.Meter()
+    yield
+
+
+
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item, call):
+    """The last report of a test says what it cost."""
+    if call.when == "teardown":
+        item.user_properties.append(("cost", list(item.stash[METER].read())))
+    yield
+
+
+def pytest_runtest_logreport(report):
+    """Collect what the tests cost, in the process that all report to."""
+    if report.when == "teardown":
+        COSTS[report.nodeid] = counting.Cost(*dict(report.user_properties)["cost"])
+
+
+def pytest_testnodedown(node, error):
+    """Collect what a worker says of itself."""
+    PROCESSES.extend([tuple(node.workeroutput["process"])] if "process" in getattr(node, "workeroutput", {}) else [])
+
+
+def pytest_sessionfinish(session):
+    """A worker says what it took; where all reports are, the budget of the fast tier is a test."""
+    process = collected[0] if collected else 0.0, counting.peak_memory()
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["process"] = process
+        return
+    if not session.config.getoption("numprocesses", None):
+        PROCESSES.append(process)
+    whole = session.config.args_source.name == "TESTPATHS" and not session.config.getoption("keyword")
+    if whole and session.config.getoption("markexpr") == "not slow" and counting.over_budget(COSTS, PROCESSES):
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """What the tests cost; of a fast tier over its budget, the dearest."""
+    if COSTS:
+        terminalreporter.write_line(counting.told(COSTS, PROCESSES))
+    whole = config.args_source.name == "TESTPATHS" and not config.getoption("keyword")
+    if whole and config.getoption("markexpr") == "not slow" and (excess := counting.over_budget(COSTS, PROCESSES)):
+        terminalreporter.write_line(f"FAILED: {excess}\n{counting.dearest(COSTS)}", red=True)

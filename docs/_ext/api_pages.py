@@ -1,4 +1,4 @@
-"""A page for each public name, in the sections of `lagjax/__init__.py`: signature, docstring, example, errors.
+"""A page for each public name, in the sections of `lagjax/__init__.pyi`: signature, docstring, example, errors.
 
 The docstrings are Markdown with doctest examples, which `pytest lagjax` runs.
 """
@@ -9,14 +9,13 @@ import re
 import typing
 from operator import attrgetter
 from pathlib import Path
-from statistics import median
 
 from written import clear, write
 
 import lagjax
 
 FOLDER = Path(__file__).parent.parent / "api"
-INIT = Path(lagjax.__file__)
+INIT = Path(lagjax.__file__).with_suffix(".pyi")
 # The function whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
     "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
@@ -45,20 +44,15 @@ Traceback (most recent call last):
 
 
 def sections() -> dict[str, list[str]]:
-    """The public names under the comments above their imports, in the order of `__all__`."""
-    found, title = {}, ""
-    on_one_line = re.sub(r"import \(([^)]*)\)", lambda names: "import " + " ".join(names[1].split()), INIT.read_text())
-    for line in on_one_line.splitlines():
-        if re.match(r"\s*# (?!isort)", line) and not found.get("closed"):
-            title = line.strip("# .")
-        elif named := re.match(r"\s*from lagjax\S* import (.*)", line):
-            for name in re.findall(r"\w+", named[1]):
-                found[name] = title
-    place = {name: i for i, name in enumerate(lagjax.__all__)}
-    groups: dict[str, list[str]] = {}
-    for name in lagjax.__all__:
-        groups.setdefault(found.get(name, "More"), []).append(name)
-    return dict(sorted(groups.items(), key=lambda item: median(place[name] for name in item[1])))
+    """The public names under the comments above their imports, in the order of the map."""
+    found: dict[str, list[str]] = {}
+    names: list[str] = []
+    for line in INIT.read_text().splitlines():
+        if re.match("# (?!isort)", line):
+            names = found.setdefault(line.strip("# ."), [])
+        else:
+            names += re.findall(r"(\w+) as \1\b", line)
+    return found
 
 
 def page_of(name: str) -> str:

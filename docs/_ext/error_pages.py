@@ -163,10 +163,10 @@ def entry(kind: str, text: str, taken: set[str]) -> str:
     return f"({name})=\n### {heading}\n\n{shown}"
 
 
-def page() -> str:
-    """The whole page."""
+def page(files: str = "**/*.py") -> str:
+    """The whole page, or its part of some files."""
     by_theme: dict[str, list[tuple[str, str]]] = {}
-    for path in sorted(ROOT.rglob("*.py")):
+    for path in sorted(ROOT.glob(files)):
         module = str(path.relative_to(ROOT).with_suffix(""))
         if module.startswith(("scenes", "mechanisms", "stability", "report", "job", "__")):
             continue

@@ -82,10 +82,11 @@ class BodiesLagrangian(SystemFunction):
 
     `looks_like`: functions whose `drawing` says what joints and loads look like.
 
+    >>> import jax
     >>> import lagjax as lj
     >>> bob, pose = lj.Body("bob", 2.0, (1.0, 1.0, 1.0)), lj.Pose.at()
     >>> free = BodiesLagrangian((bob,), Driven(()), (), None, ())
-    >>> print(free(0.0, {"bob": pose}, {"bob": pose.moving((3.0, 0.0, 0.0))}, None))
+    >>> print(jax.jit(free)(0.0, {"bob": pose}, {"bob": pose.moving((3.0, 0.0, 0.0))}, None))
     9.0
     """
 

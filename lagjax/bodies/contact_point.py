@@ -66,7 +66,10 @@ def searched(f: Callable, centre: Array, shape: Array) -> Touch:
 def least_of(f: Callable, start: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The unit vector of two or three numbers, near that at the start, for which a function is least; and its value.
 
-    >>> u, value = least_of(lambda u: jnp.sum((u - jnp.array([3.0, 4.0])) ** 2), jnp.array([0.5, jnp.sqrt(0.75)]))
+    >>> import jax
+    >>> import numpy as np
+    >>> nearest = jax.jit(lambda to, start: least_of(lambda u: jnp.sum((u - to) ** 2), start))
+    >>> u, value = nearest(np.array([3.0, 4.0]), np.array([0.8, 0.6]))
     >>> print(u.round(6), value.round(6))
     [0.6 0.8] 16.0
 

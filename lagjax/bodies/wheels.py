@@ -32,12 +32,13 @@ NOT_ONE = 1e-3
 class Surface:
     """A surface to roll on, f = 0, on the side where f > 0.
 
+    >>> import jax
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
     >>> bowl = lj.Surface(lambda r, params: params["radius"] ** 2 - jnp.sum(r**2))
     >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
     >>> contact = lj.rolling_sphere(ball.at(), bowl, radius=1.0)
-    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((0.0, 0.0, -3.5))}, {"radius": 5.0}).round(6))
+    >>> print(jax.jit(contact["touches"].g)(0.0, {"ball": lj.Pose.at((0.0, 0.0, -3.5))}, {"radius": 5.0}).round(6))
     0.527778
 
     **Arguments:** `f`, a function of (r, params) with r (3,) a point; twice differentiable, of any unit, its gradient
@@ -47,7 +48,7 @@ class Surface:
 
     >>> pipe = lj.Surface(lambda r, params: 5.0 - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
     >>> contact = lj.rolling_sphere(ball.at(), pipe, radius=1.0)
-    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((0.0, 3.5, 0.0))}, None))
+    >>> print(jax.jit(contact["touches"].g)(0.0, {"ball": lj.Pose.at((0.0, 3.5, 0.0))}, None))
     0.5
 
     What rolls must be less curved inward than the surface, so that it touches in one point: a ball in a bowl is smaller

@@ -39,8 +39,8 @@ def load_trajectory(
     >>> path = os.path.join(tempfile.mkdtemp(), "fall.npz")
     >>> traj.save(path)
     >>> again = lj.load_trajectory(path, fall)
-    >>> print(again.q.round(9), again.params["g"], again.at(0.1).q.round(9))
-    [0.   0.4  0.25] 10.0 0.25
+    >>> print(again.q.round(9), again.params["g"], again.at([0.1, 0.3]).q.round(9))
+    [0.   0.4  0.25] 10.0 [0.25 0.45]
 
     **Arguments:**
 

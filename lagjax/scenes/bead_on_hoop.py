@@ -32,11 +32,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis import continue_equilibria
+from lagjax.analysis.continuation import continue_equilibria
 from lagjax.display import plots
 from lagjax.integrate import EventWarning, integrate
 from lagjax.mechanics import accelerations
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.scenes.potentials import agm, jacobi_elliptic
 from lagjax.sweep import sweep
@@ -289,7 +289,7 @@ def runs():
     ]  # fmt: skip
 
 
-def cases():
+def cases(tier=FULL):
     """Speeds, starts and lengths at the ends of their ranges."""
     rows = [
         _period_case("omega = omega0 exactly, psi_m = 2^-10", CRITICAL, 2.0**-10, 1e-12),

@@ -38,7 +38,7 @@ from jaxtyping import PyTree
 from lagjax.analysis.modes import normal_modes
 from lagjax.display import plots
 from lagjax.integrate import integrate
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.sweep import sweep
 from lagjax.system import System
@@ -267,7 +267,7 @@ def _run(name: str, system, params: PyTree, ts, acceleration=None):
     )  # fmt: skip
 
 
-def cases():
+def cases(tier=FULL):
     """Speeds at and between the critical ones, stiff springs, late times."""
     rows = [
         _case("omega² = K/m: no equilibrium", {"omega": float(np.sqrt(PARAMS["K"] / PARAMS["m"]))}, 20.0),

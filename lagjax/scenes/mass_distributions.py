@@ -30,10 +30,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis import symmetries
+from lagjax.analysis.symmetry import symmetries
 from lagjax.display import plots
 from lagjax.integrate import integrate
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand, potentials
 from lagjax.system import System
 
@@ -233,7 +233,7 @@ def _charges(name: str, q: PyTree, v: PyTree, params: PyTree):
     return jax.vmap(partial(charges, name), in_axes=(0, 0, None))(q, v, params)
 
 
-def cases():
+def cases(tier=FULL):
     """Kinks, surfaces, rims, wires, and the limiting cases of each shape."""
     return [
         _plane_case(),

@@ -40,7 +40,7 @@ from scipy import special
 from lagjax.display import plots
 from lagjax.integrate import RESULTS, Crossing, integrate
 from lagjax.mechanics import accelerations
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -268,7 +268,7 @@ def departure(start_of: tuple, until=10.0):
     return float(rolled.end.t), float(rolled.end.q["theta"]), bool(left), np.asarray(rolled.q["theta"])
 
 
-def cases():
+def cases(tier=FULL):
     """Starts near and on the top, on the other side, uphill, too fast; other bodies; a hundred swings."""
     starts = {
         # Projection onto the constraints needs some inertia in φ: 2^-40 replaces the point's 0.

@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 from lagjax.display import plots
 from lagjax.integrate import integrate
 from lagjax.mechanics import accelerations
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, Case, Run, Scene, relative_error
 from lagjax.sweep import sweep
 from lagjax.system import Holonomic, System
 
@@ -118,7 +118,7 @@ def _run(name: str, q0: PyTree, v0: PyTree, ts):
     return Run(name, system, PARAMS, q0, v0, ts, error, words, drawn=False)
 
 
-def cases():
+def cases(tier=FULL):
     """Mass ratios and angles at the ends of their ranges."""
     rows = []
     steep, flat = np.pi / 2 - 2.0**-30, 2.0**-30

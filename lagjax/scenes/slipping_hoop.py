@@ -23,7 +23,7 @@ from scipy import optimize
 
 from lagjax.display import plots
 from lagjax.integrate import HybridTrajectory, integrate, releases, slips, sticks, touches
-from lagjax.report import Case, Scene, relative_error
+from lagjax.report import FULL, Case, Scene, relative_error
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling
 from lagjax.system import Holonomic, Hybrid, Switch, System
@@ -121,7 +121,7 @@ def seen(params: PyTree) -> WithFriction:
     return WithFriction(*map(float, (slip, left, -l * rate, spin, switches.q["r"][2] * np.cos(down))))
 
 
-def cases():
+def cases(tier=FULL):
     """Friction from weak to strong; a disk, a sphere, a shell; no friction; and too little to start rolling."""
     many = {f"mu = {mu:g}": {"mu": mu} for mu in (0.0625, 0.25, 1.0, 4.0, 16.0)}
     many |= {f"a {name}, mu = 0.25": {"beta": rolling_hoop.SHAPES[name]} for name in ("disk", "sphere", "shell")}
@@ -190,5 +190,4 @@ SCENE = Scene(
     runs=tuple,
     cases=cases,
     picture=picture,
-    long=True,
 )

@@ -36,7 +36,7 @@ from jaxtyping import PyTree
 from lagjax.display import plots
 from lagjax.integrate import integrate
 from lagjax.mechanics import accelerations
-from lagjax.report import Case, Run, Scene, relative_error
+from lagjax.report import FULL, QUICK, Case, Run, Scene, relative_error
 from lagjax.scenes import by_hand
 from lagjax.system import Holonomic, System
 from lagjax.two_points import geodesic
@@ -177,6 +177,7 @@ def _length(vector):
     return jnp.hypot(jnp.hypot(vector[0], vector[1]), vector[2])
 
 
+@jax.jit
 def cartesian(params: PyTree, psi, theta):
     """r of a point, (..., 3)."""
     return params["R"] * jnp.stack(
@@ -184,12 +185,14 @@ def cartesian(params: PyTree, psi, theta):
     )
 
 
+@jax.jit
 def exact_over_azimuth(A, B, theta):
     """ψ and ψ' where cot ψ = A cos θ + B sin θ."""
     q, slope = A * jnp.cos(theta) + B * jnp.sin(theta), B * jnp.cos(theta) - A * jnp.sin(theta)
     return jnp.arctan2(1.0, q), -slope / (1 + q**2)
 
 
+@jax.jit
 def exact_embedded(q0: PyTree, v0: PyTree, s):
     """r and dr/ds at (T,) arc lengths, from the start of a path of unit speed."""
     R = jnp.sqrt(jnp.sum(q0**2))
@@ -205,8 +208,12 @@ def exact_multiplier(params: PyTree):
 
 def start_towards(params: PyTree, psi1, theta1, psi2, theta2):
     """A start in r at the first point, of unit speed, along the minor arc to the second."""
-    normal = great_circle(psi1, theta1, psi2, theta2).normal
-    q = cartesian(params, psi1, theta1)
+    return _towards(params, psi1, theta1, great_circle(psi1, theta1, psi2, theta2).normal)
+
+
+@jax.jit
+def _towards(params: PyTree, psi, theta, normal):
+    q = cartesian(params, psi, theta)
     v = jnp.cross(normal, q)
     return q, v / _length(v)
 
@@ -250,22 +257,27 @@ def _over_the_poles():
         return relative_error((trajectory.q, trajectory.v), exact_embedded(q0, v0, ts))
 
     words = "r and dr/ds against the circle"
-    return Run("embedded, over both poles", embedded, PARAMS, q0, v0, ts, error, words, 1e-7, by_hand=by_hand.on_sphere)
+    return Run(
+        "embedded, over both poles", embedded, PARAMS, q0, v0, ts, error, words, 1e-7,
+        by_hand=by_hand.on_sphere, tier=FULL,
+    )  # fmt: skip
 
 
 def arrivals(q0: PyTree, v0: PyTree, arc):
     """The end points (N, 3) of starts in r after their arc lengths."""
     # One after another, by one short program: one of lanes would compile for three times as long.
-    return [_end(embedded, q, v, (0.0, s), 1e-10) for q, v, s in zip(q0, v0, arc)]
+    return [_path(embedded, q, v, 0.0, s, OUTPUTS, 1e-10).end.q for q, v, s in zip(q0, v0, arc)]
 
 
 def colatitudes(psi, slope, theta1, theta2, atol):
     """ψ(θ₂) for starts (ψ, ψ') at θ₁, over the azimuth."""
-    return [_end(over_azimuth, q, v, (a, b), tol) for q, v, a, b, tol in zip(psi, slope, theta1, theta2, atol)]
+    starts = zip(psi, slope, theta1, theta2, atol)
+    return [_path(over_azimuth, q, v, a, b, DRAWN, tolerance).end.q for q, v, a, b, tolerance in starts]
 
 
-def _end(system, q0: PyTree, v0: PyTree, ts, atol):
-    return integrate(system, q0, v0, PARAMS, ts=np.array(ts, float), rtol=1e-10, atol=atol).end.q
+def _path(system, q0: PyTree, v0: PyTree, start, end, outputs, atol):
+    ts = np.linspace(float(start), float(end), outputs)
+    return integrate(system, q0, v0, PARAMS, ts=ts, rtol=1e-10, atol=atol)
 
 
 # Name: ψ₁, θ₁, ψ₂, θ₂.
@@ -281,10 +293,14 @@ ARCS = {
     "along the equator": (np.pi / 2, 0.5, np.pi / 2, 1.75),
 }
 WIDE = (1.0, 0.0, 1.25, 4.5)
+# Outputs of embedded paths, and of those over the azimuth: as many for all, so that each form needs one program.
+OUTPUTS, DRAWN = 101, 25
 
 
-def cases():
+def cases(tier=FULL):
     """Poles, meridians, the equator, close and nearly antipodal points; both forms; refused inputs."""
+    if tier == QUICK:
+        return [*_over_azimuth_cases(), *_undetermined_cases()]
     starts = [start_towards(PARAMS, *ends) for ends in ARCS.values()]
     arcs = [distance(PARAMS, *ends) for ends in ARCS.values()]
     # Backwards along the great circle: the long way to the same point.
@@ -298,10 +314,15 @@ def cases():
         error = relative_error(q, cartesian(PARAMS, *ends[2:]))
         rows.append(Case(name, f"arrives after s = {float(arc):.6g}", error, 1e-9))
     rows += _over_azimuth_cases()
-    rows += [_from_two_points(name) for name in ("generic", "along a meridian", "over the pole")]
-    for name, ends in (("coincident points", (1.0, 0.5, 1.0, 0.5)), ("antipodal points", (0.0, 0.0, np.pi, 1.0))):
-        rows.append(_undetermined(name, ends))
-    return [*rows, _at_the_pole(), _thousand_turns()]
+    # The search between two points compiles for longer than all others.
+    found = ("generic", "along a meridian", "over the pole") if tier == FULL else ()
+    rows += [_from_two_points(name) for name in found]
+    return [*rows, *_undetermined_cases(), _at_the_pole(), _thousand_turns()]
+
+
+def _undetermined_cases():
+    ends = {"coincident points": (1.0, 0.5, 1.0, 0.5), "antipodal points": (0.0, 0.0, np.pi, 1.0)}
+    return [_undetermined(name, points) for name, points in ends.items()]
 
 
 def _from_two_points(name: str):
@@ -350,9 +371,8 @@ def _at_the_pole():
 
 def _thousand_turns():
     q0, v0 = start_towards(PARAMS, *ENDS)
-    ts = np.linspace(0.0, 2000 * np.pi * PARAMS["R"], 101)
-    path = integrate(embedded, q0, v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
-    off = relative_error(path.q, exact_embedded(q0, v0, ts)[0])
+    path = _path(embedded, q0, v0, 0.0, 2000 * np.pi * PARAMS["R"], OUTPUTS, 1e-10)
+    off = relative_error(path.q, exact_embedded(q0, v0, path.t)[0])
     happened = f"worst residual (the error here); r off by {off:.0e}, speed by {float(path.drift()):.0e}"
     return Case("1000 turns, embedded", happened, float(path.residual()), 1e-12)
 
@@ -360,7 +380,7 @@ def _thousand_turns():
 def picture():
     """Integrated great circles over the azimuth, and the saddle of an arc longer than half a turn."""
     fig, axes = plots.figure(1, 2, size=(4.8, 3.6))
-    axis, theta = axes[0, 0], np.linspace(-np.pi, np.pi, 25)
+    axis, theta = axes[0, 0], np.linspace(-np.pi, np.pi, DRAWN)
     fine = np.linspace(-np.pi, np.pi, 361)
     for i, inclination in enumerate((20.0, 45.0, 60.0, 80.0)):
         A = float(np.tan(np.radians(inclination)))
@@ -373,10 +393,11 @@ def picture():
     axis.set_xticks(range(-180, 181, 90))
     axis.invert_yaxis()
     axis.legend(fontsize=8, frameon=False, title="inclination", title_fontsize=8)
-    axis, amplitude = axes[0, 1], jnp.linspace(-0.5, 0.5, 41)
+    axis, amplitude = axes[0, 1], np.linspace(-0.5, 0.5, 41)
     minor = float(great_circle(*WIDE).angle)
+    lengths = jax.jit(jax.vmap(varied_length, (None, 0)))
     for i, (name, angle) in enumerate((("minor", minor), ("half turn", np.pi), ("major", 2 * np.pi - minor))):
-        change = jax.vmap(lambda x: varied_length(angle, x))(amplitude) - angle
+        change = np.asarray(lengths(angle, amplitude)) - angle
         axis.plot(amplitude, change, label=f"{name}, {np.degrees(angle):.0f}°", **plots.style(i))
     axis.set(xlabel="sideways displacement / R", ylabel="change of length / R", title="Stationary, not always shortest")
     axis.legend(fontsize=8, frameon=False)

@@ -4,19 +4,20 @@
 ends of their ranges, each compared with a closed form or an independent value.
 """
 
+from lagjax.report import FULL, MAIN, QUICK
 from lagjax.stability.amplifying import amplifying
 from lagjax.stability.constraints import redundant
 from lagjax.stability.geodesics import geodesics
 from lagjax.stability.hoop_and_wedge import bead, float32, separatrix, wedge
 from lagjax.stability.long import long
 from lagjax.stability.stiff import stable_steps, stiff
-from lagjax.stability.trial import FULL, QUICK, REDUCED, SILENTLY_WRONG, VERDICTS, Outcome, Trial, stability_table
+from lagjax.stability.trial import SILENTLY_WRONG, VERDICTS, Outcome, Trial, stability_table
 
-__all__ = ["FULL", "QUICK", "REDUCED", "SILENTLY_WRONG", "VERDICTS", "Outcome", "Trial", "stability_table", "trials"]
+__all__ = ["FULL", "QUICK", "MAIN", "SILENTLY_WRONG", "VERDICTS", "Outcome", "Trial", "stability_table", "trials"]
 
 FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, amplifying, float32, redundant)
 
 
 def trials(tier=FULL):
-    """The rows of the QUICK, REDUCED or FULL report."""
+    """The rows of the QUICK, MAIN or FULL tier."""
     return [row for family in FAMILIES for row in family() if row.tier <= tier]

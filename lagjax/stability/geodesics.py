@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.report import FULL, MAIN
 from lagjax.scenes import sphere_geodesic
-from lagjax.stability.trial import FULL, REDUCED, REFUSED, Trial, zeros
+from lagjax.stability.trial import REFUSED, Trial, zeros
 from lagjax.system import System
 
 
@@ -64,7 +65,7 @@ def geodesics():
             Trial(
                 "geodesic", name, by_angles, q0, v0, params, np.linspace(0.0, 2.1, 5), _circle_from_angles,
                 None if miss == 0 else along, observed=_position_in_space,
-                amplification=1 / miss if miss else 1.0, tier=FULL if miss else REDUCED,
+                amplification=1 / miss if miss else 1.0, tier=FULL if miss else MAIN,
             )
         )  # fmt: skip
     circle = sphere_geodesic.great_circle(*near)

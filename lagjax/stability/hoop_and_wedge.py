@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.numerics import Dopri8
+from lagjax.report import FULL, MAIN, QUICK
 from lagjax.scenes import bead_on_hoop, jacobi_elliptic, sliding_wedge
-from lagjax.stability.trial import ACCURATE, FULL, QUICK, REDUCED, REFUSED, Trial, by_parameter
+from lagjax.stability.trial import ACCURATE, REFUSED, Trial, by_parameter
 
 
 def single(tree):
@@ -34,7 +35,7 @@ def wedge():
     return [
         Trial(
             "wedge", name, sliding_wedge.system, *start, at | change, ts, _wedge_motion,
-            by_parameter(*start, at, "alpha"), tier=REDUCED if name in shown else FULL,
+            by_parameter(*start, at, "alpha"), tier=MAIN if name in shown else FULL,
         )
         for name, change in rows
     ]  # fmt: skip
@@ -74,7 +75,7 @@ def bead():
     for psi in (1.0, 2.0**-10):
         for side in (-1e-9, 1e-9):
             name, omega = f"omega = critical (1 {side:+.0e}), psi = {psi:.3g}", critical * (1 + side)
-            rows.append(swing(name, {"omega": omega}, psi, 3.7, tier=REDUCED if side > 0 else FULL))
+            rows.append(swing(name, {"omega": omega}, psi, 3.7, tier=MAIN if side > 0 else FULL))
     return by_both(rows)
 
 
@@ -96,7 +97,7 @@ def separatrix():
             Trial(
                 "separatrix", f"{distance:.0e} off the top, from there", bead_on_hoop.system, distance, 0.0, params,
                 np.linspace(0.0, 1.2 * quarter, 6), _fall, by_parameter(distance, 0.0, params, "g"), options=options,
-                tier=REDUCED if distance == 1e-8 else FULL,
+                tier=MAIN if distance == 1e-8 else FULL,
             )
         )  # fmt: skip
     for distance in (1e-2, 1e-4, 1e-8):
@@ -145,7 +146,7 @@ def float32():
                 params, np.linspace(0.0, 0.75, 5), _wedge_motion, tolerance=1e-5,
             )
         )  # fmt: skip
-    for periods, expected, tier in ((3.7, ACCURATE, REDUCED), (1000.3, None, FULL), (10000.3, None, FULL)):
+    for periods, expected, tier in ((3.7, ACCURATE, MAIN), (1000.3, None, FULL), (10000.3, None, FULL)):
         row = swing(f"pendulum, {periods:g} periods", {"omega": 0.0}, 1.0, periods, tolerance=1e-5, derived=False)
         rows.append(_in_single(row, expected, tier))
     row = swing("pendulum, tolerance 1e-9", {"omega": 0.0}, 1.0, 3.7, tolerance=1e-9, derived=False)

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.integrate import integrate
-from lagjax.stability.trial import ACCURATE, FULL, Outcome
+from lagjax.report import FULL
+from lagjax.stability.trial import ACCURATE, Outcome
 from lagjax.system import System
 
 # A step is stable if the amplitude grows by less than GROWTH in STEPS steps; |R| of Dopri8 crosses 1 steeply.

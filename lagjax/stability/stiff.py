@@ -7,8 +7,9 @@ from jaxtyping import PyTree
 
 from lagjax.mechanisms import car_axis, governor
 from lagjax.numerics import Dopri8, Radau5
+from lagjax.report import FULL, MAIN
 from lagjax.stability import oscillator
-from lagjax.stability.trial import ACCURATE, DEGRADED, FULL, REDUCED, REFUSED, Trial, zeros
+from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, Trial, zeros
 from lagjax.system import System, coordinates
 
 
@@ -93,7 +94,7 @@ def _fixed_steps():
                 "fixed step", f"{step:g}/omega on an oscillator", oscillator.oscillator, 1.0, 0.0,
                 {"omega": oscillator.OMEGA}, np.linspace(0.0, 1000 * h, 5), oscillator.exact, tolerance=1e-9,
                 method=Dopri8(), options=constant(h), periods=1000 * step / (2 * np.pi), expected=expected,
-                tier=REDUCED if expected == DEGRADED else FULL,
+                tier=MAIN if expected == DEGRADED else FULL,
             )
         )  # fmt: skip
     for step in (0.25, 6.0):

@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled
-from lagjax.report import relative_error
+from lagjax.report import FULL, relative_error
 from lagjax.system import System, coordinates
 from lagjax.work_precision import table
 
@@ -37,8 +37,6 @@ REPORTED_WITHIN = 10.0
 LANES = 0.0, 1e-3
 ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG = "accurate", "degraded", "refused", "SILENTLY WRONG"
 VERDICTS = (ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG)
-# The reports to which rows belong; each report includes the rows of the ones before it.
-QUICK, REDUCED, FULL = 0, 1, 2
 
 
 @dataclass(frozen=True)

@@ -31,9 +31,11 @@ def column_lagrangian(t, q, v, params):
 BUCKLING = (3 - np.sqrt(5)) / 2, (3 + np.sqrt(5)) / 2
 
 
-def exchange_lagrangian(t, q, v, params):
-    """Equilibria at 0 and at (mu - c)/d, which exchange their stability where they meet."""
-    return 0.5 * v**2 + 0.5 * (params["mu"] - params["c"]) * q**2 - params["d"] * q**3 / 3
+def forms_lagrangian(t, q, v, params):
+    """A unit mass with the force b μ + e + (a μ - c) q - d q² - h q³ + 3/2 s √(1 - q): branches of all simple kinds."""
+    mu, a, b, c, d, e, h, s = (params[name] for name in ("mu", *"abcdehs"))
+    potential = (b * mu + e) * q + (a * mu - c) * q**2 / 2 - d * q**3 / 3 - h * q**4 / 4
+    return 0.5 * v**2 + potential - s * jnp.sqrt(1.0 - q) ** 3
 
 
 def top_lagrangian(t, q, v, params):
@@ -104,7 +106,7 @@ def rail_pendulum_lagrangian(t, q, v, params):
 
 truss = lj.System(truss_lagrangian)
 column = lj.System(column_lagrangian)
-exchange = lj.System(exchange_lagrangian)
+forms = lj.System(forms_lagrangian)
 top = lj.System(top_lagrangian)
 ziegler = lj.System(ziegler_lagrangian, force=follower_force)
 damped_ziegler = lj.System(ziegler_lagrangian, force=follower_force, dissipation=joint_friction)
@@ -113,7 +115,11 @@ turning_pendulum = lj.System(rail_pendulum_lagrangian)
 
 TRUSS = {"a": 1.0, "h": 0.5, "k": 100.0, "P": -6.0}
 COLUMN = {"c": 3.0, "l": 2.0, "P": 0.1}
-EXCHANGE = {"mu": -1.0, "c": 0.3, "d": 1.7}
+# At μ = c/a: ±√((a μ - c)/h) branch off from 0, and (a μ - c)/d crosses it.
+FORMS = {"mu": -1.0} | dict.fromkeys("abcdehs", 0.0)
+PITCHFORK, EXCHANGE = FORMS | {"a": 1.25, "c": 0.5, "h": 2.0}, FORMS | {"a": 1.25, "c": 0.5, "d": 1.75}
+# It folds where c + 3 h q² = 0; and it is lost at q = 1.
+FOLDS, ENDS = FORMS | {"b": 1.25, "c": -0.5, "e": 0.0625, "h": 2.0}, FORMS | {"mu": 0.0, "b": 1.0, "c": 1.0, "s": 0.1}
 TOP = {"I1": 2.0, "I3": 0.7, "Mgl": 3.0}
 UPRIGHT = {"a": 0.0, "b": 0.0, "spin": 0.0}
 ZIEGLER = {"m": 1.3, "l": 0.7, "c": 2.0, "b": 0.2, "P": 0.1}

@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis.explain import Explanation, _first_answer, equations_of, explained
+from lagjax.system import coordinates
+from lagjax.system.model import model_of
 
 
 def lagrangian(t, q, v, params):
@@ -25,59 +28,85 @@ def edge(t, q, v, params):
     return 3.0 - q["x"]
 
 
-@pytest.fixture(scope="module")
-def explanation():
-    """The explanation of a stone that slides on the table at speed 2."""
-    touches = lj.touches(lambda t, q, params: q["y"], 0.5)
-    switches = [
-        lj.Switch("flying", to="flying", when=touches, rest="sliding"),
-        lj.Switch("sliding", to="flying", when=edge),
-        lj.Switch("sliding", to="flying", when=lj.releases("table")),
-    ]
-    return lj.explain(lj.Hybrid(PHASES, switches), 0.0, {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0})
+SWITCHES = [
+    lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q["y"], 0.5), rest="sliding"),
+    lj.Switch("sliding", to="flying", when=edge),
+    lj.Switch("sliding", to="flying", when=lj.releases("table")),
+]
+STATE = {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0}
 
 
-def test_phases_and_guards(explanation):
-    """Degrees of freedom of each phase, guards with its own multipliers, and phases without a way in or out."""
-    assert [found.degrees_of_freedom for found in explanation.phases.values()] == [2, 1, 2]
-    assert [(phase, to) for phase, to, _, _ in explanation.switches] == [
+def by_hand(freedoms, *rows):
+    """What is said of a phase."""
+    return Explanation(("x", "y"), (), freedoms, freedoms, (), "definite", None, None, (("at", "t = 0"), *rows))
+
+
+def of_phases(switches=SWITCHES, off=()):
+    """The explanation of a stone at speed 2 on the table, from what is said of its phases; `off` the table."""
+    said = {"flying": by_hand(2), "sliding": by_hand(1, *off), "lost": by_hand(2)}
+    return explained(lj.Hybrid(PHASES, switches), said, coordinates.state(0.0, *STATE, None))
+
+
+def check(found):
+    """Guards have the values by each phase's own multipliers; phases without a way in or out are named."""
+    assert [explanation.degrees_of_freedom for explanation in found.phases.values()] == [2, 1, 2]
+    assert [(phase, to) for phase, to, _, _ in found.switches] == [
         ("flying", ("flying", "sliding")), ("sliding", ("flying",)), ("sliding", ("flying",)),
     ]  # fmt: skip
-    assert [value for *_, value in explanation.switches] == [0.0, 2.0, 10.0]
-    assert explanation.unreachable == explanation.final == ("lost",)
-    words = repr(explanation)
+    assert [value for *_, value in found.switches] == [0.0, 2.0, 10.0]
+    assert found.unreachable == found.final == ("lost",)
+    words = repr(found)
     assert "-> flying, when edge reaches zero, now 2" in words
-    assert "no switch leads here; no switch leaves it" in words and "held by 'table'" in words
+    assert "no switch leads here; no switch leaves it" in words
 
 
-def test_elsewhere_guards_have_no_value():
-    """The guards of a phase to which the state does not belong are not evaluated."""
-    hybrid = lj.Hybrid(PHASES, [lj.Switch("sliding", to="flying", when=lj.releases("table"))])
-    found = lj.explain(hybrid, 0.0, {"x": 1.0, "y": 5.0}, {"x": 2.0, "y": 0.0})
+def test_phases_and_guards():
+    """Guards with the multipliers of a phase, and phases without a way in or out; off a phase they have no value."""
+    found = of_phases()
+    check(found)
+    axis = found.plot().axes[0]
+    words = [text.get_text() for text in axis.texts]
+    assert [word for word in words if word] == ["touches", "touches", "edge", "releases", *PHASES]
+    elsewhere = of_phases(SWITCHES[2:], off=[("off the constraints", "by 5")])
+    assert elsewhere.switches[0][3] is None and "now" not in repr(elsewhere)
+
+
+@pytest.mark.slow
+def test_explained_phases():
+    """The same of phases that are explained, with their constraints; off a constraint its guard has no value."""
+    found = lj.explain(lj.Hybrid(PHASES, SWITCHES), 0.0, *STATE)
+    check(found)
+    assert "held by 'table'" in repr(found)
+    found = lj.explain(lj.Hybrid(PHASES, SWITCHES[2:]), 0.0, {"x": 1.0, "y": 5.0}, STATE[1])
     assert found.switches[0][3] is None and "now" not in repr(found)
 
 
-def test_picture(explanation):
-    """The picture has a name for each phase, and an arrow for each switch."""
-    axis = explanation.plot().axes[0]
-    words = [text.get_text() for text in axis.texts]
-    assert [word for word in words if word] == ["touches", "touches", "edge", "releases", *PHASES]
+def springs(count, at_once):
+    """Equal springs in a row, in one term for all or in one for each."""
+
+    def lagrangian(t, q, v, params):
+        if at_once:
+            return 0.5 * v @ v - 0.25 * jnp.sum((q[1:] - q[:-1]) ** 4)
+        return 0.5 * v @ v - sum(0.25 * (q[i + 1] - q[i]) ** 4 for i in range(count - 1))
+
+    return lj.System(lagrangian)
 
 
-def test_it_says_what_a_first_answer_costs():
-    """One term for `vmap` is a fraction of the operations of forty terms in a loop, and of the time; twin: of two."""
+@pytest.mark.parametrize(
+    ("count", "said"), [(12, _first_answer), pytest.param(40, None, marks=pytest.mark.exhaustive)], ids=["few", "many"]
+)
+def test_it_says_what_a_first_answer_costs(count, said):
+    """One term for `vmap` is a fraction of the operations of many terms in a loop, and of the time; twin: of two."""
 
-    def springs(count):
-        def in_a_loop(t, q, v, params):
-            return 0.5 * v @ v - sum(0.25 * (q[i + 1] - q[i]) ** 4 for i in range(count - 1))
-
-        return lj.System(in_a_loop), np.linspace(0.0, 1.0, count), np.zeros(count)
-
-    def seconds(system, q, v):
-        row = dict(lj.explain(system, 0.0, q, v).rows)["first answer"]
+    def seconds(count, at_once):
+        q, system = np.linspace(0.0, 1.0, count), springs(count, at_once)
+        if said is None:
+            row = dict(lj.explain(system, 0.0, q, 0 * q).rows)["first answer"]
+        else:
+            s = coordinates.state(0.0, q, 0 * q, None)
+            row = said(equations_of(model_of(system, *s), fast=True), s)
         assert "operations" in row
         return float(row.split()[1])
 
-    (many, q, v), (few, *two) = springs(40), springs(2)
-    once = lj.System(lambda t, q, v, params: 0.5 * v @ v - 0.25 * jnp.sum((q[1:] - q[:-1]) ** 4))
-    assert seconds(many, q, v) > 2 * seconds(once, q, v) and seconds(few, *two) <= seconds(once, q, v)
+    once = seconds(count, True)
+    assert seconds(count, False) > 2 * once and seconds(2, False) <= once

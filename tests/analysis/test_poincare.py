@@ -10,7 +10,8 @@ from scipy import special
 
 import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
-from tests.systems import PARAMS, double_pendulum, pendulum
+from tests.by_hand import by_hand
+from tests.systems import PARAMS, pendulum
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 bottom = lambda t, q, v, p: q
@@ -80,20 +81,24 @@ def test_derivatives_of_the_period():
         np.testing.assert_allclose(found, slopes, rtol=1e-8)
 
 
-def by_hand(t):
+def crossings(t, q=None, v=None, count=None):
     """Crossings at these times."""
-    return lj.Crossings(t, t, t, {}, jnp.sum(jnp.isfinite(t)), jnp.asarray(False))
+    q, v = (t if x is None else x for x in (q, v))
+    return lj.Crossings(t, q, v, {}, np.asarray(len(t) if count is None else count), np.asarray(False))
 
 
 def test_nothing_beyond_the_last_one_is_differentiated():
     """Gradients of a sum of known periods are exact despite NaN times; twin: through a root of squares they are NaN."""
-    t = jnp.array([1.0, 2.5, 4.5, jnp.nan, jnp.nan])
-    total = lambda periods: jax.grad(lambda t: jnp.sum(periods(t)[:2]))(t)
-    np.testing.assert_array_equal(total(lambda t: lj.periods(by_hand(t))), [-1.0, 0.0, 1.0, 0.0, 0.0])
-    assert np.isnan(total(lambda t: jnp.sqrt(jnp.diff(t) ** 2))).any()
-    # A motion that runs backward has the same periods.
-    np.testing.assert_array_equal(lj.periods(by_hand(-t))[:2], [1.5, 2.0])
-    np.testing.assert_array_equal(jax.vmap(lambda t: lj.periods(by_hand(t)))(t[None])[0, :2], [1.5, 2.0])
+    t = np.array([1.0, 2.5, 4.5, np.nan, np.nan])
+    periods = lambda t: lj.periods(crossings(t))
+    slope = lambda periods, t: jax.grad(lambda t: jnp.sum(periods(t)[:2]))(t)
+    # A motion that runs backward has the same periods, and so have lanes.
+    right, wrong, backward, lanes = jax.jit(lambda t: (
+        slope(periods, t), slope(lambda t: jnp.sqrt(jnp.diff(t) ** 2), t), periods(-t), jax.vmap(periods)(t[None])
+    ))(t)  # fmt: skip
+    np.testing.assert_array_equal(right, [-1.0, 0.0, 1.0, 0.0, 0.0])
+    assert np.isnan(wrong).any()
+    np.testing.assert_array_equal([backward[:2], lanes[0, :2]], [[1.5, 2.0]] * 2)
 
 
 def test_what_is_printed():
@@ -104,7 +109,9 @@ def test_what_is_printed():
     assert f"crossings   {int(section.count)}, at t = {0.75 * period:.9g}, " in words
     assert f"period      {period:.9g} on average" in words and "standard deviation" in words
     assert "uncertain   no" in words and "error       of the times at most" in words
-    jax.eval_shape(lambda q0: print(repr(swing(q0, 1.25))) or q0, 2.0)
+    traced = []
+    jax.eval_shape(lambda section: traced.append(repr(section)), section)
+    assert traced == ["Poincaré section, being traced, room for 500 crossings"]
 
 
 # Central motions.
@@ -125,6 +132,7 @@ def radial(r, speed, mu, k, span):
     return lj.integrate(central, *start, {"mu": mu, "k": k}, ts=[0.0, span], events=TURNS, **TIGHT).events
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (0.0, 0.75, 1.25), (1.25, 0.75, 0.5), (0.5, 0.25, 1.5)])
 def test_radial_turning_points(mu, k, speed):
     """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
@@ -147,6 +155,7 @@ def kepler(speed, mu):
     return 2 * jnp.pi * (2 - speed**2 / mu) ** -1.5 / jnp.sqrt(mu)
 
 
+@pytest.mark.exhaustive
 def test_radial_periods():
     """Radial periods obey Kepler's third law, or are half a spring's period; twin: with both forces neither holds."""
     period = lambda mu, k, speed: np.asarray(lj.periods(radial(1.0, speed, mu, k, 30.0)["nearest"]))[:2]
@@ -217,7 +226,7 @@ def test_more_than_there_is_room_for():
     np.testing.assert_allclose(section.t[:11], room.t[:11], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes():
     """A batch equals a loop over its lanes, and prints and draws them."""
     starts = jnp.array([0.125, -0.1, 0.2])
@@ -236,21 +245,42 @@ def test_lanes():
     assert len({line.get_color() for line in axis.lines}) == 3
 
 
+def in_a_plane(seed=0, count=4):
+    """A section x = 0 of given numbers, with room for five, and y and its velocity there."""
+    y, vy = numbers = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 5))
+    numbers[:, count:] = np.nan
+    state = lambda of_y: {"x": 0.0 * of_y, "y": of_y}
+    recorded = {"section": crossings(1.0 + np.arange(5) + 0 * y, state(y), state(vy), count)}
+    ends = state(np.array([0.5, 0.25])), state(np.array([-1.0, 1.0]))
+    return lj.PoincareSection(by_hand(henon_heiles, [0.0, 9.0], *ends, events=recorded)), numbers
+
+
 def test_pictures():
-    """One panel per coordinate that the section does not hold fixed, or the requested one."""
-    section = orbit(0.125)
+    """One panel per coordinate that the section does not hold fixed, or the requested one; a note if some are lost."""
+    section, numbers = in_a_plane()
     (axis,) = section.plot().axes
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("q.y", "v.y")
-    found = section.crossings.found()
-    np.testing.assert_array_equal(axis.lines[0].get_xydata(), np.stack([found.q["y"], found.v["y"]], axis=1))
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("q.y", "v.y") and section.plot().get_suptitle() == ""
+    np.testing.assert_array_equal(axis.lines[0].get_xydata(), numbers.T[:4])
     (axis,) = section.plot(x="t", y="q.x").axes
-    np.testing.assert_array_equal(axis.lines[0].get_xydata(), np.stack([found.t, found.q["x"]], axis=1))
+    np.testing.assert_array_equal(axis.lines[0].get_xydata(), [(t, 0.0) for t in range(1, 5)])
     with pytest.raises(ValueError, match="to plot 'q.z': there is none; there are t, q.x, q.y"):
         section.plot(x="q.z", y="v.y")
     with pytest.raises(ValueError, match="only one of them was given"):
         section.plot(x="q.y")
     with pytest.raises(ValueError, match="did not cross the section"):
-        orbit(0.125, span=1.0).plot()
+        in_a_plane(count=0)[0].plot()
+    lost, _ = in_a_plane(count=19)
+    assert "19, of which the first 5 are kept" in repr(lost) and "kept" not in repr(section)
+    assert "the first 5 of up to 19 crossings" in lost.plot().get_suptitle()
+
+
+def test_lanes_in_words_and_pictures():
+    """A batch prints the range of its counts, and draws each lane in its colour."""
+    lanes = jax.tree.map(lambda *x: np.stack(x), *(in_a_plane(i, count)[0] for i, count in enumerate((4, 3, 2))))
+    words = repr(lanes)
+    assert "lanes       3" in words and "2 to 4 a lane" in words and "period      1 on average, 1 to 1" in words
+    (axis,) = lanes.plot().axes
+    assert len({line.get_color() for line in axis.lines}) == 3
 
 
 def test_angles_within_half_turns():
@@ -264,6 +294,7 @@ def driven_lagrangian(t, q, v, p):
     return 0.5 * v**2 - 0.5 * q**2 + p["force"] * q * jnp.cos(p["omega"] * t)
 
 
+@pytest.mark.slow
 def test_once_a_period_of_the_drive():
     """The steady motion q = f cos(ωt) / (1 - ω²) is one point of the section; twin: with free motion added it moves."""
     driven, f, omega = lj.System(driven_lagrangian), 0.5, 0.625
@@ -300,20 +331,21 @@ def test_refused_in_words(given, error, words):
 
 
 def test_refused_elsewhere():
-    """Refused: turning points without a name among several coordinates, periods of other things, unrecorded events."""
-    start = jnp.zeros(2), jnp.ones(2)
+    """Turning points are of a velocity by name, which several need; periods of other things, unrecorded events."""
+    velocity = lambda name, v: lj.turning_points(name).guard(0.0, v, v, None)
+    assert velocity("r", {"phi": 1.0, "r": 2.0}) == 2.0 and velocity("q[1]", np.array([1.0, 2.0])) == 2.0
     with pytest.raises(ValueError, match=r"There are q\[0\], q\[1\]") as raised:
-        events = {"turn": lj.turning_points()}
-        lj.integrate(
-            double_pendulum, *start, dict.fromkeys(("m1", "m2", "l1", "l2", "g"), 1.0), ts=[0.0, 1.0], events=events
-        )
+        velocity(None, np.ones(2))
     assert 'lj.turning_points("q[0]")' in str(raised.value)
+    with pytest.raises(ValueError, match="turning points of 'x': there is none; there are phi, r"):
+        velocity("x", {"phi": 1.0, "r": 2.0})
     with pytest.raises(TypeError, match="by its name, not as int"):
         lj.turning_points(0)
+    assert [getattr(lj.turning_points("r", direction=1), name) for name in ("direction", "terminal")] == [1, False]
     section = swing(2.0, PARAMS["l"])
     with pytest.raises(TypeError, match="not from a Trajectory"):
         lj.periods(section.trajectory)
     with pytest.raises(ValueError, match="only one crossing was kept"):
-        lj.periods(by_hand(jnp.ones(1)))
+        lj.periods(crossings(np.ones(1)))
     with pytest.raises(ValueError, match="no event 'top'; recorded: 'section', 'turn'"):
         lj.PoincareSection(section.trajectory, "top")

@@ -7,11 +7,16 @@ import pytest
 
 import lagjax as lj
 
-ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
-bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))
-zeno = lj.Hybrid({"flying": ball}, [bounce], most_switches=50)
-PARAMS = {"g": 10.0}
+# Two balls that attract each other; slow impacts halve the speed, those faster than 100 are elastic.
+attracted = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * (q[1] - q[0]))
+hit = lj.touches(lambda t, q, p: q[1] - q[0] - 0.2, lambda speed: jnp.where(speed > 100.0, 1.0, 0.5))
+zeno = lj.Hybrid({"flying": attracted}, [lj.Switch("flying", to="flying", when=hit)], most_switches=50)
 TS = np.array([0.0, 1.0, 3.5])
+
+
+def thrown(q, v, g=0.0, **options):
+    """A motion of the two balls."""
+    return lj.integrate(zeno, np.array(q), np.array(v), {"g": g}, ts=TS, throw=False, **options)
 
 
 def finite_after(traj, t):
@@ -31,30 +36,49 @@ def finite_after(traj, t):
 
 
 def test_bounces_that_accumulate():
-    """A ball (e = 0.5, from 5 at g = 10) bounces infinitely often until t = 3; from there on nothing is finite.
+    """From 5 apart, at a relative acceleration of 10, infinitely many impacts until t = 3; from there nothing is finite.
 
-    Twin: with e = 1 it bounces three times until 3.5 and is known throughout.
+    Twin: at speeds at which they are elastic, they hit three times until 3.5, and are known throughout.
     """
-    traj = lj.integrate(zeno, 5.0, 0.0, PARAMS, ts=TS, throw=False)
+    traj = thrown([0.0, 5.2], [0.0, 0.0], 5.0)
     assert traj.result == lj.RESULTS.too_many_switches and np.isinf(traj.scaled_error)
     np.testing.assert_allclose(traj.end.t, 3.0, rtol=1e-9)
     assert np.isfinite(traj.q[:2]).all() and not finite_after(traj, 3.0)
     with pytest.raises(RuntimeError, match="(?s)infinitely many switches.*each takes 0.5 of.*about t = 3\\b"):
-        lj.integrate(zeno, 5.0, 0.0, PARAMS, ts=TS)
+        lj.integrate(zeno, np.array([0.0, 5.2]), np.zeros(2), {"g": 5.0}, ts=TS)
     with pytest.raises(ValueError, match="ended at t = 3"):
         traj.at(3.2)
-    elastic = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, 1.0))])
-    traj = lj.integrate(elastic, 5.0, 0.0, PARAMS, ts=TS)
-    np.testing.assert_allclose(traj.q, [5.0, 0.0, 5.0 * (1 - 0.25)], atol=1e-8)
+    fast = np.asarray(thrown([0.0, 5e4 + 0.2], [0.0, 0.0], 5e4).q)
+    np.testing.assert_allclose(fast[:, 1] - fast[:, 0] - 0.2, 5e4 * np.array([1.0, 0.0, 0.75]), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("q", "v", "right", "count"),
+    [
+        # Gaps of -2.8e-17 and +5.6e-17, and none that closes.
+        ([0.1, 0.3], [0.0, 0.0], [0.0, 0.0], 0),
+        ([0.9, 1.1], [0.0, 0.0], [0.0, 0.0], 0),
+        ([0.9, 1.1], [-200.0, 0.0], [-200.0, 0.0], 0),
+        # Twin: what closes hits at once.
+        ([0.1, 0.3], [200.0, 0.0], [0.0, 200.0], 1),
+        ([0.9, 1.1], [200.0, -200.0], [-200.0, 200.0], 1),
+    ],
+)
+def test_two_balls_that_touch(q, v, right, count):
+    """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
+    traj = thrown(q, v)
+    np.testing.assert_allclose(traj.v[-1], right, atol=200 * 1e-14)
+    assert isinstance(traj, lj.HybridTrajectory)
+    assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
 
 
 @pytest.mark.exhaustive
 def test_bounces_that_accumulate_in_lanes():
     """The same for lanes, under jit, and in a sweep."""
-    run = lambda h: lj.integrate(zeno, h, 0.0, PARAMS, ts=TS, throw=False)
+    run = lambda h: lj.integrate(zeno, jnp.stack([0.0 * h, h + 0.2]), jnp.zeros(2), {"g": 5.0}, ts=TS, throw=False)
     traj = jax.jit(jax.vmap(run))(np.array([5.0, 4.0]))
     assert np.isnan(traj.q[:, 2]).all() and np.isinf(traj.scaled_error).all() and np.isfinite(traj.q[:, 0]).all()
-    swept = lj.sweep(lambda point: run(point["h"]).q[-1], {"h": np.array([5.0, 4.0])}, progress=False)
+    swept = lj.sweep(lambda point: run(point["h"]).q[-1, 1], {"h": np.array([5.0, 4.0])}, progress=False)
     assert np.isnan(swept.values).all()
 
 
@@ -66,6 +90,7 @@ gaps = [
 cradle = lj.Hybrid({"fly": row}, gaps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "q, v, right, count",
     [
@@ -79,7 +104,7 @@ cradle = lj.Hybrid({"fly": row}, gaps)
         ([0.1, 0.3, 0.5], [1.0, 0.0, -1.0], [-1.0, 0.0, 1.0], 3),
     ],
 )
-def test_balls_that_touch(q, v, right, count):
+def test_three_balls_that_touch(q, v, right, count):
     """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
     traj = lj.integrate(cradle, np.array(q), np.array(v), ts=[0.0, 0.5])
     np.testing.assert_allclose(traj.v[-1], right, atol=1e-14)
@@ -87,6 +112,7 @@ def test_balls_that_touch(q, v, right, count):
     assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
 
 
+@pytest.mark.slow
 def test_steps_that_collapse():
     """A fall into a centre: nothing is finite after the failure; at(t) refuses."""
     fall = lj.System(lambda t, q, v, p: 0.5 * v**2 + 1.0 / q)

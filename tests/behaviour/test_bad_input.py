@@ -40,8 +40,8 @@ def test_no_numbers_in_the_start():
 
 def test_nan_in_the_start():
     """A NaN coordinate is named."""
-    with refusal(ValueError, "'theta' of v0 is nan"):
-        lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0, "theta": np.nan}, ts=TS)
+    with refusal(ValueError, "'y' of v0 is nan"):
+        lj.integrate(rod_pendulum, {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": np.nan}, PARAMS, ts=TS)
 
 
 def test_start_off_the_constraint():

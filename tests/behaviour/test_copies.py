@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.systems import motion as motion_of
 
 TS = np.linspace(0.0, 1.0, 4)
 WAYS = {
@@ -57,11 +58,22 @@ def same(found, motion):
     np.testing.assert_allclose(found.q["x"], np.cos(2.0 * TS), atol=1e-8)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_trajectories(way):
+def test_trajectories():
     """A copied trajectory knows its system, and JAX treats both as equal."""
-    motion = swing(2.0)
-    same(WAYS[way](motion), motion)
+    motion = motion_of("rod pendulum")
+    for way, copied in WAYS.items():
+        found = copied(motion)
+        assert shown(found) == shown(motion) and found.system == motion.system, way
+        assert jax.tree.structure(found) == jax.tree.structure(motion) and found.params == motion.params
+        assert bool(found.result == lj.RESULTS.successful)
+        np.testing.assert_array_equal(found.multipliers["rod"], motion.multipliers["rod"])
+
+
+@pytest.mark.slow
+def test_trajectories_with_numbers_that_are_no_arrays():
+    """A copied trajectory keeps a whole number in `params`, and is the closed form."""
+    for copied in WAYS.values():
+        same(copied(swing(2.0)), swing(2.0))
 
 
 @pytest.mark.slow

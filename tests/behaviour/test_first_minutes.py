@@ -15,6 +15,7 @@ import scipy.special
 import sympy
 
 import lagjax as lj
+from tests.systems import motion
 
 TS = np.linspace(0.0, 1.0, 5)
 PARAMS = {"m": 1.5, "g": 9.81}
@@ -249,7 +250,7 @@ MISTAKES = {
     "if in a sweep": (lambda: swept(lambda p: 1.0 if p["m"] > 1 else 0.0), TYPE, "branches on", "jnp.where"),
     "float in a sweep": (lambda: swept(lambda p: float(p["m"])), TYPE, "Python number", "leave out float"),
     "a film of q alone": (
-        lambda: move(swing).animate(lambda q: (q["theta"], 0.0)), TYPE, r"positions\(t, q, params\)",
+        lambda: motion("rod pendulum").animate(lambda q: (q["x"], 0.0)), TYPE, r"positions\(t, q, params\)",
         r"def f\(t, q, params\)"),
     "the state of the explanation": (
         lambda: lj.explain(lj.System(by_numpy), 0.0, *START, PARAMS), TYPE, NUMPY, "jnp.cos"),

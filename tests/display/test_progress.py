@@ -1,12 +1,13 @@
 """Progress is shown: the wait for the compiler once, and a meter."""
 
+import importlib.util
 from contextlib import nullcontext
 
 import jax
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.solve import programs
+from lagjax.integrate.solve import one_motion, programs
 from tests.systems import PARAMS, TS, pendulum
 
 
@@ -26,6 +27,15 @@ def test_the_wait_for_the_compiler_is_told_once(monkeypatch):
     assert told[1:] == [(False, "compiling")]
 
 
+def test_meters(monkeypatch):
+    """A meter of tqdm, or of text without it; twin: none is shown without being asked for."""
+    kinds = lambda: [type(one_motion._progress_meter(progress)).__name__ for progress in (True, False, None)]
+    assert kinds() == ["TqdmProgressMeter", "NoProgressMeter", "NoProgressMeter"]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert kinds() == ["TextProgressMeter", "NoProgressMeter", "NoProgressMeter"]
+
+
+@pytest.mark.slow
 def test_progress_is_shown(capfd):
     """`progress=True` shows a meter."""
     jax.block_until_ready(lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, progress=True))

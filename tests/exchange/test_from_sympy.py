@@ -103,7 +103,7 @@ def test_constraints_of_lagranges_method():
     np.testing.assert_allclose(multipliers["constraint1"], -pull / (2 * 1.25), rtol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_knife_edge():
     """A blade on a slope turns and slides on a cycloid; twin: without its constraint it slides straight down."""
     omega, slope, J = 2.0, 9.75 * np.sin(0.5), sp.Symbol("J")

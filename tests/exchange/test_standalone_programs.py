@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ from jax import export
 
 import lagjax as lj
 from lagjax.exchange.standalone_programs import plain
-from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
+from tests.systems import HORIZONTAL, PARAMS, motion, pendulum, rod_pendulum
 
 TS = np.linspace(0.0, 1.0, 5)
 # Reads each program and the arguments of its calls, runs them, and writes the results.
@@ -112,7 +113,7 @@ def test_another_process_without_lagjax(tmp_path):
         assert found["q"].shape == (len(start), len(TS)) and not found["result"].any()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_what_was_written():
     """With `vjp_order=1` the derivative is exported as well, and equals that of the motion here."""
     exported = lj.export(lambda angle, params: swing(angle, 0.5, params).q[-1], 1.0, PARAMS)
@@ -123,6 +124,25 @@ def test_derivatives_of_what_was_written():
         np.testing.assert_allclose(x, y, rtol=1e-12)
 
 
+def test_a_motion_is_a_dictionary():
+    """Whatever a trajectory has is an array by name, its result a code; a failing check gives NaN."""
+    traj = motion("pendulum")
+    codes = lj.RESULTS.successful._value, lj.RESULTS.max_steps_reached._value
+
+    def run(angle):
+        new = angle * traj.q, jnp.where(angle > 1.5, codes[1], codes[0])
+        return eqx.tree_at(lambda x: (x.q, x.result._value), traj, new), eqx.error_if(angle, angle > 2, "too far")
+
+    exported = lj.export(run, 1.0)
+    for angle, code, words in ((1.0, codes[0], "successful"), (1.75, codes[1], "The maximum number of solver steps")):
+        found, checked = exported.call(angle)
+        np.testing.assert_array_equal(found["q"], angle * np.asarray(traj.q))
+        np.testing.assert_array_equal(found["t"], traj.t)
+        assert found["result"] == code and checked == angle and lj.result_codes()[int(code)].startswith(words)
+    assert np.isnan(exported.call(3.0)[1])
+
+
+@pytest.mark.slow
 def test_failures_are_codes():
     """A motion that would raise gives a code instead and keeps its first outputs; a failing check gives NaN."""
 
@@ -150,7 +170,7 @@ def prints(x):
 
 
 REFUSED = {
-    "no function": (lambda: lj.export(swing(0.0, 0.0, PARAMS)), "takes a function, not Trajectory"),
+    "no function": (lambda: lj.export(motion("pendulum")), "takes a function, not Trajectory"),
     "a class": (lambda: lj.export(lambda x: x, lj.RESULTS.successful), "an argument of an exported program"),
     "a system": (lambda: lj.export(lambda system, x: x, pendulum, 1.0), "and not System"),
     "text": (lambda: lj.export(lambda x: x, {"a": "text"}), "and not str"),
@@ -185,16 +205,27 @@ def test_whole_numbers_and_structures():
     assert found == 0.75 and whole.dtype == jnp.int64 and nothing is None
 
 
+class Layer(eqx.Module):
+    """A network of one layer."""
+
+    weights: np.ndarray
+    activation: Callable
+
+    def __call__(self, x):
+        return jnp.sum(self.activation(self.weights * x))
+
+
 def test_weights_are_arguments():
     """A network among the arguments is a list of arrays there: other weights give what they give here; twin: others."""
-    first, other = (eqx.nn.MLP(1, "scalar", 3, 1, jnp.tanh, key=jax.random.key(i)) for i in (0, 1))
+    first, other = (Layer(np.array(weights), jnp.tanh) for weights in ([0.5, -0.25], [1.0, 2.0]))
 
     def run(x, params):
         return {"y": params["net"](x) + params["k"]}
 
-    program = lj.export(run, jnp.ones(1), {"net": first, "k": 1.0})
+    program = lj.export(run, np.ones(2), {"net": first, "k": 1.0})
     arrays = {"net": jax.tree.leaves(eqx.filter(other, eqx.is_array)), "k": 2.0}
-    found = export.deserialize(bytearray(program.serialize())).call(0.5 * jnp.ones(1), arrays)["y"]
-    assert np.isclose(found, other(0.5 * jnp.ones(1)) + 2.0) and not np.isclose(found, first(0.5 * jnp.ones(1)) + 2.0)
+    found = export.deserialize(bytearray(program.serialize())).call(0.5 * np.ones(2), arrays)["y"]
+    of = lambda net: np.sum(np.tanh(0.5 * net.weights)) + 2.0
+    assert np.isclose(found, of(other)) and not np.isclose(found, of(first))
     with pytest.raises(TypeError, match="must be a number or an array"):
-        lj.export(run, jnp.ones(1), {"net": eqx.nn.Identity(), "k": 1.0})
+        lj.export(run, np.ones(2), {"net": eqx.nn.Identity(), "k": 1.0})

@@ -11,15 +11,15 @@ import pytest
 
 import lagjax as lj
 from lagjax.files import npz
-from tests.integrate.trajectory.test_save import TS, springs
+from tests.systems import motion, pendulum
 
 
 def test_files_that_are_not_whole(tmp_path):
     """Files that are missing, cut off, changed, of another kind or a newer version are refused with the reason."""
-    path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
+    path, traj = tmp_path / "x.npz", motion("pendulum")
     traj.save(path)
     whole = path.read_bytes()
-    place = whole.index(np.asarray(traj.q["x"]).tobytes())
+    place = whole.index(np.asarray(traj.q).tobytes())
     changed = whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :]
     for content, words in (
         (changed, "is damaged: Bad CRC-32"),
@@ -45,12 +45,12 @@ def test_files_that_are_not_whole(tmp_path):
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path)
     path.write_bytes(whole)
-    assert lj.load_trajectory(path, springs).q["x"][0] == 1.0
+    assert lj.load_trajectory(path, pendulum).q[0] == 1.0
 
 
 def test_a_failure_leaves_the_file_of_before(tmp_path, monkeypatch):
     """If writing fails, the new file leaves nothing and the old one is intact; folders that do not exist are named."""
-    path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
+    path, traj = tmp_path / "x.npz", motion("pendulum")
     traj.save(path)
     before = path.read_bytes()
 
@@ -85,10 +85,10 @@ files.write(sys.argv[1], "trajectory", {}, {"a": np.zeros(1), "b": np.zeros(1000
 @pytest.mark.slow
 def test_a_killed_process_leaves_the_file_of_before(tmp_path):
     """A process killed while writing leaves the previous file, and the next write succeeds."""
-    path, traj = tmp_path / "x.npz", lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS)
+    path, traj = tmp_path / "x.npz", motion("pendulum")
     traj.save(path)
     before = path.read_bytes()
     assert subprocess.run([sys.executable, "-c", KILLED, str(path)]).returncode == -9
     assert path.read_bytes() == before and len(os.listdir(tmp_path)) == 2
     traj.save(path)
-    assert lj.load_trajectory(path, springs).q["x"][0] == 1.0
+    assert lj.load_trajectory(path, pendulum).q[0] == 1.0

@@ -5,8 +5,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.fit.problem import residuals
+from lagjax.fit.problem.arguments import problem_of
 from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions, rolling_hoop, sliding_wedge, sphere_geodesic
 
 
@@ -21,6 +24,12 @@ class Case(NamedTuple):
     ts: np.ndarray
     measured: Any
     sigma: dict
+
+    def problem(self, measured, **options):
+        """The arrays of a fit."""
+        record = lj.Record(self.ts, **measured, q0=self.q0, v0=self.v0, sigma=self.sigma)
+        nothing = dict(observe=None, bounds=None, priors=None, loss="squares", window=None)
+        return problem_of(self.system, record, self.guess(), sorted(self.free), **nothing, options=options)
 
     def truth(self):
         """The true motion."""
@@ -45,6 +54,27 @@ class Case(NamedTuple):
         return jax.tree.unflatten(structure, noisy)
 
 
+# Fits of it take their motions from a formula, `in_closed_form`; integrated it would be NaN.
+formula = lj.System(lambda t, q, v, params: np.nan * v)
+Motion = NamedTuple("Motion", [(name, Any) for name in ("t", "q", "v", "multipliers", "end", "result", "params")])
+End = NamedTuple("End", [(name, Any) for name in "tqv"])
+
+
+def in_closed_form(monkeypatch, motion):
+    """Let the fits of `formula` take q and v from `motion(t, q0, v0, params)`: no solver is compiled.
+
+    A motion with NaN has failed.
+    """
+
+    def solved(system, q0, v0, params, *, ts, **options):
+        q, v = motion(ts, q0, v0, params)
+        well = jnp.all(jnp.isfinite(jnp.stack(jax.tree.leaves(q))))
+        ended = lj.RESULTS.where(well, lj.RESULTS.successful, lj.RESULTS.not_finite)
+        return Motion(ts, q, v, {}, End(ts[-1], *jax.tree.map(lambda x: x[-1], (q, v))), ended, params)
+
+    monkeypatch.setattr(residuals, "integrate", solved)
+
+
 def noisy(x, sigma=0.01, seed=0):
     """Values with normal errors."""
     return x + sigma * np.random.default_rng(seed).normal(size=x.shape)
@@ -62,6 +92,15 @@ def air(t, q, v, params):
 
 pendulum = lj.System(swing, dissipation=air)
 PENDULUM = {"m": 1.0, "l": 1.25, "g": 9.81, "c": 0.05}
+
+
+def swung(ts, q0, v0, params):
+    """Its angle and rate at times, by SciPy."""
+    m, l, g, c = (params[name] for name in "mlgc")
+    field = lambda t, y: [y[1], -g / l * np.sin(y[0]) - c / (m * l**2) * y[1]]
+    return solve_ivp(field, ts[[0, -1]], [q0, v0], "DOP853", ts, rtol=1e-13, atol=1e-14).y
+
+
 # Measurements of the pendulum, and what is not known of it.
 TS = np.linspace(0.0, 5.0, 100)
 GUESS = PENDULUM | {"l": 1.4, "c": 0.1}

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.files import tree_json
+from lagjax.files.table import Table
 
 T = np.linspace(0.0, 3.0, 16)
 
@@ -124,6 +126,18 @@ def with_networks(t, q, v, params):
 
 
 @pytest.mark.slow
+def test_networks_alone():
+    """Networks of eight kinds come back from JSON and arrays; twin: without a class of the user's they do not."""
+    writer, nets = tree_json.Writer(), networks()
+    node = writer.down(nets, "net")
+    read = lambda *classes: tree_json.Reader(dict(writer.arrays).pop, table=Table(classes)).up(node)
+    again = read(Own)
+    assert eqx.tree_equal(nets, again) and again["own"].activation is jnp.sin
+    with pytest.raises(ValueError, match="(?s)class .*Own"):
+        read()
+
+
+@pytest.mark.exhaustive
 def test_networks(tmp_path):
     """A fit and a motion with networks of eight kinds come back and go on; twin: without a class of the user's, not."""
     path, system, params = tmp_path / "fit.npz", lj.System(with_networks), {"net": networks(), "k": 3.5}

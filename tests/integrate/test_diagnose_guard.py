@@ -26,8 +26,9 @@ def moved(events, **options):
     return lj.integrate(FREE, 0.0, 1.0, ts=TS, events=events, **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NASTY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if x == "pole" else pytest.mark.exhaustive) for x in NASTY]
+)
 def test_it_is_named_with_a_number(name):
     """The motion arrives in less than 2000 rejected steps; twin: a tame guard beside it is not named."""
     guard, number = NASTY[name]
@@ -39,7 +40,7 @@ def test_it_is_named_with_a_number(name):
     assert abs(float(motion.events["tame"].t[0]) - 5.0) < 1e-13
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_it_is_named_where_it_uses_up_the_steps():
     """NaN throughout, 293 of 300 steps rejected; twin: with a tame guard the same advice concerns the motion alone."""
     with pytest.raises(
@@ -72,7 +73,7 @@ def test_a_switch_is_named():
     assert abs(float(motion.q[-1]) + 4.0) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_end_that_only_the_second_motion_sees():
     """A guard that crosses and comes back within one step is named; no error of the motion is invented.
 

@@ -1,6 +1,7 @@
 """Messages when `max_steps` is used up or steps collapse: each cause by its own words, and none by another's."""
 
 import re
+from types import SimpleNamespace
 
 import diffrax
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.diagnose_stop import Steps, _fast, _rounded_up, _singularity, stopped_early
+from tests.by_hand import by_hand
 from tests.systems import PARAMS, pendulum
 
 
@@ -62,8 +65,70 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+GEOMETRIC = 0.5 ** np.arange(20.0)
+
+
+def stepped(h, rejected=0, left=100.0):
+    """Steps of these lengths from t = 0, after some rejected ones of the first length, of a motion with q = v = t."""
+    h, accepted = np.append(np.full(rejected, h[0]), h), np.arange(len(h) + rejected) >= rejected
+    t = np.cumsum(h * accepted) - h * accepted
+    return Steps(t, [*zip(t, t)], h, accepted, left)
+
+
+def along(velocity, rates=(), usual=(1.0, 1.0)):
+    """A path with these velocities and accelerations at each time, and eigenvalues."""
+    return SimpleNamespace(
+        names=["q", "r"], in_dict=False, usual=usual, velocity=lambda y: np.array([0.0, velocity(y[0])]),
+        at=lambda t, y, s: np.zeros(2), rates=lambda t, y: np.array(rates),
+    )  # fmt: skip
+
+
+def test_how_many_steps_are_missing():
+    """By the progress of the last steps, rejected ones counted; advice in two digits, rounded up."""
+    steps = stepped(np.full(30, 0.5), rejected=10, left=60.0)
+    assert steps.rate == 15.0 / 40 and steps.missing == 40 + 60.0 / steps.rate
+    np.testing.assert_array_equal(steps.kept, np.arange(11, 40))
+    # Of many steps the first, which only find their length, do not count.
+    assert stepped(np.append(np.full(40, 1e-9), np.full(120, 0.5))).rate == 0.5
+    assert [_rounded_up(n) for n in (7, 123, 120, 4567.0)] == [7, 130, 120, 4600]
+
+
+def test_a_singularity_by_its_numbers():
+    """A velocity that grows while steps shrink, toward the limit of their series; twins: steady, or long steps."""
+    to_two = along(lambda t: 1 / (2 - t))
+    cause, fix = _singularity(to_two, stepped(GEOMETRIC), None)
+    assert "the velocity of 'r' grows without bound as t -> 2;" in cause and "ts that end before 2" in fix
+    assert _singularity(along(lambda t: 1.0), stepped(GEOMETRIC), None) is None
+    assert _singularity(along(lambda t: np.exp(t)), stepped(np.full(20, 0.1)), None) is None
+    cause, _ = _singularity(along(lambda t: 1e5 * t), stepped(np.full(100, 0.01)), None)
+    assert "it is 9.9e+04 already, where the start and the way so far have 1" in cause
+
+
+RATES = {
+    "a stiff system: something decays at a rate of 8": ((-8.0, -1.0), False),
+    "a motion that grows at a rate of 9": ((9.0, 1.0), False),
+    "an oscillation of period 1.26, of which 80 are left": ((5j, -5j), False),
+    "80 are left: a stiff spring, or another high frequency": ((5j, -5j, 0.1j, -0.1j), False),
+    "": ((-8.0, -1.0), True),
+    "nothing": ((0.1j, -0.1j), False),
+}
+
+
+@pytest.mark.parametrize("words", RATES)
+def test_what_is_fast_by_its_eigenvalues(words):
+    """Decay, growth and oscillations are told apart; decay does not limit an implicit method, nor what is slow."""
+    rates, implicit = RATES[words]
+    found = _fast(along(lambda t: 1.0, rates), stepped(np.full(20, 0.5)), implicit)
+    assert found is None if words in ("", "nothing") else words in found[0], found
+
+
+IN_SLOW = "a collision", "strong damping", "a repulsion"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=pytest.mark.slow if case in IN_SLOW else pytest.mark.exhaustive) for case in CASES],
+)
 def test_each_cause_is_told_apart(case):
     """The message has the words of the right cause with its remedy, and of no other."""
     system, start, span, kinds = CASES[case]
@@ -77,8 +142,9 @@ def test_each_cause_is_told_apart(case):
     assert all(re.search(KINDS[kind][1], said) for kind in kinds), said
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("backward", (False, True))
+@pytest.mark.parametrize(
+    "backward", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
+)
 def test_the_number_of_steps_is_the_one_that_is_missing(backward):
     """The advised max_steps suffices, and is less than three times what is needed; also backward in time."""
     ts = np.array([0.0, 300.0])
@@ -90,14 +156,16 @@ def test_the_number_of_steps_is_the_one_that_is_missing(backward):
     assert taken <= asked <= 3 * taken
 
 
-@pytest.mark.slow
 def test_a_short_fixed_step():
-    """The number of fixed steps is known: 10,000 of 0.01."""
-    with pytest.raises(RuntimeError, match="it needs 9.8e\\+03 more"):
-        lj.integrate(
-            pendulum, 1.0, 0.0, PARAMS, ts=np.array([0.0, 100.0]), dt0=0.01, max_steps=200,
-            stepsize_controller=diffrax.ConstantStepSize(),
-        )  # fmt: skip
+    """It is said where a motion stopped; the number of fixed steps that it needs is known: 10,000 of 0.01."""
+    ts, fixed = np.array([0.0, 100.0]), {"controller": diffrax.ConstantStepSize(), "method": None, "dt0": 0.01}
+    end = lj.Snapshot(*map(np.asarray, (2.0, 2.0, 1.0)), {})
+    used_up = lj.RESULTS.max_steps_reached
+    stopped = by_hand(lj.System(free), ts, ts, 0 * ts + 1, end=end, result=used_up, steps=200)
+    said = stopped_early(stopped, SimpleNamespace(max_steps=200, **fixed), "")
+    assert "stopped at t = 2, 2 % of the way to 100, after 200 accepted and 0 rejected steps" in said
+    assert "max_steps = 200 is used up. The last state is (q = 2), v = (q = 1)." in said
+    assert re.search(r"it needs 9.8e\+03 more.\nFix: max_steps=15000, or longer steps", said), said
 
 
 # x over the depth y of a cycloid: x' is infinite at y = y0 (1 + 1/u0²).
@@ -106,7 +174,7 @@ cycloid = lj.System(lambda y, x, u, p: jnp.sqrt((1 + u**2) / (2 * 9.81 * y)))
 hole = lj.System(lambda t, q, v, p: 0.5 * (-(1 - 2 / q["r"]) * v["t"] ** 2 + v["r"] ** 2 / (1 - 2 / q["r"])))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_diverges_is_named():
     """The velocity that grows without bound, and when; with ts that end before, as advised, the motion is computed."""
     for system, start, ts, words in (
@@ -123,9 +191,9 @@ def test_what_diverges_is_named():
 
 @pytest.mark.slow
 def test_steps_that_collapse_at_a_singularity():
-    """If steps collapse before max_steps, the singularity is named too."""
+    """If steps collapse before max_steps, the singularity is named too, with where it happened."""
     kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
-    with pytest.raises(RuntimeError, match="grows without bound as t -> 1.1107"):
+    with pytest.raises(RuntimeError, match="(?s)stopped at t = 1.1107.*grows without bound as t -> 1.1107"):
         lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]), method=lj.Dopri8())
 
 

@@ -1,5 +1,9 @@
 """A motion that fails says where it stopped, why, and what to do; inside programs too."""
 
+import importlib
+from dataclasses import replace
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +11,7 @@ import pytest
 
 import lagjax as lj
 from tests.behaviour.test_bad_input import refusal
-from tests.systems import PARAMS, TS, pendulum
+from tests.systems import PARAMS, TS, motion, pendulum
 
 
 @pytest.mark.slow
@@ -17,17 +21,33 @@ def test_max_steps():
         lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=4)
 
 
-def test_singularity_on_the_way():
-    """A fall into the centre is reported with the state where it happened, not as `max_steps`."""
-    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
-    with refusal(RuntimeError, "stopped at t = 1.1107", "(singularity|not finite|L is)"):
-        lj.integrate(kepler, 1.0, 0.0, ts=np.array([0.0, 2.0]))
-
-
-def test_failure_under_jit_is_not_silent():
+def test_failure_under_jit_is_not_silent(monkeypatch):
     """Inside jit a failed integration raises at run time; with throw=False it carries its result."""
-    run = jax.jit(lambda q0, throw: lj.integrate(
-        pendulum, q0, 0.0, PARAMS, ts=TS, throw=throw).result, static_argnums=1)  # fmt: skip
+    done = motion("pendulum")
+    coded = lambda code: eqx.tree_at(lambda result: result._value, done.result, code)
+    solved = lambda *problem: replace(done, result=coded(problem[1].astype(int)))
+    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "trajectory_of", solved)
+    # In place of a solve, with the start as the number of its result.
+    run = jax.jit(
+        lambda q0, throw: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS, throw=throw).result._value, static_argnums=1
+    )
+    failed = float(lj.RESULTS.start_not_finite._value)
     with pytest.raises(RuntimeError, match="not finite"):
-        jax.block_until_ready(run(jnp.nan, True))
-    assert bool(run(jnp.nan, False) == lj.RESULTS.start_not_finite)
+        jax.block_until_ready(run(failed, True))
+    assert run(failed, False) == failed and run(0.0, True) == 0
+
+
+def test_what_only_a_program_knows():
+    """A start, lengths of steps and times that are known at run time alone: each has its result; twin: good ones."""
+
+    def result(q0, dt0, max_step, end):
+        ts, options = jnp.stack([0.0, end]), {"dt0": dt0, "max_step": max_step, "throw": False}
+        return lj.integrate(pendulum, q0, 0.0, PARAMS, ts=ts, **options).result._value
+
+    run, good = jax.jit(result), {"q0": 0.5, "dt0": 0.1, "max_step": 1.0, "end": 2.0}
+    unordered, not_finite = lj.RESULTS.unordered, lj.RESULTS.start_not_finite
+    cases = {"end": (-2.0, unordered), "dt0": (-0.1, unordered), "max_step": (-0.1, unordered)}
+    for name, (value, expected) in (cases | {"q0": (np.nan, not_finite)}).items():
+        assert run(**good | {name: value}) == int(expected._value), name
+    assert run(**good) == int(lj.RESULTS.successful._value)
+    assert "NumPy array" in lj.RESULTS[unordered]

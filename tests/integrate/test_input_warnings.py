@@ -1,5 +1,7 @@
 """A warning of input that is hardly ever meant: a force in place of R."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
 from lagjax.system import coordinates
+from tests.systems import PARAMS, TS, motion, pendulum
 
 ODD = {
     "a force": lambda t, q, v, p: -p["c"] * v,
@@ -44,22 +47,34 @@ def test_what_dissipates_is_left_alone(which, q, v):
     warn_of_odd_dissipation(new, coordinates.state(0.5, q, v, {"c": 0.3}))
 
 
-def test_integrate_tells_and_goes_on():
-    """`integrate` warns by the function's name, goes on with its constant force of 0.5, and ignores traced values."""
+def test_integrate_tells_and_goes_on(monkeypatch):
+    """`integrate` warns by the function's name, and goes on; twin: traced values are ignored."""
 
     def drag(t, q, v, params):
-        return -0.5 * v["x"]
+        return -0.5 * v
 
-    free = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2), dissipation=drag)
-    start = {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 1.0}
+    done, solved = motion("pendulum"), lambda *problem: done
+    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "trajectory_of", solved)
+    dragged = lj.System(pendulum.lagrangian, dissipation=drag)
+    run = lambda q0: lj.integrate(dragged, q0, 1.0, PARAMS, ts=TS, throw=False)
     with pytest.warns(UserWarning, match="Fix: force=drag"):
-        motion = lj.integrate(free, *start, None, ts=jnp.array([0.0, 2.0]))
+        assert run(0.5) is done
+    jax.eval_shape(lambda q0: run(q0).q, 0.5)
+
+
+@pytest.mark.exhaustive
+def test_a_force_taken_for_a_dissipation():
+    """Its motion is that of a constant force of 0.5, and a warning; twin: traced values, of all kinds, are ignored."""
+    free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
+    start = {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 1.0}
+    dragged, ts = lj.System(free, dissipation=lambda t, q, v, params: -0.5 * v["x"]), np.array([0.0, 2.0])
+    with pytest.warns(UserWarning, match="Fix: force=f"):
+        motion = lj.integrate(dragged, *start, None, ts=ts)
     np.testing.assert_allclose(motion.q["x"][-1], 0.5 * 0.5 * 2.0**2, rtol=1e-12)
 
     def traced(y, c):
-        closed = lj.System(free.lagrangian, dissipation=lambda t, q, v, params: c * v["x"])
-        ts = jnp.array([0.0, 2.0])
-        of_start = lj.integrate(free, start[0] | {"y": y}, start[1], None, ts=ts)
+        closed = lj.System(free, dissipation=lambda t, q, v, params: c * v["x"])
+        of_start = lj.integrate(dragged, start[0] | {"y": y}, start[1], None, ts=ts)
         return of_start.q["x"] + lj.integrate(closed, *start, None, ts=ts).q["x"]
 
     assert jax.eval_shape(traced, 0.5, 0.5).shape == (2,)

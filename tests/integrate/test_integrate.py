@@ -6,33 +6,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.integrate.solve.phases import traced_phases
 from lagjax.jaxtools.jaxpr import length
-from tests.counting import compiles
+from lagjax.system import coordinates
 from tests.plain import not_plain
-from tests.systems import HORIZONTAL, PARAMS, TS, pendulum, pendulum_lagrangian, rod_pendulum
+from tests.systems import DRIVEN_PARAMS, HORIZONTAL, PARAMS, TS, driven, pendulum, rod_pendulum
 
 # A wide swing, from 2 rad at 3 rad/s: nonlinear, and without a symmetry that would raise an order.
 SWING = (2.0, 3.0)
 SWING_TS = np.array([0.0, 0.26, 0.77, 1.01])
 
 
-@pytest.fixture(scope="module")
-def exact():
-    """The pendulum in its angle at 1e-13, checked against SciPy in `test_against_scipy`."""
-    return lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, rtol=1e-13, atol=1e-13)
-
-
-def test_against_scipy(exact):
+def test_against_scipy():
     """The angle agrees with SciPy's DOP853 on the hand-derived equation."""
-    integrate = pytest.importorskip("scipy.integrate")
+    exact = lj.integrate(pendulum, *SWING, PARAMS, ts=SWING_TS, rtol=1e-13)
     k = PARAMS["g"] / PARAMS["l"]
-    solution = integrate.solve_ivp(
-        lambda t, y: [y[1], -k * np.sin(y[0])], (0, 1.01), SWING, "DOP853", SWING_TS, rtol=1e-13, atol=1e-13
-    )
-    np.testing.assert_allclose(exact.q, solution.y[0], atol=2e-12)
-    np.testing.assert_allclose(exact.v, solution.y[1], atol=1e-11)
+    by_hand = lambda t, y: [y[1], -k * np.sin(y[0])]
+    y = solve_ivp(by_hand, (0, 1.01), SWING, "DOP853", SWING_TS, rtol=1e-13, atol=1e-13).y
+    np.testing.assert_allclose(exact.q, y[0], atol=2e-12)
+    np.testing.assert_allclose(exact.v, y[1], atol=1e-11)
 
 
 @pytest.mark.slow
@@ -70,14 +65,9 @@ def test_second_derivative_forward():
     np.testing.assert_allclose(second, (slope(9.8125 + step) - slope(9.8125 - step)) / (2 * step), rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
-    "adjoint",
-    [
-        diffrax.ForwardMode(),
-        pytest.param(diffrax.RecursiveCheckpointAdjoint(), marks=pytest.mark.exhaustive),
-        pytest.param(diffrax.BacksolveAdjoint(), marks=pytest.mark.exhaustive),
-    ],
+    "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
 )
 def test_diffrax_adjoints_are_accepted(adjoint):
     """Each adjoint gives the derivative of an oscillator's cos(2t) by its stiffness."""
@@ -122,30 +112,31 @@ def test_gradient_of_a_batch():
     np.testing.assert_allclose(jax.grad(total)(4.0), exact, rtol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "transform",
-    [
-        pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive),
-        pytest.param(jax.grad, marks=pytest.mark.exhaustive),
-        lambda f: jax.jit(jax.grad(f)),
-    ],
-)
+def oscillator(k):
+    """A spring whose L closes over its stiffness."""
+    return lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * k * q**2)
+
+
+def test_a_closed_over_value_is_a_number_of_the_system():
+    """What L closes over inside a program is lifted into the system, by which a motion is differentiated."""
+    state = coordinates.prepared(0.0, 1.0, 0.0, None)
+    lifted = lambda k: jax.tree.leaves(eqx.filter(traced_phases(oscillator(k), state), eqx.is_inexact_array))
+    for k in (4.0, 9.0):
+        assert [*map(float, jax.jit(lifted)(k))] == [k]
+        assert jax.jit(jax.grad(lambda k: sum(lifted(k))))(k) == 1.0
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("transform", [lambda f: jax.jit(jax.grad(f)), jax.jacfwd, jax.grad])
 def test_gradient_by_a_closed_over_value(transform):
     """A value that L closes over has its derivative; before such values were lifted, jit(grad) silently gave zero."""
-
-    def final(k):
-        oscillator = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * k * q**2)
-        return lj.integrate(oscillator, 1.0, 0.0, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10).q[-1]
-
+    ts, tight = np.array([0.0, 1.0]), {"rtol": 1e-10, "atol": 1e-10}
+    final = lambda k: lj.integrate(oscillator(k), 1.0, 0.0, ts=ts, **tight).q[-1]
     np.testing.assert_allclose(transform(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-8)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "method",
-    [None, *(pytest.param(m, marks=pytest.mark.exhaustive) for m in (lj.Dopri8(), lj.Tsit5()))],
-    ids=["default", "8", "5"],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("method", [None, lj.Dopri8(), lj.Tsit5()], ids=["default", "8", "5"])
 def test_float32_with_explicit_time(method):
     """Stages at intermediate times stay in float32 even if JAX has float64 enabled."""
     driven = lj.System(lambda t, q, v, params: 0.5 * v**2 + params * q * jnp.sin(3 * t))
@@ -168,39 +159,16 @@ def test_float32_says_what_it_is():
     )
 
 
-def test_one_compilation_for_all_tolerances_states_and_parameters():
-    """New numbers do not compile again: an L that reads the outside is traced once in each call, nothing else."""
-    traced, traces, compiled = [], [], []
-
-    def counted(t, q, v, params):
-        traced.append(1)
-        return 0.8125 * pendulum_lagrangian(t, q, v, params)  # No other test's: programs belong to what L computes.
-
-    system = lj.System(counted)
-    for i, tolerance in enumerate((1e-6, 1e-7, 1e-8)):
-        traced.clear()
-        with compiles() as found:
-            lj.integrate(system, 1.0 + i, 0.0, {"g": 9.0 + i, "l": 1.25}, ts=TS + i, rtol=tolerance, atol=tolerance)
-        traces.append(len(traced))
-        compiled.append(len(found))
-    assert traces == [1, 1, 1] and compiled[0] > 0 == sum(compiled[1:])
-
-
 def test_dissipation_and_force_in_motion():
     """A driven, damped oscillator follows its exact solution."""
-    system = lj.System(
-        lambda t, q, v, params: 0.5 * v**2 - 0.5 * 4.0 * q**2,
-        force=lambda t, q, v, params: jnp.cos(3 * t),
-        dissipation=lambda t, q, v, params: 0.5 * 0.5 * v**2,
-    )
-    # Steady state: amplitude and phase of 1/(4 - 9 + 1.5 i).
-    response = 1 / (4 - 9 + 1.5j)
-    ts = np.array([0.0, 1.0, 5.0])
-    traj = lj.integrate(system, response.real, (3j * response).real, ts=ts, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(traj.q, (response * np.exp(3j * ts)).real, atol=1e-9)
+    m, k, c, pull, rate = DRIVEN_PARAMS.values()
+    # Steady state: amplitude and phase of pull / (k - m rate² + i c rate).
+    response, ts = pull / (k - m * rate**2 + 1j * c * rate), np.array([0.0, 1.0, 5.0])
+    traj = lj.integrate(driven, response.real, (1j * rate * response).real, DRIVEN_PARAMS, ts=ts, rtol=1e-11)
+    np.testing.assert_allclose(traj.q, (response * np.exp(1j * rate * ts)).real, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_feedback_and_values_closed_over_where_equations_are_not_written_out():
     """Baumgarte's rate, and a length that a constraint closes over inside `jit`, are arguments of the program."""
     there = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
@@ -235,7 +203,7 @@ def test_an_empty_batch():
         jax.block_until_ready(jax.vmap(lambda q: run(q).q[-1])(jnp.array([1.0, jnp.nan])))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_calls_of_the_host_are_the_users():
     """A force from Python in one branch works in a motion and in a sweep; so does a check of the user's own."""
     free = lambda t, q, v, p: 0.5 * v**2
@@ -265,10 +233,7 @@ class OwnTsit5(diffrax.Tsit5):
     """Another user's subclass."""
 
 
-SHIPPED = [
-    (diffrax.Dopri8(), lj.Dopri8(), OwnDopri8()),
-    pytest.param(diffrax.Tsit5(), lj.Tsit5(), OwnTsit5(), marks=pytest.mark.exhaustive),
-]
+SHIPPED = [(diffrax.Dopri8(), lj.Dopri8(), OwnDopri8()), (diffrax.Tsit5(), lj.Tsit5(), OwnTsit5())]
 
 
 def by_method(method, **options):
@@ -277,7 +242,7 @@ def by_method(method, **options):
     return lambda g: lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS | {"g": g}, **settings)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @not_plain
 @pytest.mark.parametrize(("shipped", "ours", "own"), SHIPPED, ids=["Dopri8", "Tsit5"])
 def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
@@ -292,7 +257,7 @@ def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
     assert "form)" not in repr(expected) + jax.eval_shape(by_method(ours), g).static.method
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_methods_with_options_stay():
     """Other methods, those with an option set, and those that a condition evaluates are not replaced by ours."""
     looped = diffrax.Dopri8(scan_kind="lax")

@@ -7,12 +7,7 @@ import pytest
 
 from lagjax.integrate.jumps.find import Given
 from tests.integrate.jumps.test_find import JUMPING, jumps_of
-
-
-def given_at(system, jumps, *state):
-    """The parameters with the modes at a state."""
-    modes = jumps.modes(system, *state)
-    return Given(state[-1], modes, jnp.zeros(jumps.count, bool), jnp.asarray(False))
+from tests.jaxtools.in_numpy import run
 
 
 @pytest.mark.parametrize("name", JUMPING)
@@ -23,20 +18,25 @@ def test_in_its_mode_a_force_is_itself(name):
     """
     force, rng, differs = JUMPING[name], np.random.default_rng(1), 0
     system, jumps = jumps_of(force)
-    smooth, guards = jumps.smooth(system), jumps.numbers(system, 0)
-    smooth_force = smooth.force
+    smooth_force, guards, beyond = jumps.smooth(system).force, jumps.numbers(system, 0), jumps.numbers(system, 1)
     assert smooth_force is not None
-    beyond = jumps.numbers(system, 1)
-    slope = jax.jit(jax.grad(lambda q, v, t, p: smooth_force(t, q, v, p), argnums=(0, 1)))
-    right = jax.jit(jax.grad(lambda q, v, t, p: force(t, q, v, p), argnums=(0, 1)))
-    for t, q, v in rng.uniform(-1.5, 1.5, (12, 3)):
-        state = jnp.asarray(t), jnp.asarray(q), jnp.asarray(v), jnp.asarray(0.3)
-        given = given_at(system, jumps, *state)
-        np.testing.assert_allclose(smooth_force(*state[:3], given), force(*state), rtol=1e-14, atol=1e-14)
-        np.testing.assert_allclose(slope(q, v, t, given), right(q, v, t, state[-1]), rtol=1e-14, atol=1e-14)
-        assert all(guard(*state[:3], given) >= 0 for guard in guards)
-        for i, (guard, other) in enumerate(zip(guards, beyond)):
-            crossed = given._replace(modes=given.modes.at[i].set(other(*state[:3], given)))
-            assert guard(*state[:3], crossed) <= 0
-            differs += not np.isclose(smooth_force(*state[:3], crossed), force(*state))
+
+    def at(t, q, v, p):
+        modes = jumps.modes(system, t, q, v, p)
+        given = Given(p, modes, jnp.zeros(jumps.count, bool), jnp.asarray(False))
+        crossed = [given._replace(modes=jnp.where(np.arange(jumps.count) == i, other(t, q, v, given), modes))
+                   for i, other in enumerate(beyond)]  # fmt: skip
+        for f, params in ((smooth_force, given), (force, p)):
+            yield from jax.value_and_grad(lambda x: f(t, *x, params))((q, v))
+        yield [guard(t, q, v, given) for guard in guards]
+        yield [guard(t, q, v, of) for guard, of in zip(guards, crossed)]
+        yield [smooth_force(t, q, v, of) for of in crossed]
+
+    program = jax.make_jaxpr(lambda *state: list(at(*state)))(0.0, 0.0, 0.0, 0.3)
+    for state in rng.uniform(-1.5, 1.5, (12, 3)):
+        found = np.array(run(program, *state, 0.3))
+        np.testing.assert_allclose(found[:3], found[3:6], rtol=1e-14, atol=1e-14)
+        inside, outside, others = found[6:].reshape(3, -1)
+        assert np.all(inside >= 0) and np.all(outside <= 0)
+        differs += not np.allclose(others, found[0])
     assert differs > 0

@@ -1,5 +1,7 @@
 """Coordinates of first order: states and damped coordinates against closed forms, SciPy and eigenvalues."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import lagjax as lj
+from lagjax.mechanics import diagnosis, with_first_order
+from lagjax.mechanics.first_order import is_determined, of_states, resolved
+from lagjax.system import coordinates, model_of
+from tests.jaxtools.in_numpy import accelerations, in_numpy
 
 ONE = np.array([0.0, 1.0])
 
@@ -31,6 +37,7 @@ def spent(t):
     return 0.5 * (t - 0.5 * np.sin(2.0 * t))
 
 
+@pytest.mark.slow
 def test_a_running_cost():
     """c' = v² of cos t, to 1e-12; its rate is the velocity of c, at every output. Twin: the cost of another speed."""
     ts = np.linspace(0.0, 20.0, 9)
@@ -40,14 +47,27 @@ def test_a_running_cost():
     assert np.max(np.abs(motion.q["c"] - 0.5 * (ts - 0.5 * np.sin(2.1 * ts)))) > 0.1
 
 
+def first_order(system, x, u, params):
+    """The model of a system, in which coordinates of first order are known, and a state as it takes it."""
+    like = {"x": 0.0, "c": 0.0} if system is costly else np.zeros(len(x))
+    model = with_first_order(model_of(system, *coordinates.state(0.0, like, like, params)))
+    return model, (np.array(0.0), np.array(x), np.array(u))
+
+
+def velocities(system, x, u, params):
+    """The velocities that follow from a state."""
+    model, state = first_order(system, x, u, params)
+    return in_numpy(lambda *state: resolved(model, *state))(*state)
+
+
 def test_its_acceleration_at_one_state():
     """dv²/dt = 2 v a. Twin: the velocity given for the state does not count."""
     q, v = {"x": 0.5, "c": 7.0}, {"x": 3.0}
-    for given in (v, v | {"c": 100.0}):
-        a, multipliers = lj.accelerations(costly, 0.0, q, given, None)
+    for given in (v | {"c": 0.0}, v | {"c": 100.0}):
+        a, multipliers = accelerations(costly, 0.0, q, given, None)
         np.testing.assert_allclose([a["x"], a["c"]], [-0.5, -3.0], rtol=1e-15)
         assert not multipliers
-    np.testing.assert_allclose(lj.consistent_state(costly, 0.0, q, v, None)[1]["c"], 9.0)
+    np.testing.assert_allclose(velocities(costly, [7.0, 0.5], [100.0, 3.0], None), [9.0, 3.0])
 
 
 @pytest.mark.slow
@@ -211,6 +231,18 @@ def chain_matrix(k, c):
     return np.array([*x, *([row[0], 0.0, row[1], row[2]] for row in slow)])
 
 
+def test_rates_of_maxwells_element():
+    """Velocities of the points and the acceleration of the mass are those of the matrix, whatever velocity is given."""
+    q, v = np.array([1.0, 0.5, -0.3]), np.array([0.7, 50.0, 9.0])
+    rate = chain_matrix(**CHAIN) @ [q[0], v[0], *q[1:]]
+    np.testing.assert_allclose(velocities(chain, q, v, CHAIN), [v[0], *rate[2:]], rtol=1e-13)
+    # The massless points' accelerations are the rates of their velocities.
+    second = chain_matrix(**CHAIN) @ rate
+    np.testing.assert_allclose(accelerations(chain, 0.0, q, v, CHAIN)[0], [rate[1], *second[2:]], rtol=1e-13)
+    assert np.max(np.abs(chain_matrix(k=4.0, c=3.0) @ [q[0], v[0], *q[1:]] - rate)) > 0.1
+
+
+@pytest.mark.slow
 def test_maxwells_element():
     """Two damped points of one vector, which move each other, and a mass: the matrix exponential."""
     start = np.array([1.0, 0.5, -0.3])
@@ -237,6 +269,14 @@ def test_energy_of_a_damped_chain():
     assert abs(ledger.closure[-1]) < 1e-8 and np.max(np.abs(ledger.works["states"].total)) > 0.1
 
 
+def test_which_are_of_first_order():
+    """The coordinates without a mass, and which of them are states; twin: a mass is neither."""
+    for system, params, massless, states in ((costly, None, (), [True, False]), (chain, CHAIN, (1, 2), [False] * 3)):
+        model, _ = first_order(system, np.zeros(len(states)), np.zeros(len(states)), params)
+        assert model.form.first_order.massless == massless and list(of_states(model)) == states
+
+
+@pytest.mark.slow
 def test_it_is_said():
     """What `explain` says of both kinds."""
     assert "c (state)" in str(lj.explain(costly, 0.0, *SWING, None))
@@ -244,8 +284,25 @@ def test_it_is_said():
     assert "q[1] (no mass), q[2] (no mass)" in words and "degrees of freedom  1" in words
 
 
-def test_no_damping_at_all():
-    """A damping of zero leaves the velocity undetermined; a damper that is not linear is not taken for one."""
+def test_what_determines_velocities():
+    """A damper of zero leaves them undetermined; twin: one above zero does not."""
+    for c, expected in ((0.0, False), (1.5, True)):
+        model, state = first_order(chain, np.ones(3), np.zeros(3), CHAIN | {"c": c})
+        assert in_numpy(lambda *state: is_determined(model, *state))(*state) == expected
+
+
+def test_no_damping_at_all(monkeypatch):
+    """A damping of zero is said to leave velocities undetermined."""
+    for name in ("is_determined", "balance_matrix"):
+        monkeypatch.setattr(diagnosis, name, in_numpy(getattr(diagnosis, name)))
+    s = coordinates.state(0.0, np.ones(3), np.zeros(3), CHAIN | {"c": 0.0})
+    said = diagnosis.explain_undetermined(model_of(chain, *s), s)
+    assert said is not None and re.search(r"(?s)'q\[1\]' and 'q\[2\]' are not determined.*damping above zero", said)
+
+
+@pytest.mark.slow
+def test_no_motion_without_damping():
+    """A motion says so; a damper that is not linear is not taken for one."""
     with pytest.raises(ValueError, match=r"(?s)'q\[1\]' and 'q\[2\]' are not determined.*damping above zero"):
         lj.integrate(chain, np.ones(3), np.zeros(3), CHAIN | {"c": 0.0}, ts=ONE)
     cubic = lj.System(spring, dissipation=lambda t, q, v, k: v**4)

@@ -10,6 +10,7 @@ from lagjax.integrate.elements.in_modes import in_modes
 from lagjax.mechanics import equations_of
 from lagjax.mechanics.forward_dynamics import ForwardDynamics
 from lagjax.system import State, model_of
+from tests.jaxtools.in_numpy import accelerations
 
 
 def lagrangian(t, q, v, params):
@@ -30,7 +31,7 @@ def without_coriolis(t, q, v, force, params):
     return polar(t, q, jnp.array([0.0, 1.0]) * v, force, params)
 
 
-Q, V, PARAMS = jnp.array([2.0, 0.3]), jnp.array([0.5, -1.0]), {"m": 3.0}
+Q, V, PARAMS = np.array([2.0, 0.3]), np.array([0.5, -1.0]), {"m": 3.0}
 ROD = {"rod": lj.Holonomic(lambda t, q, params: q[0] ** 2 - 4.0)}
 
 
@@ -39,7 +40,7 @@ def test_a_system_that_solves_itself():
     """Accelerations, multipliers, motion and explanation are those of L's own equations, under forces, with a rod."""
     beside = dict(force=lambda t, q, v, params: jnp.array([0.0, 2.0]), dissipation=lambda t, q, v, params: v[1] ** 2)
     systems = [lj.System(lagrangian, ROD, forward_dynamics=f, **beside) for f in (polar, None)]
-    v = V.at[0].set(0.0)
+    v = V * [0.0, 1.0]
     (a, found), (b, expected) = (lj.accelerations(system, 0.0, Q, v, PARAMS) for system in systems)
     np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
     np.testing.assert_allclose(found["rod"], expected["rod"], rtol=1e-13)
@@ -69,14 +70,14 @@ def test_forces_of_multipliers_and_elements():
     found = []
     for f, force in ((polar, rubbed), (None, rubbed), (polar, None)):
         system = lj.System(lagrangian, ROD, force=force, forward_dynamics=f)
-        found.append(lj.accelerations(system, 0.0, Q, V.at[0].set(0.0), PARAMS))
+        found.append(accelerations(system, 0.0, Q, V * [0.0, 1.0], PARAMS))
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-13, atol=1e-14)
     np.testing.assert_allclose(found[0][1]["rod"], found[1][1]["rod"], rtol=1e-13)
     assert np.abs(found[0][0] - found[2][0]).max() > 0.1
     wall = lj.Contact(lambda t, q, params: q[0] - 1.0, friction=0.3, sliding=lambda t, q, v, params: q[0] * v[1])
     for f in (polar, None):
         system = lj.System(lagrangian, elements={"wall": wall}, forward_dynamics=f)
-        start = State(jnp.zeros(()), Q, V, {"m": jnp.asarray(3.0)})
+        start = State(np.zeros(()), Q, V, {"m": np.array(3.0)})
         in_its_modes, laws = in_modes(system, start)
         given = laws.at_first(start.t, start.params)
         solver = equations_of(model_of(in_its_modes, *start[:3], given)).form

@@ -72,13 +72,13 @@ def test_conserved_jacobi_integral():
 
 def of(lagrangian, q, constraints=None, **functions):
     """The structure at some state."""
-    s = coordinates.state(0.3, q, jnp.ones_like(q), None)
+    s = coordinates.state(0.3, q, np.ones_like(q), None)
     return structure(model_of(lj.System(lagrangian, constraints, **functions), *s))
 
 
 def test_mass_matrix():
     """What the mass matrix depends on and couples: constant or not, diagonal, in blocks, dense."""
-    q = jnp.array([0.2, 0.4, 0.6])
+    q = np.array([0.2, 0.4, 0.6])
     constant = of(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - jnp.sum(q**2) * jnp.cos(t), q)
     assert constant.mass_depends_on == () and len(constant.blocks) == 3
     coupled = of(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + v[0] * v[2] * jnp.cos(q[1] - q[2]) * t, q)
@@ -92,7 +92,7 @@ def test_mass_matrix():
 
 def test_time_cyclic_coordinates_and_linear_terms():
     """Cyclic coordinates, explicit time and linear terms, each with a twin that differs by one term."""
-    q = jnp.array([0.2, 0.4])
+    q = np.array([0.2, 0.4])
     planar = lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2)
     central = of(planar, q)
     assert (central.cyclic, central.explicit_time, central.linear_terms) == (("q[1]",), False, ())
@@ -105,7 +105,7 @@ def test_time_cyclic_coordinates_and_linear_terms():
 
 def test_constraints():
     """Constraints that are linear with constant coefficients or not, moving or not."""
-    q = jnp.array([0.2, 0.4])
+    q = np.array([0.2, 0.4])
     found = of(
         lambda t, q, v, params: 0.5 * jnp.sum(v**2),
         q,
@@ -123,19 +123,31 @@ def test_constraints():
 
 def test_a_large_system_is_not_taken_apart():
     """Beyond two dozen coordinates the structure is not examined."""
-    assert of(lambda t, q, v, params: 0.5 * jnp.sum(v**2), jnp.ones(25)) is None
+    assert of(lambda t, q, v, params: 0.5 * jnp.sum(v**2), np.ones(25)) is None
 
 
-@not_plain
-@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
-def test_a_long_program_is_not_taken_apart(nodes, known):
-    """A mass by quadrature of many nodes has no structure, and `explain` works without; twin: few nodes."""
-    angles = jnp.linspace(0.0, 6.0, nodes)
+def mass_by_quadrature(nodes):
+    """A system with a mass by quadrature of many nodes, and a state."""
+    angles = np.linspace(0.0, 6.0, nodes)
     apart = lambda q: (q[0] - jnp.cos(angles)) ** 2 + (q[1] - jnp.sin(angles)) ** 2 + q[2] ** 2
     wire = lambda q: jnp.sum(1 / jnp.sqrt(apart(q)) + jnp.exp(-apart(q)))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v * wire(q))
-    s = coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.ones(3), None)
+    return system, coordinates.state(0.0, np.array([2.0, 0.0, 0.3]), np.ones(3), None)
+
+
+@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
+def test_a_long_program_is_not_taken_apart(nodes, known):
+    """A long mass matrix has no structure; twin: few nodes."""
+    system, s = mass_by_quadrature(nodes)
     assert (structure(model_of(system, *s)) is not None) == known
+
+
+@not_plain
+@pytest.mark.slow
+@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
+def test_a_long_program_is_explained(nodes, known):
+    """`explain` works without a structure; twin: few nodes."""
+    system, s = mass_by_quadrature(nodes)
     report = dict(lj.explain(system, *s[:3]).rows)
     assert report["mass matrix"] == "positive definite" + ", diagonal, depends on q[0], q[1], q[2]" * known
     assert report["solved"] == ("3 divisions" if known else "3 equations by elimination")

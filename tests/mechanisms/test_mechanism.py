@@ -1,15 +1,13 @@
 """Each mechanism: its start is on its constraints, which leave the freedoms that it states."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.mechanisms import MECHANISMS
-from lagjax.system import constraints, coordinates
-from lagjax.system.model import model_of
+from lagjax.system import coordinates
+from tests.by_numpy import by_numpy, matrices
 
 
 def stacked(tree):
@@ -17,26 +15,16 @@ def stacked(tree):
     return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(tree)])
 
 
-@eqx.filter_jit
-def matrices(system, t, q, v, params):
-    """M, F, A and gamma from lagjax."""
-    model = model_of(system, t, q, v, params)
-    x, u = model.vectors(q, v)
-    linear, rows = mass_and_forcing(model, t, x, u), constraints.acceleration_rows(model, t, x, u)
-    return linear.mass, linear.forcing, rows.jacobian, rows.gamma
-
-
 def equations(mechanism, t=0.0, q=None, v=None):
-    """M, F, A, gamma of a mechanism, at its start or at another state."""
+    """M, F, A, gamma of a mechanism, at its start or at another state, in NumPy."""
     q, v = mechanism.q0 if q is None else q, mechanism.v0 if v is None else v
-    found = matrices(mechanism.system, *coordinates.state(t, q, v, mechanism.params))
-    return tuple(np.asarray(part) for part in found)
+    return matrices(mechanism.system)(*coordinates.state(t, q, v, mechanism.params))
 
 
-def residual(mechanism, t, q):
-    """All position residuals of a mechanism, stacked by name, as JAX flattens a dict."""
+def residuals(mechanism):
+    """The function of (t, q) that is zero on the constraints, all stacked by name, as JAX flattens a dict."""
     in_order = [constraint for _, constraint in sorted(mechanism.system.constraints.items())]
-    return jnp.concatenate([jnp.ravel(constraint.g(t, q, mechanism.params)) for constraint in in_order])
+    return lambda t, q: jnp.concatenate([jnp.ravel(constraint.g(t, q, mechanism.params)) for constraint in in_order])
 
 
 def assert_close(ours, theirs, digits=1e-12):
@@ -61,8 +49,8 @@ def test_degrees_of_freedom(name):
     assert mass.shape[0] - rank == mechanism.freedom
     free = directions[rank:]
     assert np.all(np.linalg.eigvalsh(free @ mass @ free.T) > 1e-9 * np.max(np.abs(mass)))
-    size = np.max(np.abs(stacked(mechanism.q0)))
-    assert np.max(np.abs(residual(mechanism, 0.0, mechanism.q0))) <= 1e-15 * max(size, 1.0)
-    _, drive = jax.jvp(lambda t: residual(mechanism, t, mechanism.q0), (0.0,), (1.0,))
-    velocity = jacobian @ stacked(mechanism.v0) + np.asarray(drive)
+    at = lambda t, q: jax.jvp(lambda t: residuals(mechanism)(t, q), (t,), (1.0,))
+    off, drive = by_numpy(at)(0.0, mechanism.q0)
+    assert np.max(np.abs(off)) <= 1e-15 * max(np.max(np.abs(stacked(mechanism.q0))), 1.0)
+    velocity = jacobian @ stacked(mechanism.v0) + drive
     assert np.max(np.abs(velocity)) <= 1e-14 * max(np.max(np.abs(stacked(mechanism.v0))), 1.0)

@@ -1,5 +1,7 @@
 """Newton's method in its three ways: roots of SciPy, their derivatives in closed form, and where it gives up."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,31 +15,25 @@ def circle_and_line(a):
     return lambda y: jnp.stack([y[0] ** 2 + y[1] ** 2 - a, y[1] - 2.0 * y[0]])
 
 
-def test_steps_are_shortened():
-    """arctan from 3 converges with shortened steps; twin: whole steps leave it."""
-    step = lambda y, r, i: r * (1 + y**2)
-    run = lambda **settings: newton(jnp.arctan, step, jnp.array([3.0]), 12, **settings)
-    np.testing.assert_allclose(run(fractions=0.5 ** np.arange(6)), 0.0, atol=1e-15)
-    assert not np.abs(run()[0]) < 1.0
+def test_loops():
+    """Steps are shortened (arctan from 3; twin: whole steps leave it), and end where the residual falls enough.
 
-
-def test_it_ends_where_it_is_told():
-    """A residual that falls too slowly ends the iteration early."""
-    counted = lambda **settings: newton(lambda y: y**2, lambda y, r, i: r / (2 * y), jnp.array([1.0]), 40, **settings)
-    # At this double root each step halves y.
-    np.testing.assert_allclose(counted(), 0.5**40, rtol=1e-12)
-    np.testing.assert_allclose(counted(falls=0.2), 0.5, rtol=1e-12)
-    np.testing.assert_allclose(counted(enough=1e-3), 0.5**5, rtol=1e-12)
-
-
-def test_the_slowest_level_decides():
-    """Of two levels the second falls by 9/16 in each step, to a thousandth in 13; twin: the first alone takes 5."""
+    At a double root each step halves y. Of two levels the slowest decides: its second falls by 9/16 in each step, to a
+    thousandth in 13; twin: the first alone takes 5.
+    """
+    atan = partial(newton, jnp.arctan, lambda y, r, i: r * (1 + y**2), jnp.array([3.0]), 12)
+    double = partial(newton, lambda y: y**2, lambda y, r, i: r / (2 * y), jnp.array([1.0]), 40)
     slow = np.array([[2.0], [4.0]])
-    run = lambda level, size: newton(
-        lambda y: y**2, lambda y, r, i: r / (slow * y), jnp.ones((2, 1)), 40, size=size, enough=1e-3
-    )[level, 0]
-    np.testing.assert_allclose(run(1, lambda r: r[:, 0]), 0.75**13, rtol=1e-12)
-    np.testing.assert_allclose(run(0, lambda r: r[:1, 0].repeat(2)), 0.5**5, rtol=1e-12)
+    levels = partial(
+        newton, lambda y: y**2, lambda y, r, i: r / (slow * y), jnp.ones((2, 1)), 40, enough=1e-3
+    )
+    found = jax.jit(lambda: [
+        atan(fractions=0.5 ** np.arange(6)), atan(), double(), double(falls=0.2), double(enough=1e-3),
+        levels(size=lambda r: r[:, 0])[1], levels(size=lambda r: r[:1, 0].repeat(2))[0],
+    ])()  # fmt: skip
+    shortened, left, *others = (float(x[0]) for x in found)
+    assert abs(shortened) < 1e-15 and not abs(left) < 1.0
+    np.testing.assert_allclose(others, [0.5**40, 0.5, 0.5**5, 0.75**13, 0.5**5], rtol=1e-12)
 
 
 def test_one_more_step_has_the_derivatives():
@@ -53,18 +49,23 @@ def test_one_more_step_has_the_derivatives():
 
 def test_least_squares_against_scipy():
     """A root from far away, and its derivatives of two orders; twin: without `differentiable` these are zero."""
-    start = jnp.array([4.0, -1.0])
+    start = np.array([4.0, -1.0])
 
     def x(a, with_derivatives=True):
         found = least_squares_root(circle_and_line(jax.lax.stop_gradient(a)), start)
-        y = differentiable(circle_and_line(a), found) if with_derivatives else found.y
-        return y[0], y
+        return (differentiable(circle_and_line(a), found) if with_derivatives else found.y)[0]
 
-    of_a = jax.jit(lambda a: (x(a)[1], jax.grad(x, has_aux=True)(a)[0], jax.jacfwd(jax.grad(lambda a: x(a)[0]))(a)))
-    y, slope, bend = of_a(5.0)
-    np.testing.assert_allclose(y, scipy.optimize.root(circle_and_line(5.0), start, tol=1e-14).x, rtol=1e-12)
+    @jax.jit
+    def of_a(a):
+        near = least_squares_root(circle_and_line(a), start).y
+        slope, bend = jax.jvp(jax.grad(x), (a,), (1.0,))
+        return near, slope, bend, jax.jvp(lambda a: x(a, with_derivatives=False), (a,), (1.0,))[1]
+
+    y, slope, bend, without = of_a(5.0)
+    exact = scipy.optimize.root(lambda y: [y[0] ** 2 + y[1] ** 2 - 5.0, y[1] - 2.0 * y[0]], start, tol=1e-14).x
+    np.testing.assert_allclose(y, exact, rtol=1e-12)
     np.testing.assert_allclose([slope, bend], [0.1, -0.01], rtol=1e-12)
-    assert jax.jit(jax.jacfwd(lambda a: x(a, with_derivatives=False)[0]))(5.0) == 0.0
+    assert without == 0.0
 
 
 def test_in_python():

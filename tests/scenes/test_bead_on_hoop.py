@@ -1,4 +1,7 @@
-"""The bead on the rotating hoop: closed forms, measured periods, the motor's torque, gradients."""
+"""The bead on the rotating hoop: closed forms, measured periods, the motor's torque, gradients.
+
+Formulas are evaluated in NumPy; `python -m lagjax` integrates.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +9,14 @@ import numpy as np
 import pytest
 
 from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, momentum
 from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
 from lagjax.scenes.potentials import agm
 from lagjax.system.constraints import Holonomic
 from lagjax.system.system import System
+from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
-from tests.tiers import exhaustive_but
 
 SLOW, FAST, CRITICAL = scene.PARAMS | {"omega": 2.5}, scene.PARAMS, scene.CRITICAL
 STATE = (1.25, -2.0)
@@ -42,13 +44,13 @@ HOMOCLINIC = "s3.w=6.homoclinic psi(0.5)"
 WORK = "s3.w=6.work_of_motor(0..1.25)"
 
 
-def _work(psi, psi_rate):
+def work(psi, psi_rate):
     """The motor's work from rest at ψ = 1: E(t) - E(0)."""
     return scene.balance(FAST, psi, psi_rate).E - scene.balance(FAST, 1.0, 0.0).E
 
 
-def _single_evaluations():
-    """The value of every key of the section, from a closed form."""
+def single_evaluations():
+    """The value of every key of the section but ψ̈, from a closed form."""
     state = scene.balance(FAST, *STATE)
     slow, fast = scene.small_motion(SLOW), scene.small_motion(FAST)
     values = {
@@ -73,10 +75,9 @@ def _single_evaluations():
         "s3.state.power": state.power,
         "s3.state.N_r": state.radial,
         "s3.state.N_perp": state.sideways,
-        "s3.state.psidd": accelerations(scene.system, 0.0, *STATE, FAST)[0],
         "s3.alpha at w^2=w0^2(1+2^-30)": scene.tilt(2.0**-30),
         "s3.alpha at w^2=w0^2(1+2^-50)": scene.tilt(2.0**-50),
-        WORK: _work(*scene.exact_motion(FAST, 1.0, 1.25)),
+        WORK: work(*scene.exact_motion(FAST, 1.0, 1.25)),
     }
     for omega in (100.0, 1e6):
         params = FAST | {"omega": omega}
@@ -95,25 +96,20 @@ def _single_evaluations():
     return values
 
 
-def _stacked(params_list):
-    return jax.tree.map(lambda *x: jnp.array(x), *params_list)
+def second(params, psi, psi_rate):
+    """ψ̈ from the Lagrangian."""
+    return float(equations(scene.system, 0.0, psi, psi_rate, params).a)
 
 
-@jax.jit
-def _lanes(params, psi, psi_rate, ends, tolerance=1e-10):
-    """Final ψ and ψ̇ of a batch of motions of the bead."""
-
-    def lane(params, psi, psi_rate, end):
-        ts = jnp.stack([jnp.zeros_like(end), end])
-        return integrate(scene.system, psi, psi_rate, params, ts=ts, rtol=tolerance, atol=tolerance).end
-
-    end = jax.vmap(lane)(params, psi, psi_rate, ends)
-    return end.q, end.v
+def rate_of_balance(params, psi, psi_rate, psi_second):
+    """How fast the balance's entries change."""
+    along = lambda q, v, a: jax.jvp(lambda *y: scene.balance(params, *y), (q, v), (v, a))[1]
+    return by_numpy(along)(psi, psi_rate, psi_second)
 
 
 def test_every_reference_value():
     """Each key of the section agrees with its closed form to 1e-12, and none is omitted."""
-    values = _single_evaluations()
+    values = by_numpy(single_evaluations)() | {"s3.state.psidd": second(FAST, *STATE)}
     assert set(values) == set(keys("s3"))
     for key, value in values.items():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
@@ -121,28 +117,31 @@ def test_every_reference_value():
 
 def test_misprints_are_seen():
     """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center are all wrong."""
-    psi_acceleration = accelerations(scene.system, 0.0, *STATE, FAST)[0]
-    _, rate = jax.jvp(lambda *y: scene.balance(FAST, *y), STATE, (STATE[1], float(psi_acceleration)))
-    torque = reference("s3.state.torque")
+    rate, torque = rate_of_balance(FAST, *STATE, second(FAST, *STATE)), reference("s3.state.torque")
     assert float(rate.L_z) == pytest.approx(torque, rel=1e-12)
     assert abs(float(rate.p_psi) - torque) > 0.5 * abs(torque)
     # Not harmonic: the period goes as one over the amplitude.
-    assert float(scene.exact_period(CRITICAL, 2.0**-10) / scene.exact_period(CRITICAL, 2.0**-11)) == pytest.approx(0.5)
-    assert float(scene.frequency(scene.small_motion(CRITICAL).bottom)) == 0.0
+    long, short = (by_numpy(scene.exact_period)(CRITICAL, 2.0**-n) for n in (11, 10))
+    assert short / long == pytest.approx(0.5)
     # On the rim: the distance from the axis is a sin α, which tends to a, not to 0.
-    assert float(jnp.sin(scene.equilibrium_angle(FAST | {"omega": 1e6}))) == pytest.approx(1.0)
+    assert np.sin(by_numpy(scene.equilibrium_angle)(FAST | {"omega": 1e6})) == pytest.approx(1.0)
+    assert scene.MISPRINTS and all("\n" not in line for line in scene.MISPRINTS)
 
 
 def test_exact_motion_obeys_equation_13():
     """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a missing term is detected."""
+    both = by_numpy(lambda params, psi, t: jax.jvp(lambda t: scene.exact_motion(params, psi, t), (t,), (1.0,)))
     for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
-        t = jnp.linspace(0.1, 2.0, 5)
-        at = lambda t: scene.exact_motion(params, psi, t)
-        (angle, rate), (slope, second) = jax.jvp(at, (t,), (jnp.ones_like(t),))
-        np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)
-        right = jax.vmap(lambda q, v: accelerations(scene.system, 0.0, q, v, params)[0])(angle, rate)
-        np.testing.assert_allclose(second, right, rtol=1e-9, atol=1e-9)
-        assert np.max(np.abs(second + params["g"] / params["a"] * jnp.sin(angle))) > 0.1
+        off = []
+        for t in np.linspace(0.1, 2.0, 5):
+            (angle, rate), (slope, bend) = both(params, psi, t)
+            np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)
+            pull = params["g"] / params["a"]
+            right = np.sin(angle) * (params["omega"] ** 2 * np.cos(angle) - pull)
+            np.testing.assert_allclose(bend, right, rtol=1e-9, atol=1e-9)
+            off.append(abs(bend + pull * np.sin(angle)))
+        assert max(off) > 0.1
+    np.testing.assert_allclose(second(params, angle, rate), right, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.exhaustive
@@ -164,43 +163,54 @@ def test_measured_periods():
     assert abs(float(2 * end.t[1]) * reference("s3.w=2.5.Omega_bottom") / (2 * np.pi) - 1) > 1e-3
 
 
+@pytest.mark.exhaustive
 def test_integrated_motions():
     """ψ, ψ̇, the motor's work, the homoclinic orbit and the rotation period are right to 1e-9 at rtol 1e-10."""
+
+    def lane(params, psi, psi_rate, end):
+        ts = jnp.stack([jnp.zeros_like(end), end])
+        return integrate(scene.system, psi, psi_rate, params, ts=ts, rtol=1e-10, atol=1e-10).end
+
     lanes = [(params, psi, 0.0, t) for params, psi, t, _ in MOTIONS.values()]
     lanes += [(FAST, reference("s3.w=6.homoclinic_outer"), 0.0, 0.5)]
     for key, params in ROTATIONS.items():
         lanes.append((params, 0.0, np.sqrt(64.0 + 2 * params["g"] / params["a"]), reference(key)))
-    params, psi, psi_rate, ends = zip(*lanes)
-    q, v = _lanes(_stacked(params), jnp.array(psi), jnp.array(psi_rate), jnp.array(ends))
+    params, psi, psi_rate, ends = jax.tree.map(lambda *x: np.array(x), *lanes)
+    end = jax.jit(jax.vmap(lane))(params, psi, psi_rate, ends)
+    q, v = np.asarray(end.q), np.asarray(end.v)
     for i, (key, (*_, rate_key)) in enumerate(MOTIONS.items()):
-        assert float(q[i]) == pytest.approx(reference(key), rel=1e-9), key
+        assert q[i] == pytest.approx(reference(key), rel=1e-9), key
         if rate_key:
-            assert float(v[i]) == pytest.approx(reference(rate_key), rel=1e-9), rate_key
+            assert v[i] == pytest.approx(reference(rate_key), rel=1e-9), rate_key
     last = len(MOTIONS)
-    assert float(_work(q[last - 1], v[last - 1])) == pytest.approx(reference(WORK), rel=1e-9)
-    assert float(q[last]) == pytest.approx(reference(HOMOCLINIC), rel=1e-9)
+    assert float(work(q[last - 1], v[last - 1])) == pytest.approx(reference(WORK), rel=1e-9)
+    assert q[last] == pytest.approx(reference(HOMOCLINIC), rel=1e-9)
     # A full turn after one period: the missing angle divided by the rate is the error of the period.
-    late = (2 * np.pi - q[last + 1 :]) / v[last + 1 :] / jnp.array(ends)[last + 1 :]
+    late = (2 * np.pi - q[last + 1 :]) / v[last + 1 :] / ends[last + 1 :]
     assert np.max(np.abs(late)) < 1e-9
 
 
 def test_torque_is_the_multiplier():
     """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is detected."""
-    rng = np.random.default_rng(3)
-    for psi, psi_rate, omega in rng.uniform(-3.0, 3.0, (6, 3)):
+    balance = by_numpy(scene.balance)
+    of_systems = by_numpy(
+        lambda q, v, params: (
+            momentum(scene.driven_system, 0.5, q, v, params)["theta"],
+            jacobi_integral(scene.system, 0.0, q["psi"], v["psi"], params),
+        )
+    )
+    for psi, psi_rate, omega in np.random.default_rng(3).uniform(-3.0, 3.0, (4, 3)):
         params = FAST | {"omega": omega}
         q, v = {"psi": psi, "theta": 0.5 * omega}, {"psi": psi_rate, "theta": omega}
-        a, multipliers = accelerations(scene.driven_system, 0.5, q, v, params)
-        state = scene.balance(params, psi, psi_rate)
-        assert float(multipliers["motor"]) == pytest.approx(float(state.torque), rel=1e-12)
-        _, rate = jax.jvp(lambda *y: scene.balance(params, *y), (psi, psi_rate), (psi_rate, float(a["psi"])))
-        assert float(rate.L_z) == pytest.approx(float(multipliers["motor"]), rel=1e-11)
-        assert float(rate.E) == pytest.approx(float(omega * multipliers["motor"]), rel=1e-11)
-        assert abs(float(rate.E + omega * multipliers["motor"])) > 0.1 * abs(float(rate.E))
-        assert abs(float(rate.h)) < 1e-12
+        found = equations(scene.driven_system, 0.5, q, v, params)
+        torque, state = float(found.multipliers["motor"]), balance(params, psi, psi_rate)
+        assert torque == pytest.approx(float(state.torque), rel=1e-12)
+        rate = rate_of_balance(params, psi, psi_rate, found.a["psi"])
+        assert [rate.L_z, rate.E] == pytest.approx([torque, omega * torque], rel=1e-11)
+        assert abs(rate.E + omega * torque) > 0.1 * abs(rate.E)
+        assert abs(rate.h) < 1e-12
         # L_z of the hoop at the angle θ is the momentum of θ; E - ω L_z is the Jacobi integral of ψ alone.
-        assert float(momentum(scene.driven_system, 0.5, q, v, params)["theta"]) == pytest.approx(float(state.L_z))
-        assert float(jacobi_integral(scene.system, 0.0, psi, psi_rate, params)) == pytest.approx(float(state.h))
+        assert of_systems(q, v, params) == pytest.approx((float(state.L_z), float(state.h)))
 
 
 def test_normal_forces_are_multipliers():
@@ -214,7 +224,7 @@ def test_normal_forces_are_multipliers():
     free = System(lagrangian, constraints={"hoop": hoop, "motor": Holonomic(scene.motor)})
     psi, psi_rate = STATE
     q, v = {"r": 0.75, "psi": psi, "theta": 0.0}, {"r": 0.0, "psi": psi_rate, "theta": 6.0}
-    _, multipliers = accelerations(free, 0.0, q, v, FAST)
+    multipliers = equations(free, 0.0, q, v, FAST).multipliers
     assert float(multipliers["hoop"]) == pytest.approx(reference("s3.state.N_r"), rel=1e-12)
     sideways = float(multipliers["motor"]) / (FAST["a"] * np.sin(psi))
     assert sideways == pytest.approx(reference("s3.state.N_perp"), rel=1e-12)
@@ -222,18 +232,18 @@ def test_normal_forces_are_multipliers():
 
 def test_speed_zero_amplitude_and_reversal():
     """At ω = ω0 nothing is NaN; below it α = 0 with a zero gradient; ω < 0 changes only τ, L_z and N_perp."""
-    squares = scene.small_motion(CRITICAL)
-    assert (float(squares.bottom), float(squares.alpha)) == (0.0, 0.0)
-    assert float(scene.equilibrium_angle(CRITICAL)) == 0.0
-    assert float(jax.grad(lambda w: scene.equilibrium_angle(SLOW | {"omega": w}))(2.5)) == 0.0
-    assert float(scene.equilibrium_angle(FAST | {"g": 0.0})) == pytest.approx(np.pi / 2)
-    state, mirrored = scene.balance(FAST, *STATE), scene.balance(FAST | {"omega": -6.0}, *STATE)
+    squares, angle = by_numpy(scene.small_motion)(CRITICAL), by_numpy(scene.equilibrium_angle)
+    assert (squares.bottom, squares.alpha, by_numpy(scene.frequency)(squares.bottom)) == (0.0, 0.0, 0.0)
+    assert angle(CRITICAL) == 0.0
+    assert by_numpy(jax.grad(lambda w: scene.equilibrium_angle(SLOW | {"omega": w})))(2.5) == 0.0
+    assert angle(FAST | {"g": 0.0}) == pytest.approx(np.pi / 2)
+    state, mirrored = (by_numpy(scene.balance)(FAST | {"omega": w}, *STATE) for w in (6.0, -6.0))
     for name in state._fields:
         sign = -1 if name in ("torque", "L_z", "sideways") else 1
-        assert float(getattr(mirrored, name)) == sign * float(getattr(state, name)), name
+        assert getattr(mirrored, name) == sign * getattr(state, name), name
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pitchfork_over_speeds():
     """One vmap over ω through the pitchfork: beads with friction settle at 0 below ω0 and at ±α above it."""
     speeds = scene.natural_rate(FAST) * jnp.array([0.2, 0.6, 0.85, 1.2, 1.6, 2.4])
@@ -297,35 +307,19 @@ def _driven_final(params):
     return jnp.stack([end.q["psi"], end.v["psi"], end.multipliers["motor"]])
 
 
-def _check_gradient(derivative, function):
-    """Compare a derivative in m, a, g, ω with that of Jacobi's functions; return the latter."""
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    ("derivative", "function"), [(jax.jacrev, _final), (jax.jacrev, _driven_final), (jax.jacfwd, _driven_final)]
+)
+def test_gradients(derivative, function):
+    """The final state's, and the motor's torque's, in m, a, g and ω, agree with the elliptic functions' to 1e-6."""
     params = jax.tree.map(jnp.asarray, FAST)
-    got = jax.jit(derivative(function))(params)
-    exact = jax.jacfwd(_exact_final)(params)
+    got, exact = jax.jit(derivative(function))(params), jax.jacfwd(_exact_final)(params)
     largest = max(float(jnp.max(jnp.abs(column))) for column in exact.values())
     for name, column in exact.items():
         # The state does not depend on m: its zero is compared with the size of the other columns.
         expected = column[: got[name].size]
         np.testing.assert_allclose(got[name], expected, rtol=1e-6, atol=1e-9 * largest, err_msg=name)
-    return exact
-
-
-@pytest.mark.exhaustive
-def test_reverse_gradient_of_state():
-    """The final ψ and ψ̇, in reverse mode in m, a, g and ω, agree with the elliptic functions' gradient to 1e-6."""
-    _check_gradient(jax.jacrev, _final)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("derivative", exhaustive_but((jax.jacrev,), (jax.jacfwd, jax.jacrev)))
-def test_gradient_of_torque(derivative):
-    """So do the driven bead's state and the motor's torque, in both modes, including the torque's explicit ω."""
-    exact = _check_gradient(derivative, _driven_final)
-    # Twin: the gradient through the state alone differs.
+    # Twin: the gradient through the state alone differs: the torque contains ω.
     explicit = _exact_final(FAST)[2] / FAST["omega"]
     assert abs(float(explicit)) > 1e-3 * abs(float(exact["omega"][2]))
-
-
-def test_misprints():
-    """Every misprint is one line."""
-    assert scene.MISPRINTS and all("\n" not in line for line in scene.MISPRINTS)

@@ -1,4 +1,7 @@
-"""The carriage on the rotating rails: two frames, modes and stability, the energy balance, gradients."""
+"""The carriage on the rotating rails: two frames, modes and stability, the energy balance, gradients.
+
+Formulas are evaluated in NumPy; `python -m lagjax` integrates.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +10,11 @@ import numpy as np
 import pytest
 
 from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
 from lagjax.mechanics.lagrangian import jacobi_integral, momentum
 from lagjax.report import relative_error
 from lagjax.scenes import cross_rails as scene
 from lagjax.system.system import System
+from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
 
 PARAMS, Q0, V0 = scene.PARAMS, scene.Q0, scene.V0
@@ -22,6 +25,9 @@ AT = {
     "critical": PARAMS | {"omega": float(np.sqrt(40.0))},
 }
 ISOTROPIC = PARAMS | {"K": 8.0, "omega": 3.0}
+exact_motion = by_numpy(scene.exact_motion)
+balance = by_numpy(scene.balance)
+mode_squares = by_numpy(scene.mode_squares)
 
 
 def _state_values(stem, params, q, v):
@@ -93,27 +99,27 @@ def _solve(system, q0, v0, params, ts, tolerance):
 
 def test_every_reference_value():
     """Each key of the section agrees with its closed form to 1e-12, and none is omitted."""
-    values = _single_evaluations()
+    values = by_numpy(_single_evaluations)()
     assert set(values) == set(keys("s6"))
     for key, value in values.items():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
 
 
-def _integrated_errors(tolerance):
-    ts = [0.0, 1.0, 10.0]
-    runs = {params["omega"]: _solve(scene.rotating_system, Q0, V0, params, ts, tolerance) for params in AT.values()}
-
-    def motion(params, t):
-        trajectory = runs[params["omega"]]
-        return jax.tree.map(lambda x: x[ts.index(t)], (trajectory.q, trajectory.v))
-
-    return {key: abs(float(value) / reference(key) - 1) for key, value in _motion_values(motion).items()}
-
-
+@pytest.mark.exhaustive
 def test_integrated_motions():
     """Every state, energy and power after 1 s and 10 s is right to 1e-9 at tolerance 1e-10, but not at 1e-8."""
-    assert max(_integrated_errors(1e-10).values()) < 1e-9
-    assert max(_integrated_errors(1e-8).values()) > 1e-9
+    ts = [0.0, 1.0, 10.0]
+
+    def errors(tolerance):
+        runs = {params["omega"]: _solve(scene.rotating_system, Q0, V0, params, ts, tolerance) for params in AT.values()}
+
+        def motion(params, t):
+            trajectory = runs[params["omega"]]
+            return jax.tree.map(lambda x: x[ts.index(t)], (trajectory.q, trajectory.v))
+
+        return [abs(float(value) / reference(key) - 1) for key, value in _motion_values(motion).items()]
+
+    assert max(errors(1e-10)) < 1e-9 < max(errors(1e-8))
 
 
 def test_exact_motion_is_the_matrix_exponential():
@@ -133,7 +139,7 @@ def test_exact_motion_is_the_matrix_exponential():
             )
             with mpmath.workdps(40):
                 z = mpmath.expm(3 * matrix) * mpmath.matrix([1, 0.125, 0.25, -0.5, 1])
-            q, v = scene.exact_motion(params, Q0, V0, 3.0)
+            q, v = exact_motion(params, Q0, V0, 3.0)
             got = np.array([q["R"], q["r"], v["R"], v["r"]])
             expected = np.array([float(x) for x in z[:4]])
             assert np.max(np.abs(got - expected)) < 1e-12 * np.max(np.abs(expected)), (omega, K)
@@ -165,85 +171,84 @@ def test_frames_agree_after_a_hundred_turns():
 def test_books_balance_at_random_states():
     """dL_z/dt = τ, dE/dt = ωτ, dh'/dt = 0, h' = E - ωL_z; the factor-1 equations fail the first two, not the third."""
     rng = np.random.default_rng(6)
-    for _ in range(4):
+    rates = by_numpy(lambda params, q, v, a: jax.jvp(lambda q, v: scene.balance(params, q, v), (q, v), (v, a))[1])
+    of_system = by_numpy(lambda q, v, params: jacobi_integral(scene.rotating_system, 0.0, q, v, params))
+    for _ in range(3):
         R, r, R_rate, r_rate, omega = rng.uniform(-2.0, 2.0, 5)
         params = PARAMS | {"omega": omega}
         q, v = {"R": R, "r": r}, {"R": R_rate, "r": r_rate}
-        books = scene.balance(params, q, v)
+        books = balance(params, q, v)
         assert float(books.h) == pytest.approx(float(books.E - omega * books.L_z), rel=1e-12)
-        assert float(books.h) == pytest.approx(float(jacobi_integral(scene.rotating_system, 0.0, q, v, params)))
+        assert float(books.h) == pytest.approx(float(of_system(q, v, params)))
         for system, right in ((scene.rotating_system, True), (seed_system, False)):
-            a, _ = accelerations(system, 0.0, q, v, params)
-            _, rate = jax.jvp(lambda q, v: scene.balance(params, q, v), (q, v), (v, a))
-            scale = abs(float(books.power)) + abs(float(books.torque))
-            assert abs(float(rate.h)) < 1e-12 * scale
-            assert (abs(float(rate.L_z - books.torque)) < 1e-12 * scale) == right
-            assert (abs(float(rate.E - books.power)) < 1e-12 * scale) == right
+            rate = rates(params, q, v, equations(system, 0.0, q, v, params).a)
+            scale = abs(books.power) + abs(books.torque)
+            assert abs(rate.h) < 1e-12 * scale
+            assert (abs(rate.L_z - books.torque) < 1e-12 * scale) == right
+            assert (abs(rate.E - books.power) < 1e-12 * scale) == right
 
 
 def test_lab_lagrangian_and_printed_kinetic_energy():
     """The two forms of L are the same function of the motion, including m; T without m is detected."""
     t, params = 0.7, PARAMS
-    q, v = scene.to_lab(params, t, Q0, V0)
-    L = scene.rotating_lagrangian(t, Q0, V0, params)
-    assert float(scene.lab_lagrangian(t, q, v, params)) == pytest.approx(float(L), rel=1e-13)
+    q, v = by_numpy(scene.to_lab)(params, t, Q0, V0)
+    L = float(by_numpy(scene.rotating_lagrangian)(t, Q0, V0, params))
+    assert by_numpy(scene.lab_lagrangian)(t, q, v, params) == pytest.approx(L, rel=1e-13)
     T = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2)
-    assert abs(float(T / params["m"] - T)) > 0.1 * abs(float(L))
-    p = momentum(scene.rotating_system, t, Q0, V0, params)
-    assert float(Q0["R"] * p["r"] - Q0["r"] * p["R"]) == pytest.approx(reference("s6.w=2.5.Lz(0)"), rel=1e-14)
+    assert abs(T / params["m"] - T) > 0.1 * abs(L)
+    assert relative_error(by_numpy(scene.to_rotating)(params, t, q, v), (Q0, V0)) < 1e-14
+    p = by_numpy(lambda q, v, params: momentum(scene.rotating_system, t, q, v, params))(Q0, V0, params)
+    assert Q0["R"] * p["r"] - Q0["r"] * p["R"] == pytest.approx(reference("s6.w=2.5.Lz(0)"), rel=1e-14)
 
 
 def test_equations_and_equilibrium():
     """The accelerations have the factor 2; R_eq is a solution, above R0 below K/m, and beyond the axis above K/m."""
+    rest = {"R": 0.0, "r": 0.0}
     for params in (PARAMS, AT["8"]):
-        omega, m = params["omega"], params["m"]
-        a, _ = accelerations(scene.rotating_system, 0.0, Q0, V0, params)
-        rest, _ = accelerations(scene.rotating_system, 0.0, Q0, {"R": 0.0, "r": 0.0}, params)
-        assert float(a["R"] - rest["R"]) == pytest.approx(2 * omega * V0["r"], rel=1e-12)
-        assert float(a["r"] - rest["r"]) == pytest.approx(-2 * omega * V0["R"], rel=1e-12)
-        length = float(scene.equilibrium_length(params))
-        at, _ = accelerations(scene.rotating_system, 0.0, {"R": length, "r": 0.0}, {"R": 0.0, "r": 0.0}, params)
-        assert abs(float(at["R"])) < 1e-12 * params["K"] / m and float(at["r"]) == 0.0
-    assert float(scene.equilibrium_length(PARAMS)) > PARAMS["R0"]
-    assert float(scene.equilibrium_length(AT["8"])) < 0.0
+        length = float(by_numpy(scene.equilibrium_length)(params))
+        states = (Q0, V0), (Q0, rest), ({"R": length, "r": 0.0}, rest)
+        a, still, there = (equations(scene.rotating_system, 0.0, *state, params).a for state in states)
+        turning = 2 * params["omega"] * np.array([V0["r"], -V0["R"]])
+        np.testing.assert_allclose([a["R"] - still["R"], a["r"] - still["r"]], turning, rtol=1e-12)
+        assert abs(there["R"]) < 1e-12 * params["K"] / params["m"] and there["r"] == 0.0
+        assert length > PARAMS["R0"] if params is PARAMS else length < 0.0
 
 
 def test_no_turning_and_backward_turning():
     """At ω = 0 the springs oscillate independently and h' = E; -ω mirrors r and L_z, which +ω does not."""
     still = PARAMS | {"omega": 0.0}
-    q, _ = scene.exact_motion(still, Q0, V0, 1.5)
+    q, _ = exact_motion(still, Q0, V0, 1.5)
     fast, slow = np.sqrt(40.0), 4.0
     assert float(q["R"]) == pytest.approx(0.75 + 0.25 * np.cos(fast * 1.5) + 0.25 * np.sin(fast * 1.5) / fast)
     assert float(q["r"]) == pytest.approx(0.125 * np.cos(slow * 1.5) - 0.5 * np.sin(slow * 1.5) / slow)
-    books = scene.balance(still, Q0, V0)
+    books = balance(still, Q0, V0)
     assert float(books.h) == float(books.E)
     mirror = {"R": 1.0, "r": -1.0}
     flip = lambda state: jax.tree.map(lambda x, sign: sign * x, state, mirror)
-    forward = scene.exact_motion(PARAMS, Q0, V0, 1.5)
+    forward = exact_motion(PARAMS, Q0, V0, 1.5)
     for omega, right in ((-2.5, True), (2.5, False)):
-        backward = scene.exact_motion(PARAMS | {"omega": omega}, flip(Q0), flip(V0), 1.5)
+        backward = exact_motion(PARAMS | {"omega": omega}, flip(Q0), flip(V0), 1.5)
         assert (relative_error(tuple(map(flip, backward)), forward) < 1e-13) == right
 
 
 def test_modes_and_verdict():
     """Modes are the eigenvalues of the linear equations, the verdict their growth; factor 1 gives other modes."""
-    rng = np.random.default_rng(7)
+    rng, is_stable = np.random.default_rng(7), by_numpy(scene.is_stable)
     for m, K, k, omega in rng.uniform(0.2, 5.0, (40, 4)):
         params = PARAMS | {"m": m, "K": K, "k": k, "omega": omega}
         block = np.array([[omega**2 - K / m, 0.0], [0.0, omega**2 - k / m]])
         turn = np.array([[0.0, 2 * omega], [-2 * omega, 0.0]])
         modes = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [block, turn]]))
-        squares = scene.mode_squares(params)
+        squares, stable = mode_squares(params), is_stable(params)
         expected = sorted(np.real(-(modes**2)))
         np.testing.assert_allclose(expected[::3], [squares.slow, squares.fast], rtol=1e-8, atol=1e-10)
-        assert bool(scene.is_stable(params)) == (np.max(modes.real) < 1e-6)
+        assert bool(stable) == (np.max(modes.real) < 1e-6)
         wrong = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [block, 0.5 * turn]]))
-        assert np.min(np.abs(wrong[:, None] ** 2 + float(squares.fast))) > 1e-3
+        assert np.min(np.abs(wrong[:, None] ** 2 + squares.fast)) > 1e-3
     # The strongest growth is a maximum over ω.
-    rate, speed = scene.strongest_growth(PARAMS)
-    near = jnp.sqrt(-scene.mode_squares(PARAMS | {"omega": speed * jnp.array([0.99, 1.0, 1.01])}).slow)
-    assert float(near[1]) == pytest.approx(float(rate), rel=1e-12)
-    assert float(jnp.max(near)) == float(near[1])
+    rate, speed = by_numpy(scene.strongest_growth)(PARAMS)
+    near = np.sqrt([-mode_squares(PARAMS | {"omega": speed * x}).slow for x in (0.99, 1.0, 1.01)])
+    assert near[1] == pytest.approx(float(rate), rel=1e-12) and np.max(near) == near[1]
 
 
 def test_slow_mode_near_a_critical_speed():
@@ -254,7 +259,7 @@ def test_slow_mode_near_a_critical_speed():
             squared = mpmath.mpf(params["omega"]) ** 2
             half_sum, product = 28 + squared, (16 - squared) * (40 - squared)
             exact = float(half_sum - mpmath.sqrt(half_sum**2 - product))
-        assert float(scene.mode_squares(params).slow) == pytest.approx(exact, rel=1e-12)
+        assert float(mode_squares(params).slow) == pytest.approx(exact, rel=1e-12)
         half_sum = 28 + params["omega"] ** 2
         by_difference = half_sum - np.sqrt(half_sum**2 - (16 - params["omega"] ** 2) * (40 - params["omega"] ** 2))
         assert abs(by_difference / exact - 1) > 1e-6
@@ -262,9 +267,9 @@ def test_slow_mode_near_a_critical_speed():
 
 def test_escape_at_the_critical_speed():
     """At ω² = K/m the mean motion of the exact solution is ½ a t² and b t, with a and b as in closed form."""
-    t = jnp.array([2e4, 4e4])
-    q, _ = scene.exact_motion(AT["critical"], Q0, V0, t)
-    a, b = scene.escape(PARAMS)
+    t = np.array([2e4, 4e4])
+    q, _ = exact_motion(AT["critical"], Q0, V0, t)
+    a, b = by_numpy(scene.escape)(PARAMS)
     second = 2 * (q["R"][1] - 2 * q["R"][0]) / (t[1] ** 2 - 2 * t[0] ** 2)
     # The remaining oscillation is of order one in 1e9.
     assert float(second) == pytest.approx(float(a), rel=1e-6)
@@ -277,8 +282,10 @@ def _final(params):
     return jnp.stack([end.q["R"], end.q["r"], end.v["R"], end.v["r"]])
 
 
-def _check_gradient(derivative):
-    """Compare the derivative of the final state in m, K, k, R0, ω with that of the matrix exponential."""
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_gradients(derivative):
+    """The final state, in both modes in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
     params = jax.tree.map(jnp.asarray, PARAMS)
     got = jax.jit(derivative(_final))(params)
     of_exact = jax.jacfwd(lambda params: scene.exact_motion(params, Q0, V0, 1.0))
@@ -290,24 +297,12 @@ def _check_gradient(derivative):
             assert bool(jnp.allclose(got[name], expected, rtol=1e-6, atol=0)) == right, name
 
 
-@pytest.mark.exhaustive
-def test_forward_gradient():
-    """The final state, in forward mode in m, K, k, R0 and ω, has the matrix exponential's gradient to 1e-6."""
-    _check_gradient(jax.jacfwd)
-
-
-@pytest.mark.exhaustive
-def test_reverse_gradient():
-    """The same holds in reverse mode."""
-    _check_gradient(jax.jacrev)
-
-
 def test_exact_gradient_at_critical_speeds():
     """The exact motion is smooth in ω through the critical speed k/m: its derivative is the difference quotient."""
     at = lambda omega: scene.exact_motion(PARAMS | {"omega": omega}, Q0, V0, 1.0)[0]["r"]
-    slope = float(jax.grad(at)(4.0))
-    step = 2.0**-14
-    assert float(at(4.0 + step) - at(4.0 - step)) / (2 * step) == pytest.approx(slope, rel=1e-6)
+    of, step = by_numpy(at), 2.0**-14
+    slope = float(by_numpy(jax.grad(at))(4.0))
+    assert float(of(4.0 + step) - of(4.0 - step)) / (2 * step) == pytest.approx(slope, rel=1e-6)
 
 
 def test_misprints():

@@ -11,6 +11,7 @@ import lagjax as lj
 from lagjax.mechanics.equations import equations_of
 from lagjax.scenes import sliding_wedge as wedge
 from lagjax.system.model import model_of
+from tests.by_numpy import by_numpy
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 
@@ -30,17 +31,22 @@ CASES = {
 NOT_AT_1E_12 = {"alpha=pi/2-2^-30 (exact real)": 2e-7}
 
 
-def at_the_start(params):
-    """Accelerations and multipliers at the start."""
-    start = 0.0, wedge.Q0, wedge.V0
-    return equations_of(model_of(wedge.system, *start, params)).accelerations(*start)
+RATIOS, ANGLES = (x.ravel() for x in np.meshgrid(2.0 ** np.arange(-40, 41, 8), np.linspace(0.0, np.pi / 2, 9)))
+GRID = [{"m": m, "M": 1.0, "alpha": alpha} for m, alpha in zip(RATIOS, ANGLES)]
+CHANGES = {"": {}, **CASES, "massless": {"M": 0.0}, **dict(enumerate(GRID))}
 
 
 @pytest.fixture(scope="module")
 def solved():
-    """Accelerations and multipliers of all cases, through one compiled function."""
-    solve = jax.jit(at_the_start)
-    return {name: solve(PARAMS | change) for name, change in {"": {}, **CASES}.items()}
+    """Accelerations and multipliers at the start in all cases, by one program for lanes."""
+
+    def at_the_start(params):
+        start = 0.0, wedge.Q0, wedge.V0
+        return equations_of(model_of(wedge.system, *start, params)).accelerations(*start)
+
+    params = jax.tree.map(lambda *x: np.array(x), *(PARAMS | change for change in CHANGES.values()))
+    lanes = jax.tree.map(np.asarray, jax.jit(jax.vmap(at_the_start))(params))
+    return {name: jax.tree.map(lambda x, i=i: x[i], lanes) for i, name in enumerate(CHANGES)}
 
 
 def named(a, multipliers, params):
@@ -128,16 +134,15 @@ def test_motion(motions):
     assert abs(wedge.horizontal_momentum(PARAMS, v) - reference("s5.p_x(t)")) < 1e-12
 
 
-@pytest.mark.slow
-def test_signs_of_the_work(motions):
+def test_signs_of_the_work(solved):
     """The normal force brakes the particle and drives the wedge; both signs of the source are wrong."""
-    traj = motions["rest"]
-    on_particle, on_wedge = wedge.power_of_normal_force(PARAMS, traj.v, traj.multipliers["incline"])
-    assert float(on_particle[-1]) < 0 < float(on_wedge[-1])
-    gained = 0.5 * PARAMS["M"] * traj.v["X"][-1] ** 2
-    np.testing.assert_allclose(on_wedge[-1], 2 * gained / T, rtol=1e-9)
-    printed = -on_wedge[-1]
-    assert abs(printed - 2 * gained / T) > 1.0
+    a, multipliers = solved[""]
+    v = {name: T * x for name, x in a.items()}
+    on_particle, on_wedge = by_numpy(wedge.power_of_normal_force)(PARAMS, v, multipliers["incline"])
+    assert on_particle < 0 < on_wedge
+    gained = 0.5 * PARAMS["M"] * v["X"] ** 2
+    np.testing.assert_allclose(on_wedge, 2 * gained / T, rtol=1e-12)
+    assert abs(-on_wedge - 2 * gained / T) > 1.0
 
 
 def test_misprinted_relation_breaks_the_momentum(solved):
@@ -150,24 +155,27 @@ def test_misprinted_relation_breaks_the_momentum(solved):
     np.testing.assert_allclose(a["y"], a["x"] * (1 + m / M) * tan, rtol=1e-13)
 
 
-def test_massless_wedge():
+def test_massless_wedge(solved):
     """M = 0: the mass matrix is singular, the equations are not; the particle falls freely, Ẍ = -g cot α."""
-    a, multipliers = lj.accelerations(wedge.system, 0.0, wedge.Q0, wedge.V0, PARAMS | {"M": 0.0})
+    a, multipliers = solved["massless"]
     np.testing.assert_allclose([a["x"], a["y"]], [0.0, PARAMS["g"]], atol=1e-15)
     np.testing.assert_allclose(a["X"], -PARAMS["g"] / np.tan(PARAMS["alpha"]), rtol=1e-14)
     assert abs(multipliers["incline"]) < 1e-14
 
 
-def test_sweep_over_mass_ratio_and_angle():
-    """One vmap over m/M from 2^-40 to 2^40 and α from 0 to π/2 agrees with the closed form everywhere."""
-    ratios, angles = 2.0 ** np.arange(-40, 41, 8), np.linspace(0.0, np.pi / 2, 9)
-    grid = [x.ravel() for x in np.meshgrid(ratios, angles)]
-    at = lambda ratio, alpha: PARAMS | {"m": ratio, "M": 1.0, "alpha": alpha}
-    solve = lambda r, al: at_the_start(at(r, al))
-    a, multipliers = jax.jit(jax.vmap(solve))(*grid)
-    exact = jax.vmap(lambda r, al: wedge.exact_accelerations(at(r, al)))(*grid)
-    for got, expected in ((a["x"], exact.x), (a["y"], exact.y), (a["X"], exact.X), (multipliers["incline"], exact[3])):
-        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-300)
+def test_sweep_over_mass_ratio_and_angle(solved):
+    """For m/M from 2^-40 to 2^40 and α from 0 to π/2 the closed form agrees everywhere, and is a motion."""
+    exact = by_numpy(wedge.exact_accelerations)(PARAMS | {"m": RATIOS, "M": np.ones(RATIOS.shape), "alpha": ANGLES})
+    for i, expected in enumerate(zip(exact.x, exact.y, exact.X, exact.incline)):
+        a, multipliers = solved[i]
+        got = a["x"], a["y"], a["X"], multipliers["incline"]
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-300, err_msg=str(GRID[i]))
+    start = wedge.start_on_incline(PARAMS, X=0.25, X_rate=0.5, along=0.125, along_rate=-0.75)
+    q, v = by_numpy(lambda t: wedge.exact_motion(PARAMS, *start, t))(T)
+    got = {"init.x(t)": q["x"], "init.X(t)": q["X"], "init.p_x": wedge.horizontal_momentum(PARAMS, v)}
+    for name, value in got.items():
+        assert value == pytest.approx(reference(f"s5.{name}"), rel=1e-12), name
+    assert v["y"] / (v["x"] - v["X"]) == pytest.approx(np.tan(PARAMS["alpha"]), rel=1e-12)
 
 
 def outcome(params):

@@ -1,4 +1,7 @@
-"""Geodesics on the sphere, in both forms, against great circles and the reference values of source §1."""
+"""Geodesics on the sphere, in both forms, against great circles and the reference values of source §1.
+
+Formulas are evaluated in NumPy; `python -m lagjax` integrates.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +9,9 @@ import numpy as np
 import pytest
 
 from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
-from lagjax.mechanics.lagrangian import jacobi_integral, mass_matrix
+from lagjax.mechanics.lagrangian import jacobi_integral
 from lagjax.scenes import sphere_geodesic as geodesic
+from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference, reference_inputs
 
 PARAMS, R = geodesic.PARAMS, geodesic.PARAMS["R"]
@@ -24,6 +27,10 @@ NAMES = {
 }
 
 
+plane_and_arc = by_numpy(geodesic.plane_and_arc)
+over_azimuth = by_numpy(geodesic.exact_over_azimuth)
+
+
 def ends_of(pair):
     """ψ₁, θ₁, ψ₂, θ₂ of a pair of points in the references."""
     return tuple(reference_inputs(pair + ".inputs"))
@@ -33,38 +40,38 @@ def single_evaluations():
     """Every key with the scene's value; the inputs are used, not checked."""
     got = {}
     for pair in PAIRS:
-        circle = geodesic.great_circle(*ends_of(pair))
-        got[pair + ".length"] = geodesic.distance(PARAMS, *ends_of(pair))
+        circle = plane_and_arc(*ends_of(pair))
+        got[pair + ".length"] = R * circle.angle
         # Meridians have no A and B; the vertex is listed for one pair only.
         got |= {f"{pair}.{key}": getattr(circle, name) for key, name in NAMES.items() if f"{pair}.{key}" in keys(pair)}
-    circle = geodesic.great_circle(*ends_of("s1.generic"))
+    circle = plane_and_arc(*ends_of("s1.generic"))
     got["s1.generic.A2+B2"] = circle.A**2 + circle.B**2
-    along = geodesic.exact_over_azimuth(circle.A, circle.B, 1.25)
+    along = over_azimuth(circle.A, circle.B, 1.25)
     got["s1.generic.psi_at_theta=1.25"], got["s1.generic.dpsi/dtheta_at_1.25"] = along
     near = ends_of("s1.near_pole")
     got["s1.near_pole.planar_limit"] = 2 * R * near[0] * np.sin(0.5)
-    major = 2 * np.pi - geodesic.great_circle(*ends_of("s1.dtheta>pi")).angle
+    major = 2 * np.pi - plane_and_arc(*ends_of("s1.dtheta>pi")).angle
     got["s1.dtheta>pi.major_arc_length"] = R * major
     got["s1.dtheta>pi.second_variation_coeff"] = geodesic.second_variation(major)
     return got
 
 
 def test_great_circles_match_the_references():
-    """Plane, length, middle and vertex agree to 1e-12 for all pairs: the formulas handle ill-conditioned inputs."""
-    for key, value in single_evaluations().items():
+    """Plane, length, middle and vertex agree to 1e-12 for all pairs: the formulas handle ill-conditioned inputs.
+
+    No key of §1 is omitted: keys that are not compared are inputs.
+    """
+    found = single_evaluations()
+    for key, value in found.items():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
-
-
-def test_every_key_is_checked():
-    """No key of §1 is omitted: keys that are not compared are inputs."""
-    assert set(single_evaluations()) | {pair + ".inputs" for pair in PAIRS} == set(keys("s1"))
+    assert set(found) | {pair + ".inputs" for pair in PAIRS} == set(keys("s1"))
 
 
 @pytest.mark.parametrize("pair", ["s1.tiny_sep", "s1.near_pole", "s1.near_antipodal_1e-12"])
 def test_textbook_formulas_lose_what_ours_keep(pair):
     """arccos(p₁·p₂) loses all digits of a short length, and p₁ × p₂ of rounded points of a near-antipodal plane."""
     psi1, theta1, psi2, theta2 = ends_of(pair)
-    one, two = (np.asarray(geodesic.cartesian({"R": 1.0}, *p)) for p in ((psi1, theta1), (psi2, theta2)))
+    one, two = (by_numpy(geodesic.cartesian)({"R": 1.0}, *p) for p in ((psi1, theta1), (psi2, theta2)))
     normal = np.cross(one, two)
     by_arccos = R * np.arccos(min(one @ two, 1.0)) / reference(pair + ".length") - 1
     by_cross = -normal[0] / normal[2] / reference(pair + ".A") - 1
@@ -72,27 +79,25 @@ def test_textbook_formulas_lose_what_ours_keep(pair):
 
 
 @pytest.mark.parametrize(
-    "ends",
-    [(1.0, 0.5, 1.0, 0.5), (1.0, 0.5, 1.0, 0.5 + 2 * np.pi), (0.0, 0.25, 0.0, 2.0)],
+    ("how", "length", "ends"),
+    [
+        ("coincide", 0.0, (1.0, 0.5, 1.0, 0.5)),
+        ("coincide", 0.0, (1.0, 0.5, 1.0, 0.5 + 2 * np.pi)),
+        ("coincide", 0.0, (0.0, 0.25, 0.0, 2.0)),
+        ("are antipodal", np.pi * R, (0.0, 0.0, np.pi, 1.0)),
+        ("are antipodal", np.pi * R, (0.75, 0.25, np.pi - 0.75, 0.25 + np.pi)),
+    ],
 )
-def test_coincident_points_have_no_plane(ends):
-    """The same point twice, once around, or the pole with two azimuths has length zero and no plane."""
-    with pytest.raises(ValueError, match="coincide: the plane.*not determined"):
+def test_points_without_a_plane(how, length, ends):
+    """The same point twice, once around, or the pole with two azimuths, and antipodal points: only a length."""
+    with pytest.raises(ValueError, match=f"{how}: the plane.*not determined"):
         geodesic.great_circle(*ends)
-    assert float(geodesic.distance(PARAMS, *ends)) < 1e-14
-
-
-@pytest.mark.parametrize("ends", [(0.0, 0.0, np.pi, 1.0), (0.75, 0.25, np.pi - 0.75, 0.25 + np.pi)])
-def test_antipodal_points_have_no_plane(ends):
-    """Points that are antipodal to round-off have the length π R and no plane."""
-    with pytest.raises(ValueError, match="are antipodal: the plane.*not determined"):
-        geodesic.great_circle(*ends)
-    assert float(geodesic.distance(PARAMS, *ends)) == pytest.approx(np.pi * R, rel=1e-15)
+    assert float(geodesic.distance(PARAMS, *ends)) == pytest.approx(length, rel=1e-15, abs=1e-14)
 
 
 def test_the_source_is_wrong_where_said():
     """A² + B² = tan²i may exceed one, and the misprinted first line is not Lagrange's equation of f."""
-    steep = geodesic.great_circle(*ends_of("s1.steep(incl>45: A2+B2>1)"))
+    steep = plane_and_arc(*ends_of("s1.steep(incl>45: A2+B2>1)"))
     assert float(steep.A**2 + steep.B**2) == pytest.approx(1 / float(steep.clairaut) ** 2 - 1, rel=1e-12)
     assert steep.A**2 + steep.B**2 > 1
     assert len(geodesic.MISPRINTS) == 6
@@ -101,38 +106,62 @@ def test_the_source_is_wrong_where_said():
 def test_lagranges_equation_of_the_arc_length():
     """ψ'' sin²ψ = 2 ψ'² sin ψ cos ψ + sin³ψ cos ψ, M = sin²ψ/f³ and h = -cos i at random states, from L alone."""
     rng = np.random.default_rng(1)
-    for psi, slope in zip(rng.uniform(0.2, 2.9, 8), rng.normal(size=8)):
+    constant = by_numpy(lambda q, v: jacobi_integral(geodesic.over_azimuth, 0.0, q, v, PARAMS))
+    for psi, slope in zip(rng.uniform(0.2, 2.9, 5), rng.normal(size=5)):
         s, c = np.sin(psi), np.cos(psi)
         f = np.hypot(s, slope)
-        state = (geodesic.over_azimuth, 0.0, psi, slope, PARAMS)
-        a = float(accelerations(*state)[0])
-        assert a == pytest.approx((2 * slope**2 * s * c + s**3 * c) / s**2, rel=1e-11)
-        assert a != pytest.approx((2 * slope**2 * s * c - s**3 * c) / s**2, rel=1e-3)
-        assert float(mass_matrix(*state)[0, 0]) == pytest.approx(s**2 / f**3, rel=1e-12)
-        assert float(jacobi_integral(*state)) == pytest.approx(-(s**2) / f, rel=1e-12)
+        found = equations(geodesic.over_azimuth, 0.0, psi, slope, PARAMS)
+        assert float(found.a) == pytest.approx((2 * slope**2 * s * c + s**3 * c) / s**2, rel=1e-11)
+        assert float(found.a) != pytest.approx((2 * slope**2 * s * c - s**3 * c) / s**2, rel=1e-3)
+        assert float(found.mass[0, 0]) == pytest.approx(s**2 / f**3, rel=1e-12)
+        assert float(constant(psi, slope)) == pytest.approx(-(s**2) / f, rel=1e-12)
 
 
 def test_over_the_azimuth():
-    """ψ(θ), ψ'(θ) and Clairaut's constant are right to 1e-9 along the generic arc; another plane is detected."""
-    run, _ = geodesic.runs()
-    ts = np.array([run.ts[0], 1.25, run.ts[1]])
-    got = integrate(geodesic.over_azimuth, run.q0, run.v0, PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
+    """ψ(θ) of a great circle is a motion, with Clairaut's constant, and runs between the points; no other plane's."""
+    psi1, theta1, psi2, theta2 = ends_of("s1.generic")
+    A, B = reference("s1.generic.A"), reference("s1.generic.B")
+    moving = by_numpy(
+        lambda A, B, theta: jax.jvp(lambda x: geodesic.exact_over_azimuth(A, B, x), (theta,), (jnp.ones_like(theta),))
+    )
+    (psi, slope), (rate, second) = moving(A, B, 1.25)
+    assert float(rate) == pytest.approx(float(slope), rel=1e-13)
+    assert float(second) == pytest.approx(float(equations(geodesic.over_azimuth, 1.25, psi, slope, PARAMS).a), rel=1e-11)
+    assert np.sin(psi) ** 2 / np.hypot(np.sin(psi), slope) == pytest.approx(reference("s1.generic.clairaut_cos_i"))
+    np.testing.assert_allclose(over_azimuth(A, B, np.array([theta1, theta2]))[0], [psi1, psi2], rtol=1e-13)
+    assert not np.allclose(over_azimuth(A, -B, theta2)[0], psi2, rtol=1e-2)
+
+
+def test_embedded_path_and_multiplier():
+    """The circle over both poles starts towards its end, and is a motion on the sphere with λ = -1/(2R²)."""
+    q0, v0 = map(np.asarray, geodesic.start_towards(PARAMS, 0.5, 0.0, 0.25, np.pi))
+    np.testing.assert_allclose(q0, [R * np.sin(0.5), 0.0, R * np.cos(0.5)], atol=1e-15)
+    np.testing.assert_allclose(v0, [-np.cos(0.5), 0.0, np.sin(0.5)], atol=1e-15)
+    path = lambda s: geodesic.exact_embedded(q0, v0, s)
+    (q, v), (rate, second) = by_numpy(lambda s: jax.jvp(path, (s,), (jnp.ones_like(s),)))(np.array([0.0, 0.75, 3.0]) * R)
+    np.testing.assert_allclose([q[0], v[0], q[1]], [q0, v0, [R * np.sin(-0.25), 0, R * np.cos(0.25)]], atol=1e-14)
+    np.testing.assert_allclose(rate, v, atol=1e-15)
+    assert np.ptp(np.sum(q**2, 1)) < 1e-14 and np.ptp(np.sum(v**2, 1)) < 1e-14
+    found = equations(geodesic.embedded, 0.0, q[2], v[2], PARAMS)
+    np.testing.assert_allclose(found.a, second[2], atol=1e-15)
+    # With the sign of the constraint flipped, or |r| instead of |r|², λ would be +1/(2R²) or -1/R.
+    multiplier = geodesic.exact_multiplier(PARAMS)
+    assert found.multipliers["sphere"] == pytest.approx(multiplier, rel=1e-14) and multiplier == -0.5 / R**2
+
+
+@pytest.mark.exhaustive
+def test_integrated_motions():
+    """Both runs are right to 1e-9 at rtol 1e-10: ψ, ψ' and Clairaut's constant; r, dr/ds, λ, on the sphere to 1e-12."""
+    azimuth, poles = geodesic.runs()
+    ts, tolerance = np.array([azimuth.ts[0], 1.25, azimuth.ts[1]]), {"rtol": 1e-10, "atol": 1e-10}
+    got = integrate(geodesic.over_azimuth, azimuth.q0, azimuth.v0, PARAMS, ts=ts, **tolerance)
     assert float(got.q[1]) == pytest.approx(reference("s1.generic.psi_at_theta=1.25"), rel=1e-9)
     assert float(got.v[1]) == pytest.approx(reference("s1.generic.dpsi/dtheta_at_1.25"), rel=1e-9)
     assert float(got.q[2]) == pytest.approx(ends_of("s1.generic")[2], rel=1e-9)
     assert np.allclose(got.jacobi_integral(), -reference("s1.generic.clairaut_cos_i"), rtol=1e-10)
-    other = geodesic.exact_over_azimuth(reference("s1.generic.A"), -reference("s1.generic.B"), ts)[0]
-    assert not np.allclose(got.q, other, rtol=1e-2)
-
-
-def test_embedded_path_and_multiplier():
-    """Around over both poles r, dr/ds and λ = -1/(2R²) are right to 1e-9, with residuals below 1e-12."""
-    _, run = geodesic.runs()
-    got = integrate(geodesic.embedded, run.q0, run.v0, PARAMS, ts=run.ts, rtol=1e-10, atol=1e-10)
-    assert run.error(got) <= run.required
+    got = integrate(geodesic.embedded, poles.q0, poles.v0, PARAMS, ts=poles.ts, **tolerance)
+    assert poles.error(got) <= poles.required
     assert np.allclose(got.multipliers["sphere"], geodesic.exact_multiplier(PARAMS), rtol=1e-9)
-    # With the sign of the constraint flipped, or |r| instead of |r|², λ would be +1/(2R²) or -1/R.
-    assert not np.allclose(got.multipliers["sphere"], -1 / R, rtol=1e-3)
     assert float(got.residual()) <= 1e-12
     # Over the pole the azimuth jumps by π: the path is smooth in r all the same.
     assert float(np.min(got.q[:, 2])) < -0.9 * R < 0.8 * R < float(got.q[0, 2])
@@ -158,15 +187,16 @@ def test_a_thousand_turns():
 
 def test_the_major_arc_is_a_saddle():
     """A displaced arc of more than half a turn is shorter, by the second variation; a displaced minor arc is longer."""
-    major = reference("s1.dtheta>pi.major_arc_length") / R
-    second = jax.jit(jax.hessian(lambda x: geodesic.varied_length(major, x)))(0.0)
+    major, varied = reference("s1.dtheta>pi.major_arc_length") / R, by_numpy(geodesic.varied_length)
+    second = by_numpy(jax.hessian(lambda x: geodesic.varied_length(major, x)))(0.0)
     assert float(second) == pytest.approx(reference("s1.dtheta>pi.second_variation_coeff"), rel=1e-12)
-    assert geodesic.varied_length(major, 0.1) < major - 0.005
-    assert geodesic.varied_length(2 * np.pi - major, 0.1) > 2 * np.pi - major + 0.005
-    assert float(geodesic.varied_length(np.pi, 0.1)) == pytest.approx(np.pi, abs=1e-4)
+    assert varied(major, 0.1) < major - 0.005
+    assert varied(2 * np.pi - major, 0.1) > 2 * np.pi - major + 0.005
+    assert float(varied(np.pi, 0.1)) == pytest.approx(np.pi, abs=1e-4)
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.exhaustive)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_gradients_over_the_azimuth(mode):
     """∂ψ(1)/∂(ψ, ψ')(0) against the exact one to 1e-6."""
     ends = np.array([0.0, 1.0])
@@ -210,10 +240,10 @@ def test_gradients_embedded():
 def test_the_distance_has_the_exact_gradient():
     """∂l/∂(ψ₁, θ₁, ψ₂, θ₂) is R times the unit tangents' components, by Clairaut's constant."""
     psi1, theta1, psi2, theta2 = ends = ends_of("s1.generic")
-    got = jax.grad(lambda ends: geodesic.distance(PARAMS, *ends))(jnp.array(ends))
-    circle = geodesic.great_circle(*ends)
+    got = by_numpy(jax.grad(lambda ends: geodesic.distance(PARAMS, *ends)))(ends)
+    circle = plane_and_arc(*ends)
     # dl/dθ = R cos i, and dl/dψ = R ψ'/f, along the path at either end.
-    slopes = [geodesic.exact_over_azimuth(circle.A, circle.B, theta)[1] for theta in (theta1, theta2)]
+    slopes = [over_azimuth(circle.A, circle.B, theta)[1] for theta in (theta1, theta2)]
     along = [R * s / np.hypot(s, np.sin(psi)) for s, psi in zip(slopes, (psi1, psi2))]
     cos_i = R * circle.clairaut
-    assert np.allclose(got, jnp.stack([-along[0], -cos_i, along[1], cos_i]), rtol=1e-12)
+    np.testing.assert_allclose(got, [-along[0], -cos_i, along[1], cos_i], rtol=1e-12)

@@ -143,10 +143,3 @@ def lap(p, turn, impact_mu=None) -> tuple[float, float]:
     """The time between two slips, and the speed that the bird gains."""
     first, *_, last = [change for change in changes(p, turn, 2, impact_mu) if change.why == "slides"]
     return last.t - first.t, last.z[5] - first.z[5]
-
-
-def cycle(p, near, impact_mu=None) -> tuple[float, float]:
-    """The angle at which the bird of the jammed toy turns on the cycle, and the period."""
-    gained = lambda turn: lap(p, turn, impact_mu)[1]
-    turn = float(np.asarray(optimize.brentq(gained, near - 0.005, near + 0.005, xtol=1e-15, rtol=1e-15)))
-    return turn, lap(p, turn, impact_mu)[0]

@@ -1,7 +1,6 @@
 """The swing on a rod given twice obeys the equations with both rods, in closed form."""
 
 import numpy as np
-import pytest
 
 from lagjax.stability.constraints import _on_the_rod, redundant, twice
 from tests.stability.closed_forms import defect
@@ -9,7 +8,6 @@ from tests.stability.closed_forms import defect
 TIMES = np.array([0.3, 0.9, 2.0])
 
 
-@pytest.mark.slow
 def test_the_swing_on_two_rods():
     """Elliptic functions are a motion on the redundant rods; twin: not under another gravity."""
     row = redundant()[0]

@@ -3,12 +3,11 @@
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-import lagjax as lj
 from lagjax.scenes import sphere_geodesic
 from lagjax.stability.geodesics import _circle_from_angles, _over_azimuth, by_angles
+from tests.by_numpy import by_numpy, equations
 from tests.stability.closed_forms import defect
 
 PARAMS = sphere_geodesic.PARAMS
@@ -17,32 +16,26 @@ PARAMS = sphere_geodesic.PARAMS
 def test_over_the_azimuth():
     """cot ψ = A cos θ + B sin θ through any start obeys the equation; twin: a start with another slope does not."""
     assert defect(sphere_geodesic.over_azimuth, _over_azimuth, 1.2, 0.3, PARAMS, np.array([0.2, 0.4, 0.9])) < 1e-10
-    q, v = _over_azimuth(1.2, 0.3, PARAMS, jnp.array([0.0, 0.5]))
+    after = lambda slope: by_numpy(_over_azimuth)(1.2, slope, PARAMS, np.array([0.0, 0.5]))
+    q, v = after(0.3)
     np.testing.assert_allclose([q[0], v[0]], [1.2, 0.3], rtol=1e-14)
-    assert abs(float(_over_azimuth(1.2, 0.31, PARAMS, jnp.array([0.0, 0.5]))[0][1] - q[1])) > 1e-3
+    assert abs(after(0.31)[0][1] - q[1]) > 1e-3
 
 
 def test_the_circle_from_angles():
     """The path in space begins along the start's velocity, stays on the sphere, and bends as the angles do."""
     q0, v0 = {"psi": 0.7, "theta": 0.2}, {"psi": 0.4, "theta": 0.3}
-    a, _ = lj.accelerations(by_angles, 0.0, q0, v0, PARAMS)
-
-    def place(q):
-        return sphere_geodesic.cartesian(PARAMS, q["psi"], q["theta"])
+    a = equations(by_angles, 0.0, q0, v0, PARAMS).a
 
     def along(t, bend=1.0):
-        return place(jax.tree.map(lambda q, v, a: q + v * t + 0.5 * bend * a * t**2, q0, v0, a))
+        q = jax.tree.map(lambda q, v, a: q + v * t + 0.5 * bend * a * t**2, q0, v0, a)
+        return sphere_geodesic.cartesian(PARAMS, q["psi"], q["theta"])
 
-    def path(t):
-        return _circle_from_angles(q0, v0, PARAMS, jnp.atleast_1d(t))[0]
-
-    @partial(jax.jit, static_argnums=0)
-    def at_start(function):
-        return function(0.0), jax.jacfwd(function)(0.0), jax.jacfwd(jax.jacfwd(function))(0.0)
-
+    path = lambda t: _circle_from_angles(q0, v0, PARAMS, t[None])[0]
+    at_start = lambda f: by_numpy(lambda t: (f(t), jax.jacfwd(f)(t), jax.jacfwd(jax.jacfwd(f))(t)))(0.0)
     found = at_start(path)
     for one, other in zip(found, at_start(along)):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(path(1.3)), PARAMS["R"], rtol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(by_numpy(path)(1.3)), PARAMS["R"], rtol=1e-14)
     # Twin: without the accelerations the path bends otherwise.
     assert np.max(np.abs(found[2] - at_start(partial(along, bend=0.0))[2])) > 1e-2

@@ -1,11 +1,11 @@
-"""Many steps: controls held in each, the steps of a scan by hand with its gradients, lanes, dtypes, and memory."""
+"""Many steps: controls held in each, the steps of a loop by hand with its gradients, lanes, dtypes, and memory."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
+from jax import flatten_util, lax
 
 import lagjax as lj
 from lagjax.steps.rollout import piece_length
@@ -19,26 +19,37 @@ swing = lj.System(
     lambda t, q, v, params: 0.5 * params["m"] * v**2 + params["m"] * params["g"] * jnp.cos(q),
     force=lambda t, q, v, params: params["torque"],
 )
-SWING = {"m": 2.0, "g": 9.0}
+# q, v, params, torques, dt
 TORQUES = np.random.default_rng(4).normal(size=53)
+ARGUMENTS = 1.0, -0.5, {"m": 2.0, "g": 9.0}, TORQUES, 0.05
+FEW = (*ARGUMENTS[:3], TORQUES[:4], 0.05)
 
 
 def by_hand(q, v, params, torques, dt):
-    """The same motion by a scan of Kutta's method on the pendulum's equation."""
+    """The same motion by Kutta's method on the pendulum's equation, in NumPy."""
 
     def rate(y, u):
-        return jnp.stack([y[1], u / params["m"] - params["g"] * jnp.sin(y[0])])
+        return np.stack([y[1], u / params["m"] - params["g"] * np.sin(y[0])])
 
-    def step(y, u):
+    states = [np.stack([q, v])]
+    for u in torques:
+        y = states[-1]
         k1 = rate(y, u)
         k2 = rate(y + dt / 2 * k1, u)
         k3 = rate(y + dt / 2 * k2, u)
         k4 = rate(y + dt * k3, u)
-        y = y + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return y, y
+        states.append(y + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    return np.stack(states)
 
-    y0 = jnp.stack([q, v])
-    return jnp.concatenate([y0[None], lax.scan(step, y0, torques)[1]])
+
+def slopes_by_hand(arguments):
+    """The derivatives of all states by all arguments (states, 2, argument), by complex steps."""
+    flat, unflatten = flatten_util.ravel_pytree(arguments)
+    lanes = np.asarray(flat)[:, None] + 1e-30j * np.eye(flat.size)
+    leaves, structure = jax.tree.flatten(arguments)
+    sizes = np.cumsum([np.size(x) for x in leaves])[:-1]
+    parts = [part if np.ndim(x) else part[0] for x, part in zip(leaves, np.split(lanes, sizes))]
+    return by_hand(*jax.tree.unflatten(structure, parts)).imag / 1e-30
 
 
 def ours(q, v, params, torques, dt):
@@ -46,13 +57,15 @@ def ours(q, v, params, torques, dt):
     return jnp.stack(lj.rollout(swing, q, v, params, {"torque": torques}, dt)[1:], axis=1)
 
 
-ARGUMENTS = (
-    jnp.asarray(1.0),
-    jnp.asarray(-0.5),
-    jax.tree.map(jnp.asarray, SWING),
-    jnp.asarray(TORQUES),
-    jnp.asarray(0.05),
-)
+def scanned(q, v, params, torques, dt):
+    """The same by `step` in a scan, where the control is an entry of params."""
+
+    def one(state, u):
+        state = lj.step(swing, *state, {**params, "torque": u}, dt)
+        return state, jnp.stack(state[1:])
+
+    start = jnp.zeros_like(q), q, v
+    return jnp.concatenate([jnp.stack([q, v])[None], lax.scan(one, start, torques)[1]])
 
 
 def close(a, b, rtol=1e-12):
@@ -62,63 +75,61 @@ def close(a, b, rtol=1e-12):
 
 def test_controls_are_held():
     """A pushed cart: each push lasts for its step; twin: shifted by one step it is another motion."""
-    push, h = np.array([2.0, -1.0, 0.0, 4.0, 3.0]), 0.5
+    push, h = np.array([2.0, -1.0, 0.0, 4.0]), 0.5
     t, q, v = lj.rollout(cart, 0.0, 1.0, {"m": 2.0}, {"push": push}, h, t0=3.0)
     rates = 1.0 + np.concatenate([[0.0], np.cumsum(push / 2.0 * h)])
     places = np.concatenate([[0.0], np.cumsum(h * (rates[:-1] + rates[1:]) / 2)])
-    np.testing.assert_allclose(t, 3.0 + h * np.arange(6), rtol=1e-15)
+    np.testing.assert_allclose(t, 3.0 + h * np.arange(5), rtol=1e-15)
     np.testing.assert_allclose(v, rates, rtol=1e-14)
     np.testing.assert_allclose(q, places, rtol=1e-14)
-    assert np.max(np.abs(lj.rollout(cart, 0.0, 1.0, {"m": 2.0}, {"push": np.roll(push, 1)}, h)[2] - rates)) > 0.1
+    other = lj.rollout(cart, 0.0, 1.0, {"m": 2.0}, {"push": np.roll(push, 1)}, h, t0=3.0)[2]
+    assert np.max(np.abs(np.asarray(other) - rates)) > 0.1
 
 
-def test_the_scan_by_hand_and_its_gradients():
-    """States, gradients by all arguments, and Jacobians in both modes, for a number of steps that leaves a rest."""
-    assert -len(TORQUES) % piece_length(len(TORQUES)) != 0
-    close(ours(*ARGUMENTS), by_hand(*ARGUMENTS))
-    weights = jnp.asarray(np.random.default_rng(5).normal(size=(len(TORQUES) + 1, 2)))
+@pytest.mark.parametrize(("function", "arguments"), [(ours, ARGUMENTS), (scanned, FEW)])
+def test_the_loop_by_hand_and_its_gradients(function, arguments):
+    """States, and gradients by all arguments, of `rollout` and of `step` in a user's scan; some pieces are not full."""
+    arguments = jax.tree.map(np.asarray, arguments)
+    count = len(arguments[3])
+    assert function is scanned or -count % piece_length(count) != 0
+    weights = np.random.default_rng(5).normal(size=(count + 1, 2))
 
-    def loss(function):
-        return lambda *arguments: jnp.sum(weights * function(*arguments))
+    def loss(*arguments):
+        states = function(*arguments)
+        return jnp.sum(weights * states), states
 
-    expected = jax.grad(loss(by_hand), (0, 1, 2, 3, 4))(*ARGUMENTS)
-    close(jax.grad(loss(ours), (0, 1, 2, 3, 4))(*ARGUMENTS), expected, 1e-11)
-    close(jax.jacfwd(ours, 3)(*ARGUMENTS), jax.jacfwd(by_hand, 3)(*ARGUMENTS), 1e-11)
+    slopes, states = jax.jit(jax.grad(loss, (0, 1, 2, 3, 4), has_aux=True))(*arguments)
+    close(states, by_hand(*arguments))
+    each = slopes_by_hand(arguments)
+    close(flatten_util.ravel_pytree(slopes)[0], np.einsum("tik,ti->k", each, weights), 1e-11)
     # Twin: the gradient of other weights is another one.
-    assert np.max(np.abs(expected[3] - jax.grad(lambda *a: jnp.sum(by_hand(*a)), 3)(*ARGUMENTS))) > 1e-2
+    assert np.max(np.abs(np.sum(each, (0, 1)) - np.einsum("tik,ti->k", each, weights))) > 1e-2
 
 
-def test_steps_in_a_scan_of_the_user():
-    """`step` in a scan, where the control is an entry of params: the same states and gradients."""
+@pytest.mark.slow
+def test_jacobians_and_lanes_in_float32():
+    """The Jacobian by torques in forward mode; and lanes in float32 are its motions, with gradients in float32."""
+    close(jax.jacfwd(ours, 3)(*ARGUMENTS), slopes_by_hand(ARGUMENTS)[..., 4:-1], 1e-11)
+    few = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (*ARGUMENTS[:3], TORQUES[:12], 0.05))
+    starts = np.linspace(-1.0, 1.0, 5, dtype=np.float32)
 
-    def scanned(q, v, params, torques, dt):
-        def one(state, u):
-            state = lj.step(swing, *state, {**params, "torque": u}, dt)
-            return state, jnp.stack(state[1:])
+    def loss(starts, *others):
+        states = jax.vmap(ours, (0, None, None, None, None))(starts, *others)
+        return jnp.sum(states**2), states
 
-        start = jnp.zeros_like(q), q, v
-        return jnp.concatenate([jnp.stack([q, v])[None], lax.scan(one, start, torques)[1]])
+    slopes, found = jax.jit(jax.grad(loss, (2, 3), has_aux=True))(starts, *few[1:])
+    assert {x.dtype for x in jax.tree.leaves((found, slopes))} == {np.dtype("float32")}
+    by_lane = [(q, *jax.tree.map(lambda x: np.asarray(x, float), few[1:])) for q in starts.astype(float)]
+    states = np.stack([by_hand(*arguments) for arguments in by_lane])
+    close(found, states, 1e-5)
+    expected = sum(np.einsum("tik,ti->k", slopes_by_hand(a), 2 * y) for a, y in zip(by_lane, states))
+    close((slopes[0]["g"], slopes[0]["m"], slopes[1]), (expected[2], expected[3], expected[4:-1]), 1e-4)
 
-    few = (*ARGUMENTS[:3], ARGUMENTS[3][:4], ARGUMENTS[4])
-    close(scanned(*few), ours(*few))
-    gradients = [jax.grad(lambda *a, f=f: jnp.sum(f(*a) ** 2), (2, 3))(*few) for f in (scanned, by_hand)]
-    close(*gradients)
 
-
-def test_lanes_in_float32():
-    """A batch in float32 is its motions one by one, with their gradients, in float32."""
-    few = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (*ARGUMENTS[:3], ARGUMENTS[3][:12], ARGUMENTS[4]))
-    starts = jnp.linspace(-1.0, 1.0, 5, dtype=jnp.float32)
-
-    def lanes(function):
-        return lambda *a: jax.vmap(function, (0, None, None, None, None))(starts, *a[1:])
-
-    found = lanes(ours)(*few)
-    assert found.dtype == jnp.float32
-    close(found, lanes(by_hand)(*few), 1e-5)
-    gradients = [jax.grad(lambda *a, f=f: jnp.sum(lanes(f)(*a) ** 2), (2, 3))(*few) for f in (ours, by_hand)]
-    assert {x.dtype for x in jax.tree.leaves(gradients[0])} == {np.dtype("float32")}
-    close(*gradients, 1e-4)
+def test_float32_stays():
+    """The states of a start in float32 are in float32."""
+    single = jax.tree.map(np.float32, FEW)
+    assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(ours, *single))} == {np.dtype("float32")}
 
 
 @pytest.mark.slow
@@ -128,29 +139,27 @@ def test_constraints_in_both_modes():
 
     def end(g):
         _, q, v = lj.rollout(rod_pendulum, *HORIZONTAL, {**PARAMS, "g": g}, 30, 0.04)
-        return q["x"][-1], (q, v)
+        return q["x"][-1], (q, v, q["x"][-1])
 
-    value, (q, v) = end(9.0)
+    forward, reverse = (jax.jit(mode(end, has_aux=True)) for mode in (jax.jacfwd, jax.jacrev))
+    slope, (q, v, _) = forward(9.0)
     round_off = 16 * np.finfo(float).eps * PARAMS["l"] ** 2
     assert np.max(np.abs(q["x"] ** 2 + q["y"] ** 2 - PARAMS["l"] ** 2)) < round_off
     assert np.max(np.abs(q["x"] * v["x"] + q["y"] * v["y"])) < 8 * round_off
-    slopes = [mode(lambda g: end(g)[0])(9.0) for mode in (jax.jacfwd, jax.jacrev)]
-    np.testing.assert_allclose(*slopes, rtol=1e-11)
+    np.testing.assert_allclose(slope, reverse(9.0)[0], rtol=1e-11)
     # The derivative of the return to the rod leaves out that of its matrix, which is multiplied by a step's error.
-    np.testing.assert_allclose(slopes[0], (end(9.0 + 1e-5)[0] - end(9.0 - 1e-5)[0]) / 2e-5, rtol=1e-4)
+    above, below = (forward(9.0 + h)[1][2] for h in (1e-5, -1e-5))
+    np.testing.assert_allclose(slope, (above - below) / 2e-5, rtol=1e-4)
 
 
 def test_a_control_law_of_the_users():
     """`with_control` makes the parameters: from an array of controls, with a gain that is differentiated."""
 
-    def end(gain, form):
-        if form == "law":
-            law = lambda params, u: {**params, "push": gain * u[0]}
-            return lj.rollout(cart, 0.0, 0.0, {"m": 1.0}, np.ones((4, 1)), 0.5, with_control=law)[1][-1]
-        return lj.rollout(cart, 0.0, 0.0, {"m": 1.0}, {"push": gain * np.ones(4)}, 0.5)[1][-1]
+    def end(gain):
+        law = lambda params, u: {**params, "push": gain * u[0]}
+        return lj.rollout(cart, 0.0, 0.0, {"m": 1.0}, np.ones((4, 1)), 0.5, with_control=law)[1][-1]
 
-    assert end(3.0, "law") == end(3.0, "names") == 6.0
-    assert jax.grad(end)(3.0, "law") == 2.0
+    assert jax.jit(jax.value_and_grad(end))(3.0) == (6.0, 2.0)
 
 
 class Driven(eqx.Module):
@@ -166,20 +175,19 @@ def test_modules_in_params():
     system = lj.System(
         lambda t, q, v, params: 0.5 * v**2 - params.net(q[None]), force=lambda t, q, v, params: params.push
     )
-    pushes, drive = jnp.array([1.0, -2.0]), lambda params, u: Driven(params.net, u)
-    _, q, _ = lj.rollout(system, 0.1, 0.0, Driven(net, jnp.zeros(())), pushes, 0.5, with_control=drive)
+    pushes, drive = np.array([1.0, -2.0]), lambda params, u: Driven(params.net, u)
+    _, q, _ = lj.rollout(system, 0.1, 0.0, Driven(net, np.zeros(())), pushes, 0.5, with_control=drive)
     state = 0.0, 0.1, 0.0
-    for push, found in zip(pushes, q[1:]):
-        state = lj.step(system, *state, Driven(net, push), 0.5)
+    for push, found in zip(pushes, np.asarray(q)[1:]):
+        state = lj.step(system, *state, Driven(net, np.asarray(push)), 0.5)
         np.testing.assert_allclose(found, state[1], rtol=1e-14)
 
 
 def test_few_steps():
     """No step, one step, and the forms of a number of steps."""
-    params = {"m": 1.0, "push": 2.0}
-    assert [len(lj.rollout(cart, 0.0, 0.0, params, n, 1.0)[1]) for n in (0, 1, np.int64(2))] == [1, 2, 3]
-    _, q, _ = lj.rollout(cart, np.zeros(3), np.zeros(3), params, 2, 1.0)
-    np.testing.assert_allclose(q, np.outer([0.0, 1.0, 4.0], np.ones(3)), rtol=1e-15)
+    rolled = lambda q, count: lj.rollout(cart, q, 0.0 * q, {"m": 1.0, "push": 2.0}, count, 1.0)[1]
+    assert [len(rolled(0.0, count)) for count in (0, 1)] == [1, 2]
+    np.testing.assert_allclose(rolled(np.zeros(3), np.int64(2)), np.outer([0.0, 1.0, 4.0], np.ones(3)), rtol=1e-15)
 
 
 NOTES = np.arange(1.0, 65.0)

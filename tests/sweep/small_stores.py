@@ -3,10 +3,12 @@
 import shutil
 import warnings
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 import lagjax as lj
+from lagjax.integrate.solve.harvest import report
 from tests.mutated import describe
 
 AXES = {"k": np.arange(1, 6), "x": np.linspace(0.1, 1.0, 8)}
@@ -24,6 +26,11 @@ def run(point):
 def swept(path, of=run, axes=AXES, **settings):
     """The sweep in a store of five blocks with eight points each."""
     return lj.sweep(of, axes, store=path, chunk=8, workers=1, progress=False, **settings)
+
+
+def scaled(traj, factor):
+    """A finished motion times a factor, with its report: what `integrate` gives a sweep, without a solver."""
+    return report(eqx.tree_at(lambda x: (x.q, x.v), traj, (factor * traj.q, factor * traj.v)))
 
 
 def with_warnings(call):

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import Report, reported
+from lagjax.integrate.solve.harvest import Settled
 from lagjax.sweep import scheduler
+from tests.sweep.small_stores import scaled
 from tests.sweep.test_sweep import AXES, MAX_STEPS, quiet, swing
+from tests.systems import motion
 
 free = lj.System(lambda t, q, v, p: 0.5 * v**2 + p["k"] * q)
 
@@ -24,11 +28,24 @@ def looked_up(x):
     return jax.pure_callback(table, jax.ShapeDtypeStruct((), jnp.result_type(float)), x, vmap_method="sequential")
 
 
+def settled(x):
+    """What a motion of regular equations reports, as `integrate` does."""
+    report = Report(lj.RESULTS.successful._value, jnp.asarray(3), jnp.asarray(0.0), jnp.asarray(0.0))
+    return reported(reported(x, lambda _: report), lambda _: Settled(jnp.asarray(True)))
+
+
+def moved(point):
+    """x² for force 2 x over one unit of time is x."""
+    traj = lj.integrate(free, 0.0, 0.0, {"k": looked_up(point["x"])}, ts=np.array([0.0, 1.0]))
+    return traj.q[-1]
+
+
+@pytest.mark.parametrize("run", [lambda point: settled(looked_up(point["x"]) / 2),
+                                 pytest.param(moved, marks=pytest.mark.exhaustive)])  # fmt: skip
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_rest_keeps_its_results(workers):
-    """x² for force 2 x over one unit of time is x; twin: an error that no callback raised ends the sweep."""
+def test_the_rest_keeps_its_results(workers, run):
+    """Points where a callback raises are NaN, one is named, and the others have their values."""
     xs = np.linspace(0.0, 1.0, 41)
-    run = lambda point: lj.integrate(free, 0.0, 0.0, {"k": looked_up(point["x"])}, ts=np.array([0.0, 1.0])).q[-1]
     with pytest.warns(UserWarning, match="at x = .* raised: .*outside of the table"):
         swept = lj.sweep(run, {"x": xs}, workers=workers, chunk=16, progress=False)
     good = xs <= 0.75
@@ -40,11 +57,14 @@ def test_the_rest_keeps_its_results(workers):
 
 def test_a_trajectory_knows():
     """Where whole trajectories are returned, that of the point has the reason as its result."""
-    run = lambda point: lj.integrate(free, 0.0, 0.0, {"k": looked_up(point["x"])}, ts=np.array([0.0, 1.0]))
+    traj = motion("pendulum")
+    run = lambda point: scaled(traj, looked_up(point["x"]))
     with pytest.warns(UserWarning, match="outside of the table"):
         swept = lj.sweep(run, {"x": np.array([0.5, 1.0])}, progress=False)
-    assert np.isnan(swept.values.q[1]).all() and np.isfinite(swept.values.q[0]).all()
-    assert int(np.asarray(swept.values.result._value)[1]) == int(lj.RESULTS.raised._value)
+    assert np.isnan(swept.values.q[1]).all()
+    np.testing.assert_array_equal(swept.values.q[0], traj.q)
+    results = np.asarray(swept.values.result._value)
+    assert results.tolist() == [lj.RESULTS.successful._value, lj.RESULTS.raised._value]
 
 
 @pytest.mark.exhaustive

@@ -63,29 +63,28 @@ def test_written_resumed_and_read(tmp_path):
 def test_with_networks(tmp_path):
     """A network may stand in a sweep's function, with its weights as a part of what identifies the store, or weights be
     an axis; a module with its functions is no result."""
-    system, ts = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - p["net"](q)), np.linspace(0.0, 1.0, 3)
     nets = [lj.learned.Network(1.0, key=jax.random.key(k), width=4, depth=1, first=1.0) for k in (0, 1, 0)]
 
-    def motion(m, net):
-        return lj.integrate(system, 1.0, 0.0, {"m": m, "net": net}, ts=ts)
+    def force(m, net):
+        return -m * jax.grad(net)(1.0)
 
-    def stored(net, of=lambda motion, net: motion.q):
+    def stored(net, of=lambda force, net: force):
         axes, store = {"m": np.linspace(1.0, 2.0, 3)}, tmp_path / "store"
-        return lj.sweep(lambda point: of(motion(point["m"], net), net), axes, store=store, progress=False)
+        return lj.sweep(lambda point: of(force(point["m"], net), net), axes, store=store, progress=False)
 
-    first, expected = stored(nets[0]), [motion(m, nets[0]).q for m in (1.0, 1.5, 2.0)]
+    first, expected = stored(nets[0]), [force(m, nets[0]) for m in (1.0, 1.5, 2.0)]
     np.testing.assert_allclose(first.values, expected, rtol=1e-12)
     np.testing.assert_array_equal(stored(nets[2]).values, first.values)
     with pytest.raises(ValueError, match="run is another function"):
         stored(nets[1])
     with pytest.raises(TypeError, match=r"Fix: return a module without its functions, eqx.filter\(net, eqx.is_array\)"):
-        stored(nets[0], of=lambda motion, net: net)
+        stored(nets[0], of=lambda force, net: net)
     arrays, rest = eqx.partition(nets[0], eqx.is_array)
     _, module_of = ravel_pytree(arrays)
     weights = np.stack([ravel_pytree(eqx.filter(net, eqx.is_array))[0] for net in nets[:2]])
-    run = lambda point: motion(1.0, eqx.combine(module_of(point["weights"]), rest)).q
+    run = lambda point: force(1.0, eqx.combine(module_of(point["weights"]), rest))
     several = lj.sweep(run, {"weights": weights}, store=tmp_path / "several", progress=False)
-    np.testing.assert_allclose(several.values, [motion(1.0, net).q for net in nets[:2]], rtol=1e-12)
+    np.testing.assert_allclose(several.values, [force(1.0, net) for net in nets[:2]], rtol=1e-12)
 
 
 def test_another_sweep_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 import base64
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import lagjax as lj
 from lagjax.display.animation import NOWHERE
 from tests.display.web_page.test_page import told
+from tests.systems import motion
 
 AXES = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1, 0, 4, 9])}
 T = np.linspace(0.0, 1.0, 6)
@@ -108,11 +110,10 @@ def test_what_single_precision_would_hide():
         np.testing.assert_allclose(array(curves[name], dtype, 2, 11)[1], expected, rtol=1e-15)
 
 
-@pytest.mark.slow
 def test_batches_in_a_point_are_named():
     """A batch of trajectories per point is not drawn, and the page says so."""
-    free = lj.System(lambda t, q, v, params: 0.5 * v**2)
-    several = jax.vmap(lambda v: lj.integrate(free, 0.0, v, ts=np.array([0.0, 1.0])))
+    traj = motion("pendulum")
+    several = jax.vmap(lambda v: eqx.tree_at(lambda x: x.q, traj, v * traj.q))
     swept = lj.sweep(lambda p: {"all": several(p["v"] * np.ones(2)), "v": p["v"]}, {"v": np.ones(1)}, progress=False)
     assert "Not drawn: all, a batch of trajectories." in swept.to_html().html
 

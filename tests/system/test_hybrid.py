@@ -1,5 +1,7 @@
 """Motions in phases: times of switches, states and derivatives across them, impacts, friction, and refusals."""
 
+import re
+import types
 from functools import partial
 
 import jax
@@ -8,6 +10,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import failure
+from lagjax.integrate.trajectory.hybrid_trajectory import Switches
+from lagjax.system import State
 from tests.counting import compiles
 from tests.tiers import exhaustive_but
 
@@ -129,29 +134,70 @@ def test_lanes_are_single_runs():
         np.testing.assert_allclose(together.switches.t[i], traj.switches.t, rtol=1e-13)
 
 
-def test_said_by_name():
-    """Too many switches, a guard with the wrong sign, wrong phases and resets are refused."""
+def switched(t, v, v_after):
+    """A ball whose flights begin with these switches, as far as an error looks at them."""
+    few, none = len(t), np.zeros(len(t), int)
+    switches = Switches(t, none, none, none, v, none, v_after, none, np.array(few), np.array(False), ("flying",), ())
+    return types.SimpleNamespace(switches=switches, system=bouncing)
+
+
+def test_too_many_switches():
+    """Flights that halve come to rest, switches at one time change something or nothing, and others are just many."""
+    for t, v_after, words in (
+        (2 - 0.5 ** np.arange(14.0), 0.5, "exceeds most_switches = 14(.|\n)*each takes 0.5 of the time(.|\n)*t = 2."),
+        (np.arange(1.0, 5.0), 0.5, "until t = 4, and one more exceeds most_switches = 4.\n.*most_switches=40"),
+        (np.full(4, 1.0), 0.5, "The last 4 of them, flying -> flying .* change velocities, the last one by 1.5"),
+        (np.full(4, 1.0), -1.0, "The last 4 of them, .* changes velocities by 0 only(.|\n)*No phase lasts"),
+    ):
+        said = failure._too_many(switched(t, -np.ones(len(t)), np.full(len(t), v_after)))
+        assert re.search(words, said), said
+
+
+def test_a_guard_below_zero():
+    """A start on the wrong side of a guard is refused with its value; twin: on the other side there is none to name."""
+    below = failure._below_zero(bouncing, State(0.0, -1.0, 0.0, PARAMS))
+    assert re.search("guard of phase 'flying' is below zero at the start: .*is -1.\nUsual cause", below)
+    assert "start: .\n" in failure._below_zero(bouncing, State(0.0, 1.0, 0.0, PARAMS))
+
+
+@pytest.mark.slow
+def test_motions_that_fail():
+    """Too many switches, and a start below a guard, are said by `lj.integrate`."""
     with pytest.raises(RuntimeError, match="(?s)most_switches = 4.*each takes 0.5 of the time.*about t = 1.35457"):
         lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
     with pytest.raises(ValueError, match="guard of phase 'flying' is below zero at the start.*is -1"):
         lj.integrate(bouncing, -1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
-    with pytest.raises(ValueError, match="names a phase 'rolling', which does not exist"):
-        lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="rolling", when=lambda t, q, v, p: q)])
-    with pytest.raises(ValueError, match="start='rolling' is not a phase"):
-        lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="rolling")
-    with pytest.raises(ValueError, match="start= names the first phase"):
-        lj.integrate(ball, 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]), start="flying")
-    with pytest.raises(ValueError, match="runs forward"):
-        lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([1.0, 0.0]))
-    with pytest.raises(ValueError, match="leads back to its phase and resets nothing"):
-        lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lambda t, q, v, p: v)])
-    with pytest.raises(TypeError, match=r"(?s)takes one system.*hybrid.systems\[0\] for 'flying'"):
-        lj.mass_matrix(bouncing, 0.0, 1.0, 0.0, PARAMS)
-    with pytest.raises(TypeError, match="phase 'a' is function"):
-        lj.Hybrid({"a": falling})
-    odd = lj.Switch("flying", to="flying", when=lambda t, q, v, p: q, reset=lambda t, q, v, p: (v, v, v))
-    with pytest.raises(ValueError, match=r"reset\(t, q, v, params\).* must return velocities like v"):
-        lj.integrate(lj.Hybrid({"flying": ball}, [odd]), 1.0, 0.0, PARAMS, ts=np.array([0.0, 1.0]))
+
+
+def hybrid(to="flying", **switch):
+    """A ball with a switch."""
+    return lj.Hybrid({"flying": ball}, [lj.Switch("flying", to=to, **({"when": lambda t, q, v, p: q} | switch))])
+
+
+def run(system, ts=(0.0, 1.0), **options):
+    """Ask for a motion."""
+    return lj.integrate(system, 1.0, 0.0, PARAMS, ts=np.array(ts), **options)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: hybrid("rolling"), ValueError, "names a phase 'rolling', which does not exist"),
+        (lambda: run(bouncing, start="rolling"), ValueError, "start='rolling' is not a phase"),
+        (lambda: run(ball, start="flying"), ValueError, "start= names the first phase"),
+        (lambda: run(bouncing, (1.0, 0.0)), ValueError, "runs forward"),
+        (lambda: hybrid(when=lambda t, q, v, p: v), ValueError, "leads back to its phase and resets nothing"),
+        (lambda: lj.mass_matrix(bouncing, 0.0, 1.0, 0.0, PARAMS), TypeError,
+         r"(?s)takes one system.*hybrid.systems\[0\] for 'flying'"),
+        (lambda: lj.Hybrid({"a": falling}), TypeError, "phase 'a' is function"),
+        (lambda: run(hybrid(reset=lambda t, q, v, p: (v, v, v))), ValueError,
+         r"reset\(t, q, v, params\).* must return velocities like v"),
+    ],
+)  # fmt: skip
+def test_said_by_name(call, error, words):
+    """Wrong phases, directions of time, resets and kinds are refused before anything runs."""
+    with pytest.raises(error, match=words):
+        call()
 
 
 @pytest.mark.exhaustive

@@ -1,12 +1,15 @@
 """Programs that motions share; times of calls, taken in turn, by their median, without the overhead of a call."""
 
 import time
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from lagjax import System, Tsit5
 from lagjax.system import coordinates
+from lagjax.work_precision import programs
 from lagjax.work_precision.programs import (
     RESOLVED,
     VERY_LONG,
@@ -18,20 +21,42 @@ from lagjax.work_precision.programs import (
 )
 
 oscillator = System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params["omega"] * q) ** 2)
+# Integrated it would be NaN.
+in_closed_form = System(lambda t, q, v, params: np.nan * v)
 
 
-def test_motions_that_differ_in_numbers_share_a_program():
+class Oscillation(NamedTuple):
+    """The part of a trajectory that is looked at."""
+
+    q: Any
+
+
+def oscillation(system, q, v, params, *, ts, rtol, method, throw, **options):
+    """In place of `integrate`: q cos ωt, off by the tolerance."""
+    return Oscillation(q * jnp.cos(params["omega"] * ts) + rtol)
+
+
+@pytest.mark.parametrize("system", [in_closed_form, pytest.param(oscillator, marks=pytest.mark.exhaustive)])
+def test_motions_that_differ_in_numbers_share_a_program(monkeypatch, system):
     """Each has its own motion, cos ωt; twin: a jump's time is part of the program, which is then another."""
+    if system is in_closed_form:
+        monkeypatch.setattr(programs, "integrate", oscillation)
 
     def program(omega, options):
         start = coordinates.state(0.0, 1.0, 0.0, {"omega": omega})
-        return TimedProgram(ComparedMotion(oscillator, start, np.array([0.0, 1.0]), options), Tsit5())
+        return TimedProgram(ComparedMotion(system, start, np.array([0.0, 1.0]), options), Tsit5())
 
     one, other, jumped = program(1.0, {}), program(2.0, {}), program(2.0, {"jump_ts": np.array([0.5])})
     assert one._compiled is other._compiled is not jumped._compiled
     assert one.compile_seconds == other.compile_seconds > 0
     for omega, found in ((1.0, one), (2.0, other), (2.0, jumped)):
         assert float(found(1e-10).q[-1]) == pytest.approx(np.cos(omega), abs=1e-8)
+    # At other times, from another start, with another tolerance, by the same program.
+    if system is in_closed_form:
+        ts = np.array([0.0, 2.0])
+        for found in (one.at(ts)(0.25, q=np.array(3.0)), one(0.25, ts, np.array(3.0), np.array(0.0))):
+            np.testing.assert_allclose(found.q, 3 * np.cos(ts) + 0.25, rtol=1e-15)
+        assert 0 < one.call_seconds() < 1 and float(one.call(0.25)()[0].q[0]) == 1.25
 
 
 def test_a_call_takes_its_time():

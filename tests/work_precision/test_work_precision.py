@@ -1,5 +1,7 @@
 """Methods compared on a user's own motion: errors, orders, marks, choices, and refused arguments."""
 
+from importlib import import_module
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ import lagjax as lj
 from lagjax.work_precision.result import Curve, Point
 from tests.systems import PARAMS, pendulum
 
-TS = np.array([0.0, 7.0, 20.0])
+# The room hands out a function of this name.
+module = import_module("lagjax.work_precision.work_precision")
+TS = np.array([0.0, 7.0, 12.0, 20.0])
 RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
 
 
@@ -46,22 +50,36 @@ def test_a_lucky_tolerance_is_not_taken():
     assert Curve("m", None, 0.0, (lucky, out)).within(1e-6) is None
 
 
-def test_evaluations_are_steps_times_stages(found):
+def test_evaluations_are_steps_times_stages(found, solved):
     """Sixteen, thirteen and six per step: the last evaluation is the first of the next step."""
     for name, stages in (("Nystrom12", 16), ("Dopri8", 13), ("Tsit5", 6)):
         assert all(point.evaluations == stages * point.steps for point in found[name].points)
+    points = solved["Tsit5"].points
+    assert all(point.evaluations == 6 * point.steps for point in points)
+    assert all(a.steps < b.steps for a, b in zip(points, points[1:]))
 
 
-def test_errors_are_those_against_the_closed_form(found):
+def test_errors_are_those_against_the_closed_form(solved):
     """Errors relative to each leaf's largest value agree with those against Jacobi's functions."""
     largest = np.pi / 2, np.sqrt(2) * RATE
-    for point in found["Tsit5"].points:
+    for point in solved["Tsit5"].points:
         got = point.trajectory.q, point.trajectory.v
         error = max(np.max(np.abs(x - y)) / scale for x, y, scale in zip(got, swing(TS), largest))
-        assert point.error == pytest.approx(error, rel=1e-2, abs=2 * found.reference.error)
+        assert point.error == pytest.approx(error, rel=1e-2) and point.ended_well
     # Twin: another pendulum's motion has a much larger distance.
-    other = np.max(np.abs(found["Dopri8"].points[-1].trajectory.q - swing(TS, 1.001 * RATE)[0]))
-    assert other > 1e3 * found["Dopri8"].points[-1].error
+    other = np.max(np.abs(solved["Tsit5"].points[-1].trajectory.q - swing(TS, 1.001 * RATE)[0]))
+    assert other > 1e3 * solved["Tsit5"].points[-1].error
+
+
+def test_made_up_errors_are_found(found):
+    """A comparison finds the orders, errors and steps of its programs; the default of `integrate` comes first."""
+    assert list(found.curves) == ["Nystrom12", "Dopri8", "Tsit5"] and found.call_seconds == 1e-7
+    for name, order in (("Nystrom12", 12), ("Dopri8", 8), ("Tsit5", 5)):
+        assert found[name].order == pytest.approx(order, rel=0.05)
+        for point in found[name].points:
+            assert point.error == pytest.approx(0.02 * (100 / point.steps) ** order, rel=0.01, abs=1e-13)
+            assert point.ended_well and point.seconds > 0
+    assert all(curve.compile_seconds == 0.5 for curve in found.curves.values())
 
 
 def test_best_says_what_to_take(found):
@@ -105,9 +123,9 @@ def test_errors_of_an_event_are_those_of_its_time_and_state():
     assert found.measured.startswith("coordinates and velocities at the end, and times of 'down'")
 
 
-def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
+def test_a_failing_point_keeps_its_reason_and_the_others_go_on(made_up):
     """Too few steps at tight tolerances, or a failing other tool, give failed points; twin: loose tolerances."""
-    other = lambda tolerance: (*swing(TS), 77) if tolerance > 1e-7 else (np.full(3, np.nan), np.zeros(3), None)
+    other = lambda tolerance: (*swing(TS), 77) if tolerance > 1e-7 else (np.full(4, np.nan), np.zeros(4), None)
     found = compared(
         methods={"fifth": lj.Tsit5()}, tolerances=(1e-3, 1e-11), reference=swing, max_steps=500, others={"exact": other}
     )
@@ -118,9 +136,22 @@ def test_a_failing_point_keeps_its_reason_and_the_others_go_on():
     assert found["exact"].points[1].result == "failed"
 
 
-@pytest.mark.slow
+def test_nothing_in_reach_is_said(made_up, monkeypatch):
+    """If every solve fails, the error contains the message of `integrate`, if that fails, too."""
+    for fails, words in ((True, r"no method reached the end(.|\n)*Tsit5(.|\n)*at 1e-06: so it is"), (False, "Tsit5")):
+
+        def integrate(*state, ts, rtol, **options):
+            if fails:
+                raise RuntimeError("so it is")
+
+        monkeypatch.setattr(module, "integrate", integrate)
+        with pytest.raises(RuntimeError, match=words):
+            compared(methods=[lj.Tsit5()], tolerances=(1e-6,), reference=swing, max_steps=3)
+
+
+@pytest.mark.exhaustive
 def test_nothing_in_reach_is_said_with_its_reason():
-    """If every solve fails, the error contains the message of `integrate`."""
+    """The same with a motion."""
     with pytest.raises(RuntimeError, match=r"no method reached the end.*Tsit5"):
         compared(methods=[lj.Tsit5()], tolerances=(1e-6,), reference=swing, max_steps=3)
 

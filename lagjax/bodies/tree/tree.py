@@ -41,12 +41,13 @@ from lagjax.system import Holonomic, Nonholonomic, System
 class Tree:
     """Bodies and the joints from which they hang, each on one: chains, arms, walking machines, in joint coordinates.
 
+    >>> import jax
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
     >>> rod = lj.Body("rod", mass=1.0, inertia=(1 / 12, 1 / 12, 0.0))
     >>> hinge = lj.revolute(lj.ground.at(axis=(0.0, 1.0, 0.0)), rod.at((0.0, 0.0, 0.5), axis=(0.0, 1.0, 0.0)))
     >>> pendulum = Tree([rod], {"hinge": hinge})
-    >>> print(pendulum.poses({"hinge": jnp.pi / 2})["rod"].position.round(6) + 0.0)
+    >>> print(jax.jit(pendulum.poses)({"hinge": jnp.pi / 2})["rod"].position.round(6) + 0.0)
     [-0.5  0.   0. ]
     >>> system = pendulum.system([lj.weight([rod])])
     >>> a, _ = lj.accelerations(system, 0.0, {"hinge": jnp.pi / 2}, {"hinge": 0.0}, None)
@@ -82,7 +83,7 @@ class Tree:
     >>> turning = lj.Body("turning", motion=lambda t, params: lj.Pose.at(angle=3.0 * t))
     >>> slide = lj.prismatic(turning.at(axis=(1.0, 0.0, 0.0)), rod.at(axis=(1.0, 0.0, 0.0)))
     >>> away = Tree([turning, rod], {"slide": slide})
-    >>> print(away.rates({"slide": 0.5}, {"slide": 2.0}, None, 0.0)["rod"].position)
+    >>> print(jax.jit(away.rates)({"slide": 0.5}, {"slide": 2.0}, None, 0.0)["rod"].position)
     [2.  1.5 0. ]
 
     **Raises:** `TypeError` for what is no body or joint of these kinds; `ValueError` for a body on two joints, a ring,

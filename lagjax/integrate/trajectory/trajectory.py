@@ -129,7 +129,7 @@ class Trajectory(eqx.Module):
 
         >>> import lagjax as lj
         >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
-        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.5])
+        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
         >>> now = traj.at([0.1, 0.2])
         >>> print(now.q.round(9), now.v.round(9))
         [0.25 0.4 ] [2. 1.]
@@ -162,13 +162,12 @@ class Trajectory(eqx.Module):
         """Return the motion as an `xarray.Dataset`.
 
         >>> import lagjax as lj
-        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v["y"] ** 2 - params["g"] * q["y"])
-        >>> traj = lj.integrate(fall, {"y": 0.0}, {"y": 3.0}, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
-        >>> data = traj.to_xarray()
-        >>> print(data["q.y"].dims, data["q.y"].sel(t=0.2).item(), data.attrs["params.g"])
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+        >>> data = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.2, 0.5]).to_xarray()
+        >>> print(data["q"].dims, data["q"].sel(t=0.2).item(), data.attrs["params.g"])
         ('t',) 0.4 10.0
 
-        Variables are named as here: `q.y`, `v.y`, their estimated errors `error.q.y`, and multipliers like their
+        Variables are named as here, or `q.y`, `v.y`; their estimated errors `error.q.y`, and multipliers like their
         constraints. Their dimensions are `t` and, for a coordinate that is an array, `y_0` and so on. `result`, `end`
         and the numbers of steps are variables too; the method, tolerances and parameters are attributes.
 
@@ -216,13 +215,11 @@ class Trajectory(eqx.Module):
     ) -> Animation:
         """Animate the motion: points, lines that link them and trails, in the plane or in space; and bodies.
 
-        >>> import jax.numpy as jnp
         >>> import lagjax as lj
-        >>> stone = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"])
-        >>> start = {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 5.0}
-        >>> traj = lj.integrate(stone, *start, {"g": 10.0}, ts=jnp.linspace(0.0, 1.0, 11))
-        >>> traj.animate(lambda t, q, params: (q["x"], q["y"]))
-        Animation of 51 frames, 2 s, 8 kB: plays in a notebook, and with .save("motion.html") in a browser
+        >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
+        >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
+        >>> traj.animate(lambda t, q, params: (2.0 * t, q))  # thrown, at 2 along x
+        Animation of 51 frames, 2 s, 9 kB: plays in a notebook, and with .save("motion.html") in a browser
 
         **Arguments:**
 

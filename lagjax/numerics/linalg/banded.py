@@ -143,11 +143,13 @@ def multiplications(
 
     A program that multiplies many times then contains the function that the matrix was known as once.
 
-    >>> import jax.numpy as jnp
+    >>> import jax
     >>> import numpy as np
     >>> where = sparse(np.array([[1, 1, 0], [0, 0, 1]], bool))
-    >>> push, pull = multiplications(jnp.array([[2.0, 3.0], [5.0, 0.0]]), where)
-    >>> print(push(jnp.array([1.0, 10.0, 100.0])), pull(jnp.array([1.0, 10.0])))
+    >>> def both(compressed, x, u):
+    ...     push, pull = multiplications(compressed, where)
+    ...     return push(x), pull(u)
+    >>> print(*jax.jit(both)(np.array([[2.0, 3.0], [5.0, 0.0]]), np.array([1.0, 10.0, 100.0]), np.array([1.0, 10.0])))
     [ 52. 300.] [ 2.  5. 30.]
     """
     m, n = len(where.in_row), len(where.in_column)
@@ -289,8 +291,9 @@ def independent(band: Float[Array, "m b1"], least: float) -> Bool[Array, " m"]:
     A pivot, relative to its diagonal entry, is the squared sine of the angle between the row of A and the span of those
     kept before it; rows whose sine is at most `least` are left out. Rows that are zero or not finite are kept.
 
-    >>> import jax.numpy as jnp
-    >>> print(independent(jnp.array([[1.0, 0.0], [4.0, 2.0], [1.0, 0.0]]), 1e-6))
+    >>> import jax
+    >>> import numpy as np
+    >>> print(jax.jit(independent)(np.array([[1.0, 0.0], [4.0, 2.0], [1.0, 0.0]]), 1e-6))
     [ True False  True]
     """
     m, width = band.shape

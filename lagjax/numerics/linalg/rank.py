@@ -23,8 +23,9 @@ UNROLL_UP_TO = 2
 def independent_rows(rows: Float[Array, "m n"], dependent_below: float | None = None) -> Bool[Array, " m"]:
     """Choose a largest set of independent rows, as well conditioned as pivoting finds.
 
-    >>> import jax.numpy as jnp
-    >>> print(independent_rows(jnp.array([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])))
+    >>> import jax
+    >>> import numpy as np
+    >>> print(jax.jit(independent_rows)(np.array([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])))
     [ True False  True]
 
     Rows that are zero or not finite are kept: solving with them is then singular or not finite, which is detected.

@@ -5,10 +5,25 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.continuation.test_equilibria import check
-from tests.analysis.steady_systems import TRUSS, snap_through, truss  # fmt: skip
+from tests.analysis.continuation.test_equilibria import branches, check
+from tests.analysis.steady_systems import ENDS, FOLDS, FORMS, TRUSS, forms, snap_through, truss  # fmt: skip
 
 
+def test_folds():
+    """Two folds, passed in both directions; between them it is unstable, and on it b μ = c q + h q³ - e."""
+    found, (b, c, e, h) = branches("folds"), (FOLDS[name] for name in "bceh")
+    assert [critical.kind for critical in found.critical] == ["fold", "fold"] and len(found) == 1
+    turn = lambda p, side: (2 / 3 * p["c"] * side * jnp.sqrt(-p["c"] / (3 * p["h"])) - p["e"]) / p["b"]
+    for critical, side in zip(found.critical, (1, -1)):
+        check(critical, lambda p, side=side: turn(p, side), FOLDS, "mu", names=("mu", *"bceh"))
+    branch, edge = found[0], np.sqrt(-c / (3 * h))
+    off = np.abs(np.abs(branch.q) - edge) > 1e-6
+    np.testing.assert_array_equal(branch.stable[off], np.abs(branch.q[off]) > edge)
+    np.testing.assert_allclose(branch.parameter, (c * branch.q + h * branch.q**3 - e) / b, rtol=1e-11, atol=1e-11)
+    assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
+
+
+@pytest.mark.exhaustive
 def test_truss():
     """It snaps through at folds in both directions, at the load of the closed form; between them it is unstable."""
     found = lj.continue_equilibria(truss, TRUSS, 0.6, along="P", to=6.0)
@@ -54,14 +69,13 @@ def test_folds_of_random_curves():
     assert counted > 20
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("e", [1e-3, 1e-6])
+@pytest.mark.parametrize("e", [1e-3, pytest.param(1e-6, marks=pytest.mark.exhaustive)])
 def test_nearly_a_pitchfork(e):
     """With a small push there is no crossing, steps do not jump to the other branch, and the branch stays stable."""
-    pushed = lj.System(lambda t, q, v, p: 0.5 * v**2 + 0.5 * p["mu"] * q**2 - 0.25 * q**4 + p["e"] * q)
-    found = lj.continue_equilibria(pushed, {"mu": -1.0, "e": e}, 0.0, along="mu", to=1.0)
-    assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.9
-    back = lj.continue_equilibria(pushed, {"mu": 1.0, "e": e}, -1.0, along="mu", to=-1.0)
+    pushed = FORMS | {"a": 1.0, "h": 1.0, "e": e}
+    found = lj.continue_equilibria(forms, pushed, 0.0, along="mu", to=0.8)
+    assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.8
+    back = lj.continue_equilibria(forms, pushed | {"mu": 0.8}, -0.9, along="mu", to=-1.0)
     # The other branch folds where mu³ = 27 e²/4.
     (critical,) = back.critical
     assert critical.kind == "fold"
@@ -71,9 +85,7 @@ def test_nearly_a_pitchfork(e):
 
 def test_a_branch_that_stalls():
     """It stops where L is undefined, says so, and returns its points so far; twin: a shorter range is completed."""
-    edge = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 - p["s"] * jnp.sqrt(1.0 - q) ** 3 + p["f"] * q
-    system, params = lj.System(edge), {"f": 0.0, "s": 0.1}
-    found = lj.continue_equilibria(system, params, 0.0, along="f", to=3.0)
+    found = lj.continue_equilibria(forms, ENDS, 0.0, along="mu", to=3.0)
     assert len(found[0]) > 10 and "Newton's method does not converge" in found[0].status
     np.testing.assert_allclose([found[0].parameter[-1], found[0].q[-1]], 1.0, atol=1e-2)
-    assert lj.continue_equilibria(system, params, 0.0, along="f", to=0.9)[0].status == "the end of the range"
+    assert lj.continue_equilibria(forms, ENDS, 0.0, along="mu", to=0.9)[0].status == "the end of the range"

@@ -1,5 +1,7 @@
 """Branches of equilibria: folds, crossings and the loss of stability, against closed forms, with derivatives."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,11 +9,23 @@ import pytest
 
 import lagjax as lj
 from lagjax.scenes import bead_on_hoop, cross_rails
-from tests.analysis.steady_systems import BUCKLING, COLUMN, EXCHANGE, column, exchange  # fmt: skip
+from tests.analysis.steady_systems import BUCKLING, COLUMN, EXCHANGE, FOLDS, PITCHFORK, column, forms  # fmt: skip
+from tests.by_numpy import by_numpy
 
 BEAD = bead_on_hoop.PARAMS
 CRITICAL = 1e-10
 SLOPE = 1e-8
+
+
+@cache
+def branches(kind, to=0.75):
+    """Branches of a normal form along μ."""
+    params, start = {
+        "pitchfork": (PITCHFORK, 0.0), "from the side": (PITCHFORK | {"mu": 1.0}, 0.6), "exchange": (EXCHANGE, 0.0),
+        "folds": (FOLDS, -0.9), "later": (PITCHFORK | {"c": 0.5 + 1e-3}, 0.0),
+        "earlier": (PITCHFORK | {"c": 0.5 - 1e-3}, 0.0),
+    }[kind]  # fmt: skip
+    return lj.continue_equilibria(forms, params, start, along="mu", to=-1.0 if kind == "from the side" else to)
 
 
 def bead(first, start, last):
@@ -19,26 +33,66 @@ def bead(first, start, last):
     return lj.continue_equilibria(bead_on_hoop.system, BEAD | {"omega": first}, start, along="omega", to=last)
 
 
-def check(critical, exact, params, along):
+def check(critical, exact, params, along, names=None):
     """The critical parameter and its derivatives by all others; twin: an error of a millionth is detected."""
-    value = float(exact(params))
+    value, slopes = by_numpy(jax.value_and_grad(exact))(params)
     assert abs(float(critical.parameter) / value - 1) < CRITICAL < abs((1 + 1e-6) * value / value - 1)
-    slopes = jax.grad(exact)(params)
-    for name, slope in slopes.items():
-        expected = 0.0 if name == along else float(slope)
+    for name in names or params:
+        expected = 0.0 if name == along else float(slopes[name])
         assert abs(float(critical.derivative[name]) - expected) < SLOPE * max(1.0, abs(expected)), name
 
 
 # One coordinate.
 
 
-@pytest.mark.parametrize("from_the_side", [False, True])
+@pytest.mark.parametrize("kind", ["pitchfork", "from the side"])
+def test_pitchfork(kind):
+    """μ_c = c/a, along the branch that loses its stability, or that at ±√((a μ - c)/h), which only touches zero."""
+    found, (a, c, h) = branches(kind), (PITCHFORK[name] for name in "ach")
+    (critical,) = found.critical
+    assert critical.kind == "pitchfork" and critical.branches == (0, 1) and len(found) == 2
+    check(critical, lambda p: p["c"] / p["a"], PITCHFORK, "mu", names=("mu", "a", "c", "h"))
+    side, middle = (found[0], found[1]) if kind == "from the side" else (found[1], found[0])
+    below, above = middle.parameter < c / a - 1e-9, middle.parameter > c / a + 1e-9
+    np.testing.assert_allclose(middle.q, 0.0, atol=1e-12)
+    assert middle.stable[below].all() and not middle.stable[above].any() and side.stable.all()
+    exact = np.sqrt(np.maximum(0.0, (a * side.parameter - c) / h))
+    np.testing.assert_allclose(np.abs(side.q), exact, atol=1e-7)
+    away = exact > 0.03
+    np.testing.assert_allclose(np.abs(side.q)[away], exact[away], rtol=1e-12)
+    # Both halves of the pitchfork, and its tip.
+    assert side.q.min() < -0.4 and side.q.max() > 0.4 and np.min(np.abs(side.q)) < 1e-9
+    np.testing.assert_allclose([found.first, found.last], [1.0, -1.0] if kind == "from the side" else [-1.0, 0.75])
+
+
+def test_derivatives_are_those_of_other_runs():
+    """Twin of the derivatives: a step in c moves the critical parameter as predicted; a wrong sign is seen."""
+    later, earlier = (branches(kind).critical[0].parameter for kind in ("later", "earlier"))
+    slope = branches("pitchfork").critical[0].derivative["c"]
+    np.testing.assert_allclose(slope, (later - earlier) / 2e-3, rtol=1e-7)
+    assert abs(slope + (later - earlier) / 2e-3) > 0.1
+
+
+def test_exchange_of_stability():
+    """Two branches cross transcritically at μ = c/a, and neither folds."""
+    found, (a, c, d) = branches("exchange"), (EXCHANGE[name] for name in "acd")
+    (critical,) = found.critical
+    assert critical.kind == "transcritical"
+    check(critical, lambda p: p["c"] / p["a"], EXCHANGE, "mu", names=("mu", "a", "c", "d"))
+    other = found[1]
+    np.testing.assert_allclose(other.q, (a * other.parameter - c) / d, atol=1e-13)
+    off = np.abs(other.parameter - c / a) > 1e-6
+    np.testing.assert_array_equal(other.stable[off], other.parameter[off] > c / a)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("from_the_side", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 def test_bead(from_the_side):
     """ω_c = √(g/a), dω_c/da = -½ √(g/a³), along the bottom, or the tilt, whose eigenvalue only touches zero."""
     found = bead(8.0, 1.3, 1.0) if from_the_side else bead(1.0, 0.0, 8.0)
     (critical,) = found.critical
     assert critical.kind == "pitchfork" and critical.branches == (0, 1) and len(found) == 2
-    check(critical, lambda p: jnp.sqrt(p["g"] / p["a"]) + 0 * p["m"], BEAD, "omega")
+    check(critical, lambda p: jnp.sqrt(p["g"] / p["a"]), BEAD, "omega")
     np.testing.assert_allclose(critical.derivative["a"], -0.5 * np.sqrt(BEAD["g"] / BEAD["a"] ** 3), rtol=1e-10)
     side, bottom = (found[0], found[1]) if from_the_side else (found[1], found[0])
     below = bottom.parameter < float(critical.parameter) * (1 - 1e-9)
@@ -46,11 +100,7 @@ def test_bead(from_the_side):
     assert bottom.stable[below].all() and not bottom.stable[above].any() and side.stable.all()
     tilt = np.arccos(np.minimum(1.0, BEAD["g"] / (BEAD["a"] * side.parameter**2)))
     np.testing.assert_allclose(np.abs(side.q), tilt, atol=1e-7)
-    away = side.parameter > 1.001 * float(critical.parameter)
-    np.testing.assert_allclose(np.abs(side.q)[away], tilt[away], rtol=1e-12)
-    # Both halves of the pitchfork, and its tip.
     assert side.q.min() < -1 and side.q.max() > 1 and np.min(np.abs(side.q)) < 1e-9
-    np.testing.assert_allclose([found.first, found.last], [8.0, 1.0] if from_the_side else [1.0, 8.0])
 
 
 # Several coordinates.
@@ -62,7 +112,7 @@ def test_column():
     found = lj.continue_equilibria(column, COLUMN, np.zeros(2), along="P", to=6.0)
     assert [c.kind for c in found.critical] == ["pitchfork", "pitchfork"] and len(found) == 3
     for critical, factor in zip(found.critical, BUCKLING):
-        check(critical, lambda p, factor=factor: factor * p["c"] / p["l"] + 0 * p["P"], COLUMN, "P")
+        check(critical, lambda p, factor=factor: factor * p["c"] / p["l"], COLUMN, "P")
     stable = [b.stable for b in found.branches]
     assert stable[1].all() and not stable[2].any()
     assert lj.continue_equilibria(column, COLUMN, np.zeros(2), along="P", to=6.0, crossings=False).status != ""
@@ -75,7 +125,7 @@ def test_cross_rails():
     system = cross_rails.rotating_system
 
     def root(name):
-        return lambda p: jnp.sqrt(p[name] / p["m"]) + 0 * (p["omega"] + p["R0"] + p["K"] + p["k"])
+        return lambda p: jnp.sqrt(p[name] / p["m"])
 
     found = lj.continue_equilibria(system, params | {"omega": 1.0}, {"R": 0.8, "r": 0.0}, along="omega", to=9.0)
     assert [c.kind for c in found.critical] == ["line of equilibria", "escape"]
@@ -114,6 +164,17 @@ def test_closed_curve_and_folds_of_a_side_branch():
 def test_no_start_and_no_program():
     """Without an equilibrium there is no branch; and inside a compiled program its points cannot be counted."""
     with pytest.raises(ValueError, match="no equilibrium was found from the start"):
-        lj.continue_equilibria(exchange, EXCHANGE | {"mu": 1.0, "d": 0.0, "c": np.nan}, 0.5, along="mu", to=2.0)
+        lj.continue_equilibria(forms, EXCHANGE | {"mu": 1.0, "d": 0.0, "c": np.nan}, 0.5, along="mu", to=2.0)
     with pytest.raises(TypeError, match="JAX is tracing"):
-        jax.jit(lambda g: bead(g, 0.0, 8.0).critical[0].parameter)(1.0)
+        jax.eval_shape(lambda mu: lj.continue_equilibria(forms, EXCHANGE | {"mu": mu}, 0.0, along="mu", to=2.0), 1.0)
+
+
+def test_what_is_drawn():
+    """Stable parts are solid, unstable dashed, the pitchfork is marked, axes are named; unknown names are refused."""
+    found = branches("pitchfork")
+    (axis,) = found.plot().axes
+    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
+    assert dashes == {"-", "--"} and axis.get_xlabel() == "mu" and axis.get_ylabel() == "q"
+    assert {"stable", "unstable", "pitchfork"} <= set(axis.get_legend_handles_labels()[1])
+    with pytest.raises(ValueError, match="names no coordinate"):
+        found.plot("theta")

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis.equilibria.balance import shortest_multipliers
 from lagjax.scenes import cross_rails
 from tests.analysis.steady_systems import DISK, UPRIGHT_DISK, disk, straight_on
 from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 def test_multiplier_and_redundant_rods(times):
     """2 y λ = g, shared by redundant rods as multipliers of least norm; twin: λ has the other sign above."""
     again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
@@ -26,6 +27,19 @@ def test_multiplier_and_redundant_rods(times):
     if times == 2:
         np.testing.assert_allclose(found.multipliers["again"], 0.4 * g / (2 * found.q["y"]), rtol=1e-13)
     assert found.multipliers["rod"][0] < 0 < found.multipliers["rod"][1]
+    if times == 1:
+        # The table has one line for each equilibrium: state, multipliers, stability.
+        lines = repr(found).splitlines()
+        assert lines[0] == "Equilibria: 2 from 2 starts" and lines[1].split() == ["x", "y", "λ", "rod"]
+        assert lines[2].split() == ["0", "-1.25", "-3.925", "stable"] and lines[3].endswith("unstable")
+
+
+def test_shortest_multipliers():
+    """Of redundant forces those of least norm, as by NumPy's pseudo-inverse; forces of zero have none."""
+    pushes = np.random.default_rng(0).normal(size=(2, 3))[[0, 0, 1, 1]] * np.array([[1.0], [2.0], [0.0], [-1.0]])
+    known = np.array([0.5, -1.0]) @ pushes[[0, 3]]
+    found = jax.jit(shortest_multipliers)(pushes, known)
+    np.testing.assert_allclose(found, np.linalg.pinv(pushes.T) @ known, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.exhaustive

@@ -5,38 +5,67 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.equilibria.test_equilibria import HILLS, one, words
+from lagjax.analysis.equilibria.result import NO_BALANCE
 
-HILL = {"c": np.zeros(4), "at": 0.0, "friction": 0.0, "cubic": 0.0}
-
-
-@pytest.mark.parametrize(
-    "power, factor, verdict", [(4, -1.0, "unstable"), (4, 1.0, "stable"), (3, 1.0, "unstable"), (6, -1.0, "unstable")]
+HILLS = lj.System(
+    lambda t, q, v, p: 0.5 * v**2 - sum(c * (q - p["at"]) ** k for k, c in enumerate(p["c"], 1)),
+    dissipation=lambda t, q, v, p: 0.5 * p["friction"] * v**2 + p["cubic"] * v**4,
 )
-def test_hills_of_any_order(power, factor, verdict):
-    """V = c q^k at 0 and elsewhere: one equilibrium from nine starts, stable exactly for even k and c > 0."""
-    c = factor * np.eye(4)[power - 3]
-    for changes in ({}, {"at": 0.75}, {"friction": 0.5}):
-        found = one(HILL | {"c": c} | changes)
-        assert words(found) == [verdict] and found.zero_modes.tolist() == [1]
-        np.testing.assert_allclose(found.q, [changes.get("at", 0.0)], atol=1e-8)
-        assert np.all(found.of_start[found.status == 0] == 0)
+FLATLAND = {"c": np.zeros(6), "at": 0.0, "friction": 0.0, "cubic": 0.0}
+
+
+def hill(powers, **changes):
+    """What three starts find where V = Σ c (q - at)^k."""
+    params = FLATLAND | {"c": np.array([powers.get(k, 0.0) for k in range(1, 7)])} | changes
+    return lj.equilibria(HILLS, params, starts=np.array([-1.0, 0.25, 0.75]) + params["at"])
+
+
+def words(found):
+    """The verdicts of the equilibria found: "stable", "unstable" or "undecided"."""
+    named = zip(found.stable, found.undecided)
+    return ["stable" if stable else "undecided" if undecided else "unstable" for stable, undecided in named]
+
+
+ELSEWHERE = ({}, {"at": 0.75}, {"friction": 0.5})
+ORDERS = [(4, -1.0, "unstable"), (4, 1.0, "stable"), (3, 1.0, "unstable"), (6, -1.0, "unstable")]
+SOON = [(*ORDERS[0], {}), (*ORDERS[1], ELSEWHERE[1]), (*ORDERS[2], ELSEWHERE[2])]
+LATER = [pytest.param(*x, y, marks=pytest.mark.exhaustive) for x in ORDERS for y in ELSEWHERE if (*x, y) not in SOON]
+
+
+@pytest.mark.parametrize("power, factor, verdict, changes", [*SOON, *LATER])
+def test_hills_of_any_order(power, factor, verdict, changes):
+    """V = c q^k at 0 and elsewhere: one equilibrium from all starts, stable exactly for even k and c > 0."""
+    found = hill({power: factor}, **changes)
+    assert words(found) == [verdict] and found.zero_modes.tolist() == [1]
+    np.testing.assert_allclose(found.q, [changes.get("at", 0.0)], atol=1e-8)
+    assert np.all(found.of_start[found.status == 0] == 0)
 
 
 def test_what_decides_nothing():
     """Friction that gives energy is undecided; a term that is there decides; a free particle is a family."""
-    quartic = HILL | {"c": np.array([0.0, 1.0, 0.0, 0.0])}
-    assert words(one(quartic | {"cubic": 1.0})) == ["stable"]
-    assert words(one(quartic | {"cubic": -1.0})) == ["undecided"]
-    assert words(one(HILL)) == ["stable"] * 9
-    traced = jax.jit(lambda p: one_traced(p))(quartic)
-    assert bool(traced[1]) and not bool(traced[0])
+    assert words(hill({4: 1.0}, cubic=1.0)) == ["stable"]
+    assert words(hill({4: 1.0}, cubic=-1.0)) == ["undecided"]
+    assert words(hill({})) == ["stable"] * 3
+    # Twin: with a stiffness there is no zero mode.
+    assert hill({2: 1.0, 4: 1.0}).zero_modes.tolist() == [0]
 
 
-def one_traced(params):
-    """Stable, and undecided, from one start in a program."""
-    found = lj.equilibria(HILLS, params, starts=[0.5])
-    return found.stable[0], found.undecided[0]
+def test_starts_that_lead_nowhere():
+    """A nonzero minimum of the imbalance is no equilibrium; these starts are reported, and others find one."""
+    none = hill({1: 1.0, 3: 1 / 3})
+    assert len(none) == 0 and none.status.tolist() == [NO_BALANCE] * 3
+    assert len(hill({1: -1.0, 3: 1 / 3})) == 2
+    np.testing.assert_array_equal(none.starts, [-1.0, 0.25, 0.75])
+    assert np.all(np.isfinite(none.last))
+    assert "3 starts led to none: no equilibrium near it" in repr(none) and "from (q = -1) as far as" in repr(none)
+
+
+@pytest.mark.slow
+def test_in_a_batch():
+    """Under `vmap` nothing is merged, a zero mode decides nothing, and the printed form shows the batch."""
+    found = jax.jit(jax.vmap(lambda cubic: hill({4: 1.0}, cubic=cubic)))(np.array([0.0, 1.0]))
+    assert found.undecided.all() and not found.stable.any()
+    assert found.found.shape == (2, 3) and found.found.all() and "a batch of 2 with 3 starts each" in repr(found)
 
 
 VALLEY = lj.System(
@@ -60,7 +89,7 @@ ON_A_LINE = lj.System(
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("at", [0.0, 1.0])
 def test_a_multiple_root_on_a_constraint(at):
     """V = c (x - a)^k on a line, with and without weight across it: one rest, at a, stable exactly for c > 0."""

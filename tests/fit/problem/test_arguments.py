@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.fit.problem.arguments import problem_of
 from tests.fit.cases import PENDULUM, pendulum
 
 T = np.linspace(0.0, 1.0, 20)
@@ -51,10 +52,11 @@ def test_arguments(arguments, error, words):
         lj.fit(pendulum, records, params, **options)
 
 
-@pytest.mark.slow
 def test_wrapped_angles():
-    """An angle that jumps by a turn gives a warning."""
+    """An angle that jumps by a turn gives a warning; twin: unwrapped it gives none (an error here)."""
     angle = np.linspace(0.0, 9.0, 60)
-    wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
-    with pytest.warns(lj.FitWarning, match="np.unwrap"):
-        lj.identifiability(pendulum, lj.Record(np.linspace(0.0, 1.0, 60), q=wrapped), PENDULUM, free="g")
+    record = lambda q: lj.Record(np.linspace(0.0, 1.0, 60), q=q, sigma=0.1)
+    ask = lambda q: problem_of(pendulum, record(q), PENDULUM, "g", None, None, None, "squares", None, {})
+    ask(angle)
+    with pytest.warns(lj.FitWarning, match=r"'q' of record 0(.|\n)*np.unwrap"):
+        ask((angle + np.pi) % (2 * np.pi) - np.pi)

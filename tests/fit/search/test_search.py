@@ -13,6 +13,7 @@ from lagjax.fit.problem.arguments import problem_of
 from lagjax.fit.problem.residuals import dampened
 from lagjax.fit.search.search import CHANCE, _exceeded_by_chance, _undampened, misfit
 from lagjax.numerics.windowed_least_squares import WindowedEquations
+from tests.fit.cases import formula, in_closed_form
 
 # The room hands out a function of this name.
 engine = import_module("lagjax.fit.fit")
@@ -82,25 +83,29 @@ def test_what_only_round_off_sees_keeps_its_guess():
 
 
 @pytest.mark.slow
-def test_what_leaves_no_trace_keeps_its_guess():
+def test_what_leaves_no_trace_keeps_its_guess(monkeypatch):
     """A mass that drops out is at its guess although another start, with another mass, gave the best end; twin: with a
     prior it is where that says."""
-    scaled = lambda t, q, v, p: p["m"] * (0.5 * v**2 + p["g"] * jnp.cos(q))
-    system, ts = lj.System(scaled), np.linspace(0.0, 4.0, 41)
-    q = lj.integrate(system, 1.0, 0.0, {"m": 1.0, "g": 9.8}, ts=ts).q
-    record = lj.Record(ts, q=q + 0.01 * np.random.default_rng(0).normal(size=41), sigma=0.01)
+
+    def swing(t, q, v, p):
+        w = jnp.sqrt(p["g"])
+        return q * jnp.cos(w * t) + v / w * jnp.sin(w * t), v * jnp.cos(w * t) - q * w * jnp.sin(w * t)
+
+    in_closed_form(monkeypatch, swing)
+    ts = np.linspace(0.0, 4.0, 41)
+    record = lj.Record(ts, q=np.cos(np.sqrt(9.8) * ts) + 0.01 * np.random.default_rng(0).normal(size=41), sigma=0.01)
     elsewhere = {"restarts": 8, "grow": False, "bounds": {"g": (1.0, 100.0)}}
     with pytest.warns(lj.FitWarning, match="'m': no trace(.|\n)*One that leaves no trace keeps its guess"):
-        found = lj.fit(system, record, {"m": 1.0, "g": 70.0}, **elsewhere)
+        found = lj.fit(formula, record, {"m": 1.0, "g": 70.0}, **elsewhere)
     # The guess itself led elsewhere, so the best end came from another start.
     assert found.costs[0] > 10 * found.cost
     assert found.params["m"] == 1.0 and list(found.determined) == [True, False]
     np.testing.assert_allclose(found.params["g"], 9.8, atol=0.05)
-    with_prior = lj.fit(system, record, {"m": 1.0, "g": 9.0}, priors={"m": (1.3, 0.1)})
+    with_prior = lj.fit(formula, record, {"m": 1.0, "g": 9.0}, priors={"m": (1.3, 0.1)})
     np.testing.assert_allclose(with_prior.params["m"], 1.3, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_contradicts_sigma_is_no_success(clean):
     """A missing effect or errors larger than sigma: not converged, with a warning, from every start."""
     data = measured(clean, 3) + SIGMA * np.sin(7 * TS)
@@ -140,38 +145,33 @@ def test_in_a_sweep(clean, known):
     assert any("not measurement errors" in words for words in swept.counts())
 
 
-def spring_problem(count, sigma, loss="squares"):
-    """A fit of a spring, for which the tests make up residuals."""
-    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2)
-    t = np.linspace(0.0, 10.0, count)
-    record = lj.Record(t, q=np.cos(t), sigma=sigma)
-    return problem_of(spring, record, {"k": 1.0}, None, None, None, None, loss, None, {})
-
-
 @pytest.mark.parametrize("loss", ["squares", pytest.param("huber", marks=pytest.mark.exhaustive), "cauchy"])
 def test_false_alarms(loss):
     """Of thousands of fits with errors as stated, none is rejected, and hardly any is searched further."""
-    problem = spring_problem(104, 0.01, loss)
-    rows = jnp.asarray(dampened(np.random.default_rng(0).normal(size=(3000, 1, 104)), loss))
+    spring, t = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2), np.linspace(0.0, 10.0, 104)
+    record = lj.Record(t, q=np.cos(t), sigma=0.01)
+    problem = problem_of(spring, record, {"k": 1.0}, None, None, None, None, loss, None, {})
     zero = jnp.zeros((1, 0)), jnp.zeros(1)
-    judged = jax.jit(jax.vmap(lambda rows: misfit(problem, WindowedEquations(rows, *zero))))
-    assert not np.any(judged(rows).any) and np.mean(judged(rows).doubtful) < 0.02
+    judged = jax.jit(jax.vmap(lambda r: misfit(problem, WindowedEquations(dampened(r, loss), *zero))))
+    stated = np.random.default_rng(0).normal(size=(3000, 1, 104))
+    plain = np.tile(np.random.default_rng(1).normal(size=(300, 1, 104)), (10, 1, 1))
+    found = jax.tree.map(np.asarray, judged(stated))
+    assert not np.any(found.large | found.curved) and np.mean(found.doubtful) < 0.02
     # Twins: larger errors, and a curve, are always noticed.
-    plain = np.random.default_rng(1).normal(size=(300, 1, 104))
-    larger = dampened(jnp.asarray((2.5 if loss == "squares" else 4.5) * plain), loss)
-    assert np.all(judged(larger).large)
-    curve = 1.5 * np.sin(np.linspace(0.0, 20.0, 104))
-    assert np.all(judged(dampened(jnp.asarray(plain + 2 * curve), loss)).any)
+    assert np.all(judged((2.5 if loss == "squares" else 4.5) * plain).large)
+    found = jax.tree.map(np.asarray, judged(plain + 3.0 * np.sin(np.linspace(0.0, 20.0, 104))))
+    assert np.all(found.large | found.curved)
 
 
 def test_quantiles_and_inverses():
     """The limit of chance is that of SciPy's chi-squared distribution; `_undampened` inverts `dampened`."""
-    for n in (1.0, 4.0, 10.0, 300.0):
-        exact = chi2.isf(2.87e-7, n) / n
-        assert abs(float(_exceeded_by_chance(n, CHANCE)) / exact - 1) < 0.2
-    r = np.geomspace(1e-6, 1e4, 50)
-    for loss in ("huber", "soft_l1", "cauchy"):
-        np.testing.assert_allclose(_undampened(dampened(r, loss), loss), r, rtol=1e-6)
+    n, r, losses = np.array([1.0, 4.0, 10.0, 300.0]), np.geomspace(1e-6, 1e4, 50), ("huber", "soft_l1", "cauchy")
+    limits, inverted = jax.jit(
+        lambda n, r: (_exceeded_by_chance(n, CHANCE), [_undampened(dampened(r, loss), loss) for loss in losses])
+    )(n, r)
+    np.testing.assert_allclose(limits, chi2.isf(2.87e-7, n) / n, rtol=0.2)
+    for found in inverted:
+        np.testing.assert_allclose(found, r, rtol=1e-6)
 
 
 @pytest.mark.exhaustive

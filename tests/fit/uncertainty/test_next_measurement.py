@@ -1,5 +1,7 @@
 """What to measure next: predicted standard deviations agree with formulas and with repeated fits."""
 
+from importlib import import_module
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit.search.search import LinearisedResiduals
+from lagjax.fit.uncertainty import next_measurement
+from lagjax.fit.uncertainty.next_measurement import Survey, next_measurements
+from lagjax.numerics import Slopes
 from tests.counting import compiles
-from tests.fit.cases import CASES, HUNG, PENDULUM, hung, pendulum
+from tests.fit.cases import CASES, HUNG, PENDULUM, formula, hung, in_closed_form, pendulum
 
 T, LONG = np.linspace(0.0, 2.0, 21), np.linspace(0.0, 4.0, 21)
 SIGMA = 0.01
@@ -38,49 +45,24 @@ def two_runs(first, second, held=False):
     return rows
 
 
-@pytest.mark.slow
-def test_falling():
-    """The error of g after another fall with an unknown or known start, a longer one, or one more measurement."""
-    zeros = {"q": np.zeros(21), "q0": 0.0, "v0": 0.0, "sigma": SIGMA}
-    others = {"again": lj.Record(T, **zeros), "longer": lj.Record(LONG, **zeros)}
-    others["from a stand"] = lj.Record(LONG, **zeros, hold_q=True, hold_v=True)
-    ask = lambda **more: lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g", **more).next
-    told, first = ask(candidates=others), parabola(T)
-    assert [c.name for c in told.candidates] == ["from a stand", "longer", "again"]
-    np.testing.assert_allclose(told.now, sds(first)[0], rtol=1e-9)
-    np.testing.assert_allclose(told["again"].sd, told.now / np.sqrt(2), rtol=1e-9)
-    np.testing.assert_allclose(told["longer"].sd, sds(two_runs(first, parabola(LONG)))[0], rtol=1e-9)
-    known = sds(two_runs(first, parabola(LONG), held=True))[0]
-    np.testing.assert_allclose(told["from a stand"].sd, known, rtol=1e-9)
-    # Twin: with a known start the longer fall would be far better.
-    assert known < 0.8 * told["longer"].sd
-    times, sd = told["longer"].at_best(3)
-    np.testing.assert_allclose(times, [0.0, 2.0, 4.0])
-    np.testing.assert_allclose(sd, sds(two_runs(first, parabola(times)))[0], rtol=1e-9)
-    assert "longer" in repr(told) and "(measured: q to 0.01)" in repr(told)
-    with compiles() as programs:
-        again = ask(candidates={"twice": lj.Record(2 * T, **zeros)})
-    assert programs == [] and again.best.name == "twice"
-
-    told = ask()
-    assert {c.name for c in told.candidates} == {"q", "v"} and told.best.times[0] == told["q"].t[-1] == pytest.approx(
-        4.1
-    )
-    after = [sds(np.concatenate([first, parabola(np.array([t]))]))[0] for t in told["q"].t]
-    np.testing.assert_allclose(told["q"].alone, after, rtol=1e-8)
-    assert "q at t = 4.1" in repr(told)
-    # Twin: without the further measurement.
-    assert not np.allclose(told["q"].alone, told.now, rtol=0.3)
+def pull(t, q, v, p):
+    """The motion of the pulled spring."""
+    w, rest = jnp.sqrt(p["k"] / p["m"]), p["F"] / p["k"]
+    away = q["x"] - rest
+    return {"x": rest + away * jnp.cos(w * t) + v["x"] / w * jnp.sin(w * t)}, {"x": v["x"] * jnp.cos(w * t)}
 
 
 @pytest.mark.slow
-def test_what_is_not_determined():
+@pytest.mark.parametrize("system", [formula, pytest.param(pulled, marks=pytest.mark.exhaustive)])
+def test_what_is_not_determined(monkeypatch, system):
     """A spring determines only k/m; a run with a known force would determine k, as the formula says, another not."""
+    if system is formula:
+        in_closed_form(monkeypatch, pull)
     t = np.linspace(0.0, 6.0, 40)
     of = lambda force: lj.Record(
         t, q={"x": np.zeros(40)}, q0={"x": 0.5}, v0={"x": 0.0}, sigma=0.01, params={"F": force}
     )
-    ask = lambda **more: lj.identifiability(pulled, of(0.0), PULLED, free=["k", "m"], **more)
+    ask = lambda **more: lj.identifiability(system, of(0.0), PULLED, free=["k", "m"], **more)
     asked = ask(shrink="k", candidates={"free": of(0.0), "pulled": of(2.0)})
     told = asked.next
     assert asked.combined() == ["k/m"] and np.isinf(told.now)
@@ -89,9 +71,7 @@ def test_what_is_not_determined():
     assert "'k' is not determined by these data" in words and "not determined" in words.splitlines()[-2]
 
     def rows(x, start, force):
-        k, m = x
-        w, rest = jnp.sqrt(k / m), force / k
-        return (rest + (start[0] - rest) * jnp.cos(w * t) + start[1] / w * jnp.sin(w * t)) / 0.01
+        return pull(t, {"x": start[0]}, {"x": start[1]}, {"k": x[0], "m": x[1], "F": force})[0]["x"] / 0.01
 
     x, start = jnp.array([4.0, 1.0]), jnp.array([0.5, 0.0])
     slopes = [jax.jacfwd(rows, (0, 1))(x, start, force) for force in (0.0, 2.0)]
@@ -209,13 +189,7 @@ def test_windows_runs_without_sigma_and_several():
 
     records = [fallen, lj.Record(LONG, q=5.0 * LONG**2, sigma=0.1)]
     told = lj.identifiability(fall, records, {"g": 9.81}, shrink="g").next
-    assert {c.name for c in told.candidates} == {f"{x} of record {r}" for x in "qv" for r in (0, 1)}
-    rows = two_runs(parabola(T), parabola(LONG) / 10)
-    np.testing.assert_allclose(told.now, sds(rows)[0], rtol=1e-8)
-    further = np.zeros((len(told["q of record 1"].t), 5))
-    further[:, [0, 3, 4]] = parabola(told["q of record 1"].t) / 10
-    after = [sds(np.concatenate([rows, row[None]]))[0] for row in further]
-    np.testing.assert_allclose(told["q of record 1"].alone, after, rtol=1e-8)
+    np.testing.assert_allclose(told.now, sds(two_runs(parabola(T), parabola(LONG) / 10))[0], rtol=1e-8)
     # Twin: with the error of the other record.
     assert not np.allclose(told["q of record 0"].alone, told["q of record 1"].alone[:42], rtol=1e-3)
 
@@ -228,30 +202,117 @@ def test_windows_runs_without_sigma_and_several():
 RUN = {"q0": 0.0, "v0": 0.0}
 
 
+def problem_for(records, free=("g",)):
+    """The problem of some falls."""
+    return problem_of(fall, records, {"g": 9.81}, list(free), None, None, None, "squares", None, {}, weak=False)
+
+
+def of_a_fall(problem, u):
+    """What `survey` tells of falls, in closed form: their slopes where something is measured."""
+    t = problem.windows.ts - problem.windows.ts[:, :1]
+    counts = np.arange(t.shape[1]) <= problem.windows.last[:, None]
+    by = {"q": np.stack([t**2 / 2, np.ones_like(t), t], axis=2), "v": np.stack([t, 0 * t, np.ones_like(t)], axis=2)}
+    known = {kind: np.isfinite(x) & np.isfinite(problem.sigma[kind]) & counts for kind, x in problem.measured.items()}
+    rows = [np.where(known[kind], 1 / problem.sigma[kind], 0.0)[..., None] * by[kind] for kind in problem.measured]
+    along = np.concatenate([problem.starts.q.along, problem.starts.v.along], axis=1)
+    rows, nothing = np.concatenate(rows, axis=1), np.zeros((len(t), 0, 1))
+    slopes = Slopes(rows[..., :1], rows[..., 1:] @ along, nothing, nothing, nothing, np.zeros((1, 1)))
+    return Survey(LinearisedResiduals(None, slopes, np.ones(len(t), bool)), None)
+
+
+def asked(candidates=None, shrink="g", records=(fallen,)):
+    """What to measure next, with slopes in closed form: nothing is integrated or compiled."""
+    problem = problem_for(list(records))
+    at = of_a_fall(problem, problem.start)
+    return next_measurements(problem, list(records), at, shrink, candidates, problem_for)
+
+
+def test_further_falls_in_closed_form(monkeypatch):
+    """The error of g after another fall, a longer or a known one, one more measurement, and for two records."""
+    monkeypatch.setattr(next_measurement, "survey", of_a_fall)
+    zeros, first = {"q": np.zeros(21), "sigma": SIGMA, **RUN}, parabola(T)
+    told = asked({
+        "longer": lj.Record(LONG, **zeros),
+        "again": lj.Record(T, **zeros),
+        "from a stand": lj.Record(LONG, **zeros, hold_q=True, hold_v=True),
+    })  # fmt: skip
+    assert [c.name for c in told.candidates] == ["from a stand", "longer", "again"] and told.absolute
+    exact = [sds(two_runs(first, parabola(LONG), held=True))[0], sds(two_runs(first, parabola(LONG)))[0]]
+    np.testing.assert_allclose([c.sd for c in told.candidates], [*exact, told.now / np.sqrt(2)], rtol=1e-9)
+    np.testing.assert_allclose(told.now, sds(first)[0], rtol=1e-9)
+    times, sd = told["longer"].at_best(3)
+    np.testing.assert_allclose(times, [0.0, 2.0, 4.0])
+    np.testing.assert_allclose(sd, sds(two_runs(first, parabola(times)))[0], rtol=1e-9)
+    assert "longer" in repr(told) and "(measured: q to 0.01)" in repr(told)
+    # Further measurements: of the position or, as exactly, of the velocity; twin: not as if none were made.
+    told = asked()
+    of_rate = lambda t: np.stack([t, 0 * t, 1 + 0 * t], axis=1) / SIGMA
+    assert {c.name for c in told.candidates} == {"q", "v"} and told.best.name == "q" and "q at t = 4.1" in repr(told)
+    for name, slopes in (("q", parabola(told["q"].t)), ("v", of_rate(told["v"].t))):
+        after = [sds(np.concatenate([first, row[None]]))[0] for row in slopes]
+        np.testing.assert_allclose(told[name].alone, after, rtol=1e-8)
+        assert told[name].times[0] == told[name].t[-1] == pytest.approx(4.1)
+    assert not np.allclose(told["q"].alone, told.now, rtol=0.3)
+    # Two records: a measurement in one of them, whose errors are larger.
+    told = asked(records=(fallen, lj.Record(LONG, q=5.0 * LONG**2, sigma=0.1)))
+    assert {c.name for c in told.candidates} == {f"{x} of record {r}" for x in "qv" for r in (0, 1)}
+    rows, second = two_runs(first, parabola(LONG) / 10), told["q of record 1"]
+    further = np.zeros((len(second.t), 5))
+    further[:, [0, 3, 4]] = parabola(second.t) / 10
+    np.testing.assert_allclose(second.alone, [sds(np.concatenate([rows, x[None]]))[0] for x in further], rtol=1e-8)
+    assert told.now == pytest.approx(sds(rows)[0], rel=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_falling():
+    """The same from motions, for both kinds of candidates; other candidates compile nothing."""
+    zeros = {"q": np.zeros(21), "sigma": SIGMA, **RUN}
+    ask = lambda **more: lj.identifiability(fall, fallen, {"g": 9.81}, shrink="g", **more).next
+    others = {"longer": lj.Record(LONG, **zeros), "known": lj.Record(LONG, **zeros, hold_q=True, hold_v=True)}
+    for candidates in (others, None):
+        found = ask(candidates=candidates)
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.setattr(next_measurement, "survey", of_a_fall)
+            exact = asked(candidates)
+        assert [c.name for c in found.candidates] == [c.name for c in exact.candidates]
+        np.testing.assert_allclose([found.now, found.best.sd], [exact.now, exact.best.sd], rtol=1e-8)
+        np.testing.assert_allclose(found.best.alone, exact.best.alone, rtol=1e-8)
+    with compiles() as programs:
+        ask(candidates={"twice": lj.Record(2 * T, **zeros)})
+    assert programs == []
+
+
 @pytest.mark.parametrize(
     "more, error, words",
     [
         ({"shrink": "h"}, ValueError, "shrink names 'h', which is not among the fitted parameters: 'g'"),
-        ({"candidates": {"a": fallen}}, ValueError, 'shrink="g"'),
-        ({"shrink": "g", "free": []}, ValueError, "no parameter is fitted"),
-        ({"shrink": "g", "candidates": {}}, ValueError, "candidates is empty"),
-        ({"shrink": "g", "candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
-        (
-            {"shrink": "g", "candidates": {"a": lj.Record(T, q=T, **RUN)}},
-            ValueError,
-            "'a' has no sigma, and the records",
-        ),
-        ({"shrink": "g", "candidates": {"a": lj.Record(T, q=T * np.nan, sigma=1.0, **RUN)}}, ValueError, "are NaN"),
+        ({"candidates": {}}, ValueError, "candidates is empty"),
+        ({"candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
+        ({"candidates": {"a": lj.Record(T, q=T, **RUN)}}, ValueError, "'a' has no sigma, and the records"),
+        ({"candidates": {"a": lj.Record(T, q=T * np.nan, sigma=1.0, **RUN)}}, ValueError, "are NaN"),
+        ({"shrink": lambda p: np.ones(2)}, ValueError, r"a single number, not an array of shape \(2,\)"),
+        ({"shrink": lambda p: 0.0 * p["g"]}, ValueError, "does not depend on the fitted parameters"),
     ],
 )
 def test_words(more, error, words):
     """Arguments that make no sense raise errors in the user's words."""
     with pytest.raises(error, match=words):
-        lj.identifiability(fall, fallen, {"g": 9.81}, **more)
+        asked(**more)
 
 
-def test_words_where_it_is_traced():
+def test_words_before_anything_is_computed():
+    """Candidates without a number to compare them by, and a number while none is fitted."""
+    with pytest.raises(ValueError, match='shrink="g"'):
+        lj.identifiability(fall, fallen, {"g": 9.81}, candidates={"a": fallen})
+    with pytest.raises(ValueError, match="no parameter is fitted"):
+        next_measurement._direction(problem_for([fallen], free=()), "g")
+
+
+def test_words_where_it_is_traced(monkeypatch):
     """Inside a program it raises an error, since it needs numbers."""
+    monkeypatch.setattr(
+        import_module("lagjax.fit.identifiability"), "survey", lambda problem, u: Survey(None, problem.measured)
+    )
     of = lambda q: lj.identifiability(fall, lj.Record(T, q=q, sigma=SIGMA), {"g": 9.81}, shrink="g").next.now
     with pytest.raises(TypeError, match="not in jit, vmap or lj.sweep"):
         jax.jit(of)(5.0 * T**2)

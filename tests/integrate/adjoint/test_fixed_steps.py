@@ -8,7 +8,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.adjoint import step_record
-from tests.integrate.adjoint.test_replay import PARAMS, TS, end, modes_agree, pendulum, rod
+from tests.integrate.adjoint import test_replay
+from tests.integrate.adjoint.test_replay import PARAMS, SWUNG, TS, end, modes_agree, pendulum, rod
 
 pytestmark = pytest.mark.usefixtures("in_reverse")
 
@@ -16,6 +17,15 @@ pytestmark = pytest.mark.usefixtures("in_reverse")
 FIXED = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(0.09)}
 
 
+def test_a_spring_by_parameters_state_and_times():
+    """Derivatives by stiffness, first state and times inside steps, of which two are the same, in closed form: an
+    output at the same time as the one before it moves with that."""
+    x = np.concatenate([SWUNG[0, :4], [0.0, 0.31, 0.31, 1.0]])
+    found = np.asarray(test_replay.slopes_found(x[None], **FIXED))[0]
+    np.testing.assert_allclose(found, test_replay.slopes_expected(x, (0, 1, 1, 3)), rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.exhaustive
 def test_a_pendulum_by_parameters_state_and_times():
     """The modes agree on derivatives by g, l, the first state and all output times, which lie inside steps."""
     system = pendulum()
@@ -23,6 +33,7 @@ def test_a_pendulum_by_parameters_state_and_times():
     assert np.all(np.abs(found[3]) > 1e-3)
 
 
+@pytest.mark.slow
 def test_rollout(monkeypatch):
     """Where outputs are ends of steps, the gradient is that of `lj.rollout`; long motions are run again in pieces."""
     monkeypatch.setattr(step_record, "ROWS", 4)
@@ -45,20 +56,6 @@ def test_rollout(monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11), found, expected)
 
 
-def test_closed_form():
-    """A fall is a parabola, which Runge-Kutta steps follow to round-off: so do derivatives by g and an output time."""
-    stone = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.sum(p) * q)
-    at, g = jnp.array([0.0, 0.31, 0.31, 1.0]), jnp.full(30, 9.81 / 30)
-    found = jax.grad(
-        lambda p, ts: lj.integrate(stone, 1.0, 2.0, p, ts=ts, **FIXED).q[1:] @ jnp.arange(1.0, 4.0), (0, 1)
-    )
-    by_g, by_t = found(g, at)
-    np.testing.assert_allclose(by_g, -(3 * 0.31**2 + 3) / 2, rtol=1e-12)
-    # An output at the same time as the one before it moves with that; all move with the first time.
-    slope = np.array([0.0, 3 * (2 - 9.81 * 0.31), 0.0, 3 * (2 - 9.81)])
-    np.testing.assert_allclose(by_t, slope - [np.sum(slope), 0, 0, 0], rtol=1e-12)
-
-
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("copies", (1, 2))
 def test_constraints_in_lanes(copies):
@@ -73,7 +70,7 @@ def test_constraints_in_lanes(copies):
     modes_agree(lambda x: jnp.sum(lanes(*x)), (jnp.array([0.0, 0.5]), jnp.array([2.0, 0.7]), PARAMS))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_event():
     """The time and the velocity at which a stone falls to the floor, by its height and by g."""
     stone = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
@@ -83,7 +80,7 @@ def test_an_event():
         traj = lj.integrate(stone, p["h"], 0.0, p, ts=TS, events={"floor": floor}, **FIXED)
         return traj.end.t + traj.end.v
 
-    found = modes_agree(function, {"g": 9.81, "h": 1.0})
+    found = jax.jit(jax.grad(function))({"g": 9.81, "h": 1.0})
     # T = √(2 h / g), v = -√(2 g h).
     np.testing.assert_allclose(found["h"], 1 / np.sqrt(2 * 9.81) - np.sqrt(9.81 / 2), rtol=1e-9)
     np.testing.assert_allclose(found["g"], -np.sqrt(0.5 / 9.81**3) - np.sqrt(0.5 / 9.81), rtol=1e-9)

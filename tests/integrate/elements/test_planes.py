@@ -26,15 +26,17 @@ def test_forces_in_planes():
     count, mu = 2, 0.8
     matrix, free = random_problems(count, 60)
 
+    @jax.jit
+    @jax.vmap
     def forces_of(matrix, free):
         of_forces = jnp.repeat(jnp.eye(count, 3 * count), 2, axis=0)
         zero = jnp.zeros(2 * count)
         may_push, partners = jnp.ones(count, bool), np.arange(2 * count) ^ 1
         return solved(ContactProblem(matrix, free, may_push, of_forces, zero, zero + mu, zero, partners))
 
-    forces, well = jax.vmap(forces_of)(jnp.asarray(matrix), jnp.asarray(free))
+    forces, well = map(np.asarray, forces_of(matrix, free))
     a = np.einsum("lij,lj->li", matrix, forces) + free
-    normal, along = np.asarray(forces[:, :count]), np.asarray(forces[:, count:]).reshape(-1, count, 2)
+    normal, along = forces[:, :count], forces[:, count:].reshape(-1, count, 2)
     a_normal, a_along = a[:, :count], a[:, count:].reshape(-1, count, 2)
     scale = 1 + np.max(np.abs(forces), axis=1, keepdims=True)
 
@@ -48,7 +50,7 @@ def test_forces_in_planes():
     slides = (np.linalg.norm(a_along, axis=-1) > 1e-6) & (normal > 1e-6)
     sticks = (np.linalg.norm(a_along, axis=-1) < 1e-9) & (normal > 1e-6)
     assert slides.sum() > 5 and sticks.sum() > 5
-    assert not np.any(obeys(0.9 * mu)[np.asarray(well)[:, None] & slides.any(axis=1, keepdims=True)])
+    assert not np.any(obeys(0.9 * mu)[well[:, None] & slides.any(axis=1, keepdims=True)])
 
 
 def on_a_tilt():

@@ -1,5 +1,7 @@
 """Contacts whose forces are not unique: the shortest ones that obey the laws, against statics by hand."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,75 +17,65 @@ from tests.integrate.elements.test_motions import moved
 G, MU, BOX = 9.81, 0.5, (1.0, 1.0, 2 / 3)
 
 
-def resting(rows, of_normals, mass, load, mu=MU, partners=None):
-    """The forces of contacts that are all at rest under a load, with what is at its bound; normal rows first."""
-    rows, of_normals = np.asarray(rows), np.asarray(of_normals)
-    gaps, slips = len(rows) - len(of_normals), len(of_normals)
-    partners = np.arange(slips) if partners is None else partners
-    response = rows / np.asarray(mass)
-    problem = ContactProblem(
-        jnp.asarray(response @ rows.T), jnp.asarray(response @ np.asarray(load)), jnp.ones(gaps, bool),
-        jnp.asarray(of_normals), jnp.zeros(slips), jnp.full(slips, mu), jnp.zeros(slips), partners,
-    )  # fmt: skip
-    held = HeldRows(jnp.asarray(rows), jnp.zeros((0, rows.shape[1])), jnp.zeros(0), jnp.zeros((len(rows), 0)))
+@partial(jax.jit, static_argnums=5)
+def in_bounds(matrix, free, rows, of_normals, mu, partners):
+    """Of contacts that are all at rest: what is at its bound, whether forces are found, these, and how they exceed."""
+    partners, (slips, k) = np.array(partners, int), of_normals.shape
+    may_push, zero = jnp.ones(k - slips, bool), jnp.zeros(slips)
+    problem = ContactProblem(matrix, free, may_push, of_normals, zero, zero + mu, zero, partners)
+    held = HeldRows(rows, jnp.zeros((0, rows.shape[1])), jnp.zeros(0), jnp.zeros((k, 0)))
 
     def holds(bound, solution):
-        return jnp.concatenate([~bound.lifted, lengths(bound.leans, partners) == 0]), jnp.full(len(rows), 1e-9)
+        return jnp.concatenate([~bound.lifted, lengths(bound.leans, partners) == 0]), jnp.full(k, 1e-9)
 
     bound, solution = within_laws(problem, held, holds)
-    forces, excess = held.excess(bound.on(problem), holds(bound, solution)[0])
-    assert solution.found and np.all(excess < 1e-9)
-    return bound, forces
+    leans = lengths(bound.leans, partners) > 0
+    return bound.lifted, leans, solution.found, *held.excess(bound.on(problem), holds(bound, solution)[0])
 
 
-def beam(x: float):
-    """The forces of supports at -1, 0 and 1 under a weight of one at x, of a beam with (y, angle)."""
-    return resting(np.array([[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]), np.zeros((0, 3)), [1.0, 1.0], [-1.0, -x])
+def resting(rows, of_normals, load, mass=1.0, mu=MU, partners=()):
+    """The forces under a load, which gaps are lifted, and which frictions are at their bound; normal rows first."""
+    rows = np.asarray(rows)
+    found = in_bounds(rows / mass @ rows.T, rows / mass @ np.asarray(load), rows, of_normals, mu, partners)
+    lifted, leans, solved, forces, excess = map(np.asarray, found)
+    assert solved and np.all(excess < 1e-9)
+    return forces, lifted, leans
 
 
 def test_a_beam_on_three_supports():
     """The shortest forces, 1/3 + s x/2 at the support s, until one of them would pull at x = 2/3: then the other two
     carry the beam. Twin: the shortest ones there."""
-    bound, forces = beam(0.5)
-    np.testing.assert_allclose(forces, np.array([1 / 12, 4 / 12, 7 / 12]), atol=1e-12)
-    assert not np.any(bound.lifted)
-    bound, forces = beam(0.9)
-    np.testing.assert_allclose(forces, [0.0, 0.1, 0.9], atol=1e-12)
-    assert np.asarray(bound.lifted).tolist() == [True, False, False] and 1 / 3 - 0.9 / 2 < -0.1
-
-
-def corners(push: float, mu: float = MU):
-    """The forces of a box on its corners at (±1, -1), pushed at its centre by a part of its weight."""
-    rows = [[0.0, 1.0, -1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]
-    return resting(rows, np.eye(2, 4), BOX, [push, -1.0, 0.0], mu)
+    supports = [[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]]
+    for x, wanted, up in ((0.5, [1 / 12, 4 / 12, 7 / 12], [False] * 3), (0.9, [0.0, 0.1, 0.9], [True, False, False])):
+        forces, lifted, _ = resting(supports, np.zeros((0, 3)), [-1.0, -x])
+        np.testing.assert_allclose(forces, wanted, atol=1e-12)
+        assert lifted.tolist() == up and (1 / 3 - x / 2 < 0) == any(up)
 
 
 def test_a_box_on_two_corners():
     """Each corner has half of the friction until the one that the push unloads, N = (1 - push)/2, has all that it can:
     μ N, and the other one the rest. Twin: half, which it cannot have."""
+    corners = [[0.0, 1.0, -1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]
     for push, fraction in ((0.1, 0.05), (0.4, MU * 0.3)):
-        bound, forces = corners(push)
+        forces, _, leans = resting(corners, np.eye(2, 4), [push, -1.0, 0.0], np.array(BOX), partners=(0, 1))
         np.testing.assert_allclose(forces, [(1 - push) / 2, (1 + push) / 2, -fraction, fraction - push], atol=1e-12)
-        assert bool(bound.leans[0]) == (fraction < push / 2)
+        assert leans[0] == (fraction < push / 2)
 
 
 def test_a_table_on_four_legs():
     """A table whose weight is off its centre, pushed obliquely, in a plane: forces obey Coulomb's law at each leg, and
     add up. Twin: without bounds a leg has more friction than it can."""
     legs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    still, every = np.zeros((4, 3)), np.ones(4)
-    up = np.stack([every, legs[:, 1], -legs[:, 0]], axis=1)
+    up = np.stack([np.ones(4), legs[:, 1], -legs[:, 0]], axis=1)
     along = np.array([[[1.0, 0.0, -y], [0.0, 1.0, x]] for x, y in legs]).reshape(8, 3)
-    rows = np.block([[up, still], [np.zeros((8, 3)), along]])
-    presses, partners = np.repeat(np.eye(4, 12), 2, axis=0), np.arange(8) ^ 1
+    rows = np.block([[up, np.zeros((4, 3))], [np.zeros((8, 3)), along]])
+    presses, partners = np.repeat(np.eye(4, 12), 2, axis=0), tuple(np.arange(8) ^ 1)
     load = np.array([-1.0, -0.3, 0.45, 0.25, 0.3, 0.0])
-    bound, forces = resting(rows, presses, np.ones(6), load, partners=partners)
-    normal, friction = np.asarray(forces[:4]), np.linalg.norm(np.reshape(forces[4:], (4, 2)), axis=1)
+    (forces, _, leans), (free, *_) = (resting(rows, presses, load, 1.0, mu, partners) for mu in (MU, 100.0))
+    normal, friction, unbound = forces[:4], *(np.linalg.norm(x[4:].reshape(4, 2), axis=1) for x in (forces, free))
     np.testing.assert_allclose(rows.T @ forces, -load, atol=1e-9)
     assert np.all(normal > -1e-12) and np.all(friction < MU * normal + 1e-9)
-    _, free = resting(rows, presses, np.ones(6), load, 100.0, partners)
-    free = np.linalg.norm(np.reshape(free[4:], (4, 2)), axis=1)
-    assert np.any(free > MU * normal + 1e-3) and np.any(lengths(bound.leans, partners) > 0)
+    assert np.any(unbound > MU * normal + 1e-3) and np.any(leans)
 
 
 LENGTH, HEIGHT = 1.0, 0.5
@@ -184,17 +176,20 @@ def brake() -> lj.System:
 def test_what_others_hold_lasts_while_it_is_still():
     """Its guard is above zero up to its slack's size, whatever the direction of that, and below zero beyond twice it.
     Twin: in mode 2, 0.3 less the force, of which the velocity is no part."""
-    start = State(jnp.asarray(0.3), jnp.zeros(2), jnp.zeros(2), {"across": 1.0, "along": 0.0})
+    given, still = {"across": np.array(1.0), "along": np.array(0.0)}, np.zeros(2)
+    start = State(np.array(0.3), still, still, given)
     _, laws = in_modes(brake(), start)
-    given = {mode: laws.given(start.params, jnp.array([mode]), jnp.array([-0.1])) for mode in (2, 3)}
-    force = {"rail": jnp.zeros(()), "brake": jnp.asarray(0.05)}
+    force = {"rail": np.zeros(()), "brake": np.array(0.05)}
 
-    def guard(mode, slip):
-        v = jnp.array([0.0, slip / np.sin(0.3)])
-        return float((laws.last(start.t, start.q, v, force, given[mode]) + laws.slack(given[mode]))[0])
+    @jax.jit
+    @jax.vmap
+    def guards(mode, slip):
+        here = laws.given(given, jnp.array([mode]), jnp.array([-0.1]))
+        v = jnp.stack([0.0 * slip, slip / jnp.sin(0.3)])
+        return (laws.last(start.t, start.q, v, force, here) + laws.slack(here))[0]
 
-    np.testing.assert_allclose([guard(3, slip) for slip in (0.0, 0.1, -0.3)], [0.2, 0.1, -0.1], atol=1e-12)
-    np.testing.assert_allclose([guard(2, slip) for slip in (0.0, -0.3)], 0.3 - 0.05 - 0.1, atol=1e-12)
+    found = guards(np.array([3, 3, 3, 2, 2]), np.array([0.0, 0.1, -0.3, 0.0, -0.3]))
+    np.testing.assert_allclose(found, [0.2, 0.1, -0.1, 0.15, 0.15], atol=1e-12)
 
 
 @pytest.mark.exhaustive

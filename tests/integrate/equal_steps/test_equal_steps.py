@@ -148,7 +148,7 @@ def test_a_mass_that_depends_on_the_velocity():
     assert np.max(np.abs(run(classical, rtol=1e-9).q - exact)) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_steps_are_symplectic():
     """Dᵀ J D = J for twenty steps of a double pendulum, whose mass matrix depends on the angles. Twin: Dopri8."""
     q0, v0 = DOUBLE_SWING
@@ -187,7 +187,7 @@ def test_a_thousand_turns_and_back():
     assert abs(np.polyfit(ts, h, 1)[0]) * ts[-1] > 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_over_half_a_million_steps():
     """A pendulum on a rod, half a million steps: the rod's length to round-off, and the energy."""
     pendulum = lj.System(
@@ -207,7 +207,7 @@ def test_constraints_over_half_a_million_steps():
     np.testing.assert_allclose(traj.multipliers["rod"], tension, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_both_modes():
     """d(end)/d(parameter), forward and in reverse, and as by steps that adapt."""
     pendulum = lj.System(lambda t, q, v, k: 0.5 * v**2 + k * jnp.cos(q))
@@ -244,7 +244,7 @@ def test_what_they_refuse():
         lj.integrate(cost, {"x": 1.0, "z": 0.0}, {"x": 0.0}, ts=[0.0, 1.0], method=lj.Splitting(), dt0=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_step_that_is_too_long():
     """A stiff spring: the iteration fails and says which step would do; Newton's method takes the long one."""
     spring = lj.System(lambda t, q, v, k: 0.5 * jnp.sum(v**2) - 9.81 * q[1] - 0.5 * k * (jnp.sqrt(q @ q) - 1) ** 2)
@@ -262,7 +262,7 @@ def test_a_step_that_is_too_long():
     np.testing.assert_allclose(slow.q, np.stack([np.sin(angle), -np.cos(angle)], 1), atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_thermostat_and_a_rod_given_three_times():
     """A state beside a mass, order 6 against SciPy; twin: another Q. Dependent constraints share the rod's force."""
     hoover = lj.System(
@@ -300,7 +300,7 @@ def test_a_thermostat_and_a_rod_given_three_times():
         np.testing.assert_allclose(swing.multipliers[name], 3 * 9.81 * swing.q[:, 1] * share, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_newtons_iteration_ends_at_every_length_of_a_step():
     """A stiff spring pendulum by long and short steps, against adaptive ones: an early end was taken for a failure."""
     spring = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - 500.0 * (jnp.sqrt(jnp.sum(q**2)) - 1.0) ** 2)

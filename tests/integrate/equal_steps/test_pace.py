@@ -131,7 +131,7 @@ def test_there_and_back(kind):
     assert jnp.linalg.norm(back(steps.first(s.t, x, u), 0.0)[1] - x) > 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_both_modes():
     """d(end)/d(GM), forward and in reverse, and by scaling."""
 

@@ -122,7 +122,7 @@ def swing_by_scipy(driven):
     return solve_ivp(rates, (0, 6), [1.0, 0.5], "DOP853", SPAN, rtol=2.5e-14, atol=1e-15).y[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wrong_order_is_seen_on_a_pendulum(monkeypatch):
     """Order 4 of Gauss(2). Failing twin: nodes that are a little off, by which it would still be symplectic."""
     exact, steps = swing_by_scipy(False), (4, 6, 8)

@@ -59,7 +59,7 @@ def test_a_wrong_length_would_be_seen(exact, monkeypatch):  # noqa: F811
     assert not any(within(4, found)), found
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_half_a_million_steps_on_a_rod():
     """The rod's length to round-off, the energy, its tension, and the way back."""
     ts = np.linspace(0.0, 5000.0, 51)
@@ -78,7 +78,7 @@ def test_half_a_million_steps_on_a_rod():
     np.testing.assert_allclose(back.q[-1], START, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rod_given_three_times():
     """Constraints that depend on each other: the motion of one rod, its tension shared by the shortest multipliers."""
     again = {

@@ -8,14 +8,24 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.integrate.events.test_event import ball, doubt, oscillator, swing, times
+from tests.integrate.events.test_event import EVENTS, SPRING, doubt, fall, oscillator, plant, swing, times
 from tests.tiers import exhaustive_but
 
 
 def test_the_first_of_two_crossings_in_a_step_ends_the_motion():
     """q = sin t passes 0.9 at arcsin 0.9 and comes back within a step; outputs are NaN from there on."""
+    falling = SPRING | {"by_q": -1.0, "by_v": 0.0, "level": 0.95, "stop": -0.9}
+    traj = lj.integrate(plant, 0.0, 1.0, falling, ts=[0.0, 1.0, 1.2], events=EVENTS, rtol=1e-9, atol=1e-9)
+    assert float(traj.end.t) == pytest.approx(np.arcsin(0.9), abs=1e-9)
+    assert np.isfinite(traj.q).tolist() == [True, True, False]
+    assert len(times(traj)) == 0
+
+
+@pytest.mark.slow
+def test_an_event_of_diffrax():
+    """The same by a `diffrax.Event`, with many outputs."""
     level = diffrax.Event(lambda t, y, p, **kwargs: y[0] - 0.9)
-    ts = jnp.linspace(0.0, 20.0, 401)
+    ts = np.linspace(0.0, 20.0, 401)
     traj = lj.integrate(oscillator, 0.0, 1.0, ts=ts, event=level)
     assert float(traj.end.t) == pytest.approx(np.arcsin(0.9), abs=1e-9)
     assert np.array_equal(np.isfinite(traj.q), ts <= np.arcsin(0.9))
@@ -86,17 +96,12 @@ def test_methods_and_controllers(name):
     assert np.isfinite(traj.q).tolist() == [True, True, False]
 
 
-floor = {"floor": lj.Crossing(lambda t, q, v, p: q - p)}
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, 1e-15, -1e-15, 1e-14, 1e-12, -1e-11])
 def test_at_the_last_time(level):
     """A crossing at `ts[-1]` is found once, there or when continuing from there: q = 5 (1 - t²) is zero at 1."""
-    first = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 1.0], events=floor)
-    found, end = int(first.events["floor"].count), first.end
+    first = fall(5.0, 0.0, [0.0, 0.5, 1.0], level)
+    found, end = int(first.events["stop"].count), first.end
     if not found:
-        found = int(lj.integrate(ball, end.q, end.v, level, ts=[1.0, 2.0], events=floor).events["floor"].count)
+        found = int(fall(end.q, end.v, [1.0, 1.5, 2.0], level).events["stop"].count)
     assert found == 1
-    through = lj.integrate(ball, 5.0, 0.0, level, ts=[0.0, 2.0], events=floor)
-    assert float(through.end.t) == pytest.approx(np.sqrt(1.0 - level / 5.0), abs=1e-14)
+    assert float(fall(5.0, 0.0, [0.0, 0.5, 2.0], level).end.t) == pytest.approx(np.sqrt(1.0 - level / 5.0), abs=1e-14)

@@ -1,7 +1,9 @@
 """Estimated errors compared with true ones: Kepler's motion, whose position is known at any time, and chaos."""
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import diffrax
 import jax
@@ -10,11 +12,13 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.solve.error_estimate import _closer, _of_times, steps_to_repeat, with_errors
+from tests import by_hand
+from tests.systems import DOUBLE_PARAMS, PARAMS, TS, double_pendulum, motion, pendulum
 
 ECCENTRICITY = 0.6
 kepler = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) + p["k"] / jnp.sqrt(q["x"] ** 2 + q["y"] ** 2))
 near_pericentre = lj.Crossing(lambda t, q, v, p: q["y"], direction=1, terminal=False)
-swing = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * (1 - jnp.cos(q)))
 
 
 def exact(t, e=ECCENTRICITY):
@@ -35,63 +39,118 @@ def orbit(ts, e=ECCENTRICITY, **settings):
         return lj.integrate(kepler, *exact(ts[0], e), {"k": 1.0}, ts=ts, **settings)
 
 
-def ratios(traj, e=ECCENTRICITY):
-    """Return true errors in units of the estimated ones: the largest of the coordinates, and of the velocities.
+def ratios(*pairs):
+    """Return true errors in units of the estimated ones, each the largest of several numbers in one unit.
 
     The first outputs are left out, as they only have round-off.
     """
-    found = []
-    for got, true, error in zip((traj.q, traj.v), exact(np.asarray(traj.t), e), (traj.error.q, traj.error.v)):
-        off = np.max([abs(got[name] - true[name]) for name in got], axis=0)
-        found.append((off / np.max([error[name] for name in got], axis=0))[2:])
-    return np.concatenate(found)
+    largest = [[np.max(np.stack([*numbers]), axis=0)[2:] for numbers in pair] for pair in pairs]
+    return np.concatenate([off / error for off, error in largest])
+
+
+def off_orbit(traj):
+    """The true errors of an orbit's coordinates, and velocities, each with the estimated ones."""
+    for got, true, error in zip((traj.q, traj.v), exact(np.asarray(traj.t)), (traj.error.q, traj.error.v)):
+        yield [abs(got[name] - true[name]) for name in got], error.values()
 
 
 FEW, MANY = np.linspace(0.0, 40.0, 9), np.linspace(0.0, 20.0, 101)
 CASES = {
-    "default, loose": (FEW, dict(rtol=1e-5, atol=1e-5)),
     "default": (FEW, dict()),
-}
-OTHERS = {
     "outputs choose the steps": (MANY, dict(method=lj.Dopri8())),
-    "a longest step": (FEW, dict(max_step=0.1, method=lj.Dopri8())),
     "backward": (FEW[::-1], dict(rtol=1e-7, atol=1e-7)),
-    "Tsit5": (FEW, dict(method=lj.Tsit5(), rtol=1e-6, atol=1e-6)),
     "implicit": (FEW, dict(method=lj.Radau5(), rtol=1e-7, atol=1e-7)),
+    "default, loose": (FEW, dict(rtol=1e-5, atol=1e-5)),
+    "a longest step": (FEW, dict(max_step=0.1, method=lj.Dopri8())),
+    "Tsit5": (FEW, dict(method=lj.Tsit5(), rtol=1e-6, atol=1e-6)),
     "fixed steps": (FEW, dict(method=diffrax.Heun(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)),
 }
+RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
 
 
-marked = lambda mark, *names: [pytest.param(name, marks=mark) for name in names]
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *CASES,
-        *marked(pytest.mark.slow, "outputs choose the steps", "backward", "implicit"),
-        *marked(pytest.mark.exhaustive, "a longest step", "Tsit5", "fixed steps"),
-    ],
-)
-def test_estimated_as_they_are(name):
-    """Estimates are within a factor of ten of the true errors nearly everywhere; twin: a thousandth of them is not."""
-    ts, settings = (CASES | OTHERS)[name]
-    found = ratios(orbit(ts, **settings))
+def check_estimates(found):
+    """Within a factor of ten of the true errors nearly everywhere; twin: a thousandth of them is not."""
     within = lambda x: np.mean((x > 0.1) & (x < 10.0))
     assert within(found) > 0.85 and found.max() < 20.0, found
     assert within(1e3 * found) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [None, 1e-5])
+def test_estimated_as_they_are(rtol):
+    """Estimates are about the true errors of a pendulum, small and wide, over seven to nine periods."""
+    found = []
+    for amplitude in (0.5, 1.0, 1.5, 2.0, 2.5):
+        ts = np.linspace(0.0, 20.0, 8)
+        traj = lj.integrate(pendulum, amplitude, 0.0, PARAMS, ts=ts, rtol=rtol)
+        q, v = by_hand.swing(ts, amplitude, RATE)
+        off = abs(traj.q - q), abs(traj.v - v) / RATE
+        found.append(ratios((off, (traj.error.q, traj.error.v / RATE))))
+    check_estimates(np.concatenate(found))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "default" else pytest.mark.exhaustive) for name in CASES],
+)
+def test_estimated_as_they_are_on_an_orbit(name):
+    """Estimates are about the true errors, by each method and wherever the steps come from."""
+    ts, settings = CASES[name]
+    check_estimates(ratios(*off_orbit(orbit(ts, **settings))))
+
+
+def test_what_is_not_estimated():
+    """Steps of another controller, which cannot be shortened, and more steps than are repeated: NaN, and why."""
+    first, limit = motion("pendulum"), np.asarray(20_000)
+    pid = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    for controller, most in ((pid, limit), (diffrax.ConstantStepSize(), limit), (None, np.asarray(1))):
+        settings = SimpleNamespace(controller=controller, dt0=None, repeated_up_to=most)
+        found = with_errors(None, first, settings, TS)
+        assert bool(found.error.result == lj.RESULTS.not_estimated) and np.isnan(found.error.q).all()
+        assert found.q is first.q
+    assert "more than 20,000 steps" in repr(found) and "how to shorten the steps of its controller" in repr(found)
+
+
+@dataclass
+class SettingsLike:
+    """What a second run changes."""
+
+    controller: Any
+    rtol: Any
+    atol: Any
+    max_step: Any
+    dt0: Any = None
+    shares: Any = None
+
+
+def test_the_second_run():
+    """Ten times tighter, or looser at round-off; one step more to an output; half of fixed steps and of `max_step`."""
+    given = SettingsLike(controller=None, rtol=np.full(2, 1e-9), atol=np.full(2, 1e-6), max_step=np.asarray(np.inf))
+    closer = lambda steps=100, **changes: _closer(np, replace(given, **changes), steps, np.asarray(1.0), TS)
+    usual = closer()
+    np.testing.assert_allclose([usual.rtol[0], usual.atol[0], *usual.shares], [1e-10, 1e-7, 0.7, 1 / 3])
+    np.testing.assert_allclose([closer(rtol=np.full(2, 1e-15)).rtol[0], usual.max_step], [1e-14, np.inf])
+    # Three outputs after the start in five steps: up to two steps each, and so three.
+    np.testing.assert_allclose(closer(5).shares[1], 1 / 3)
+    np.testing.assert_allclose([closer(max_step=np.asarray(x)).max_step for x in (0.012, 0.5)], [0.006, 0.5])
+    fixed = replace(given, controller=diffrax.ConstantStepSize(), dt0=0.5)
+    assert _closer(np, fixed, 100, np.asarray(1.0), TS).dt0 == 0.25
+
+
+def test_times_of_crossings():
+    """The difference of both runs and round-off; infinite for what the second does not find."""
+    first, second = np.array([1.0, 2.0, 4.0, np.nan]), np.array([1.0 + 1e-9, np.nan, 4.0, np.nan])
+    np.testing.assert_allclose(_of_times(np, first, second, 1e-12), [1.001e-9, np.inf, 4e-12, np.nan], rtol=1e-6)
+
+
+@pytest.mark.exhaustive
 def test_steps_of_another_controller():
     """It is unknown how to shorten another controller's steps: there is no estimate, even if one is requested."""
     given = dict(stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9), estimate_error=True)
     found = orbit(np.array([0.0, 10.0]), **given)
     assert bool(found.error.result == lj.RESULTS.not_estimated) and np.isnan(found.error.q["x"]).all()
-    assert "how to shorten the steps of its controller" in repr(found)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_times_of_events():
     """Each crossing's time has an error estimate."""
     traj = orbit(np.array([0.0, 40.0]), rtol=1e-7, atol=1e-7, events={"up": near_pericentre})
@@ -104,32 +163,35 @@ def test_times_of_events():
     assert "error of 'up'" in repr(traj)
 
 
-def test_what_chaos_leaves():
-    """A warning with coordinate, time and cause appears if no digits are left, but not if all are."""
-    lagrangian = lambda t, q, v, p: (
-        v["a"] ** 2
-        + 0.5 * v["b"] ** 2
-        + v["a"] * v["b"] * jnp.cos(q["a"] - q["b"])
-        + p["g"] * (2 * jnp.cos(q["a"]) + jnp.cos(q["b"]))
-    )
-    double, start = lj.System(lagrangian), ({"a": 2.5, "b": 2.0}, {"a": 0.0, "b": 0.0})
-    run = lambda end: lj.integrate(double, *start, {"g": 9.81}, ts=np.linspace(0.0, end, 41))
-    with pytest.warns(
-        lj.AccuracyWarning, match=r"the error of '(v of )?[ab]' grows .* From t = [\s\S]* amplifies errors"
-    ):
-        long = run(60.0)
-    assert (
-        long.scaled_error > 1 and long.error.q["b"][-1] > 0.3 and "has cost" in repr(long) and "WARNING" in repr(long)
-    )
-    short = run(1.0)
-    assert short.scaled_error < 0.1 and short.error.q["b"][-1] < 1e-7 and "WARNING" not in repr(short)
+def test_what_the_top_of_a_hill_leaves():
+    """A pendulum that comes to rest on its top loses its digits there: a warning with coordinate, time and cause.
+
+    Twins: after a short time none are lost; with two outputs it is not known where, and causes are called possible.
+    """
+    run = lambda end, count: lj.integrate(pendulum, 0.0, 2 * RATE, PARAMS, ts=np.linspace(0.0, end, count))
+    words = r"the error of '(v of )?q' grows .* From t = [\s\S]* Cause: the motion itself amplifies errors, here"
+    with pytest.warns(lj.AccuracyWarning, match=words.replace(" Cause", "\nCause")):
+        long = run(12.0, 8)
+    assert long.scaled_error > 1 and long.error.q[-1] > 0.3 and "has cost" in repr(long) and "WARNING" in repr(long)
+    with pytest.warns(lj.AccuracyWarning, match="between t = 0 and 12 .* possible causes: the motion amplifies errors"):
+        run(12.0, 2)
+    short = run(1.0, 8)
+    assert short.scaled_error < 0.1 and short.error.q[-1] < 1e-7 and "WARNING" not in repr(short)
     # The Jacobi integral does not reveal this error.
     assert long.drift() < 1e-7
 
 
+@pytest.mark.exhaustive
+def test_what_chaos_leaves():
+    """No digits are left of a double pendulum, and the warning says so; the Jacobi integral does not reveal it."""
+    with pytest.warns(lj.AccuracyWarning, match=r"the error of '(v of )?\[?[01]\]?' grows [\s\S]* amplifies errors"):
+        long = lj.integrate(double_pendulum, [2.5, 2.0], [0.0, 0.0], DOUBLE_PARAMS, ts=np.linspace(0.0, 60.0, 41))
+    assert long.scaled_error > 1 and long.error.q[-1][1] > 0.3 and long.drift() < 1e-7
+
+
 def swung(g, **asked):
     """The swing for 20 seconds."""
-    return lj.integrate(swing, 1.0, 0.0, {"g": g}, ts=np.linspace(0.0, 20.0, 5), rtol=1e-6, **asked)
+    return lj.integrate(pendulum, 1.0, 0.0, {"g": g, "l": 1.0}, ts=np.linspace(0.0, 20.0, 5), rtol=1e-6, **asked)
 
 
 def test_by_default():
@@ -137,7 +199,14 @@ def test_by_default():
     eager, refused = swung(9.81), swung(9.81, estimate_error=False)
     assert refused.error is None and "  error  " not in repr(refused) and "  error  " in repr(eager)
     np.testing.assert_array_equal(refused.q, eager.q)
-    assert jax.eval_shape(swung, 9.81).error is None
+    asked = {None: 20_000, True: 2**31 - 1, False: 0}
+    assert {asked: int(steps_to_repeat(asked, None, False)) for asked in asked} == asked
+    # Neither in a program, nor by another controller, nor where the user watches.
+    assert "0:i32[]" in str(jax.make_jaxpr(lambda x: steps_to_repeat(None, None, False))(0.0))
+    pid = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+    assert not steps_to_repeat(None, pid, False) and not steps_to_repeat(None, None, True)
+    with pytest.raises(TypeError, match="estimate_error must be True, False or None, not 'yes'"):
+        steps_to_repeat("yes", None, False)
 
 
 @pytest.mark.exhaustive
@@ -152,7 +221,7 @@ def test_when_asked():
     assert jax.jacfwd(lambda g: swung(g, estimate_error=True).error.q[-1])(9.81) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_cannot_be_estimated():
     """Without an estimate it is NaN, with the reason; the motion itself is kept."""
     ts = np.array([0.0, 10.0])
@@ -164,8 +233,6 @@ def test_what_cannot_be_estimated():
     long = orbit(np.array([0.0, 8e3]))
     assert int(long.stats["num_steps"]) > 20_000 and bool(long.error.result == lj.RESULTS.not_estimated)
     assert np.isnan(long.error.q["x"]).all() and "more than 20,000 steps" in repr(long)
-    with pytest.raises(TypeError, match="estimate_error must be True, False or None, not 'yes'"):
-        orbit(ts, estimate_error="yes")
 
 
 @pytest.mark.exhaustive
@@ -173,7 +240,7 @@ def test_what_chose_the_steps():
     """Outputs, tolerance, longest step or stability are named; and the number of evaluations."""
     said = lambda traj: next(line for line in repr(traj).splitlines() if "steps chosen by" in line)
     dense = np.linspace(0.0, 2.0, 101)
-    assert "the outputs" in said(lj.integrate(swing, 1.0, 0.0, {"g": 9.81}, ts=dense))
+    assert "the outputs" in said(lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=dense))
     assert "the tolerance" in said(orbit(FEW)) and "max_step" in said(orbit(FEW, max_step=0.05))
     drag = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, dissipation=lambda t, q, v, p: 0.5 * p * v**2)
     assert "stability" in said(lj.integrate(drag, 1.0, 0.0, 1e4, ts=np.array([0.0, 0.5]), method=lj.Tsit5()))
@@ -181,14 +248,10 @@ def test_what_chose_the_steps():
     assert f"{13 * int(traj.stats['num_steps']):,} evaluations" in repr(traj)
 
 
-def test_outputs_a_round_off_apart():
-    """An output a round-off after a jump does not stop the second run; twin: if it fails, the error is not known."""
-    pulsed = lj.System(lambda t, q, v, p: 0.5 * v**2 + q * jnp.where((t > p["lo"]) & (t < p["hi"]), 1.0, 0.0))
-    ts, params = np.array([0.0, 4.0, np.nextafter(4.1, 5.0), 10.0]), {"lo": 4.0, "hi": 4.1}
-    found = lj.integrate(pulsed, 0.0, 0.0, params, ts=ts)
-    # The time of a jump is resolved to several round-offs.
-    assert abs(found.q[-1] - 0.595) < 1e-12 and found.error.q[-1] < 1e-12
+def test_an_error_that_is_not_known():
+    """If the second run fails it says so; twin: as it was."""
+    found = motion("pendulum")
     nothing = np.full(4, np.nan)
     failed = found.error._replace(q=nothing, v=nothing, result=lj.RESULTS.max_steps_reached)
-    unknown = replace(found, error=failed)
-    assert "not known: of a second, more precise motion" in repr(unknown) and "not known" not in repr(found)
+    assert "not known: of a second, more precise motion" in repr(replace(found, error=failed))
+    assert "not known" not in repr(found)

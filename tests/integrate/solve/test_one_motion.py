@@ -29,7 +29,7 @@ def test_event_is_located_by_the_method():
     assert bool(traj.result == lj.RESULTS.event_occurred)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_long_loop_in_parts(monkeypatch):
     """A mass on a rod whose angle has no mass of its own, 1e-9 from the elliptic function, its loop compiled in parts.
 

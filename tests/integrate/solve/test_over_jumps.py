@@ -26,6 +26,38 @@ def test_a_brake():
     np.testing.assert_allclose(braked(2.0, by=1.0), 1.5, rtol=1e-13)
 
 
+# A push from one time to another, of a mass on a spring.
+pushed = lj.System(
+    lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * (q - p["rest"]) ** 2,
+    force=lambda t, q, v, p: jnp.where((t > p["lo"]) & (t < p["hi"]), p["F"], 0.0),
+)
+
+
+def push(ts, F, lo, hi, k=0.0, rest=0.0, **options):
+    """The motion from rest."""
+    params = {"k": k, "rest": rest, "F": F, "lo": lo, "hi": hi}
+    return lj.integrate(pushed, rest, 0.0, params, ts=np.array(ts), **options)
+
+
+def test_a_push_in_time():
+    """A push shorter than a step is seen, and followed to round-off in any unit; the error of the motion is small.
+
+    An output a round-off after its end does not stop the second run.
+    """
+    for unit in (1e-6, 1.0, 1e6):
+        traj = push([0.0, 4.0, np.nextafter(4.1, 5.0), 10.0], unit, 4.0, 4.1)
+        # The time of a jump is resolved to several round-offs.
+        np.testing.assert_allclose(np.asarray(traj.q)[-1] / unit, 0.595, rtol=1e-12)
+        assert np.asarray(traj.error.q)[-1] < 1e-12 * unit and float(traj.scaled_error) < 1e-2
+
+
+@pytest.mark.parametrize("rest", [0.0, 1.0])
+def test_at_rest_until_a_force_sets_in(rest):
+    """The size of a motion whose force sets in later is unknown at the start: it is computed without a warning."""
+    traj = push([0.0, 6.0], 10.0, 5.25, 9.0, k=1.0, rest=rest)
+    np.testing.assert_allclose(np.asarray(traj.q)[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
+
+
 @pytest.mark.exhaustive
 def test_derivatives_of_a_brake():
     """By the velocity, the edge and the strength, in both modes.
@@ -68,7 +100,7 @@ def test_a_wall_that_does_not_pull():
     assert abs(jax.grad(partial(after, jumps="ignored"))(2.0) - value / 2.0) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_pulse_between_two_steps():
     """A push shorter than a step, with its derivatives by its two ends; twin: ignored, it is missed."""
     pushed = lj.System(kinetic, force=lambda t, q, v, p: jnp.where((t > p[0]) & (t < p[1]), 1.0, 0.0))
@@ -80,7 +112,7 @@ def test_a_pulse_between_two_steps():
     assert end(4.0, 4.05, jumps="ignored") == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rocket_switched_off():
     """Derivatives of all outputs by the time of the switch: F (t - off)/m; twin: zero where it is ignored."""
     rocket = lj.System(lambda t, q, v, p: v**2, force=lambda t, q, v, p: jnp.where(t < p, 3.0, 0.0))
@@ -157,7 +189,7 @@ def test_a_fit():
     np.testing.assert_allclose([fit.params["edge"], fit.params["by"]], [0.73, 1.7], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_events_and_constraints():
     """Events are recorded over all legs; a bead on a rod with friction comes to rest where friction holds it."""
     rod = lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1)
@@ -175,7 +207,7 @@ def test_events_and_constraints():
     np.testing.assert_allclose(traj.events["low"].found().q["x"], 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_state_on_a_jump_throughout():
     """A guard that stays at zero costs no steps and changes nothing; twin: that the motion is there at all."""
     flat = lj.System(
@@ -187,7 +219,7 @@ def test_a_state_on_a_jump_throughout():
     assert traj.stats["num_steps"] < 40
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_cannot_be_followed_is_said():
     """A comparison in a loop, and more jumps than are followed; a value of `jumps` that does not exist."""
     loop = lj.System(kinetic, force=lambda t, q, v, p: jax.lax.fori_loop(0, 2, lambda i, x: jnp.where(x > 0, -x, x), q))

@@ -1,11 +1,16 @@
 """Lanes that start in different phases."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.solve.phases import phases_in, traced_phases
+from lagjax.integrate.solve.segments import _first_leg
+from lagjax.system import coordinates
 
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q, {"floor": lj.Holonomic(lambda t, q, p: q)})
@@ -19,6 +24,29 @@ def run(q, start):
     return lj.integrate(hybrid, q, 0.0, {"g": 10.0}, ts=TS, start=start, throw=False, estimate_error=False)
 
 
+def test_a_number_that_no_phase_has():
+    """Lanes begin in their own phases; a number that no phase has is a failure there, and nothing is finite."""
+    settings = SimpleNamespace(by_size=True)
+
+    @jax.jit
+    @jax.vmap
+    def begin(q, start):
+        state = coordinates.state(0.0, q, 0.0, {"g": 10.0})
+        system = traced_phases(hybrid.starting(start), state)
+        way = _first_leg(system, *state[1:], TS, phases_in(system, state, {})[0], settings)
+        return way.phase, way.continues, way.result._value, way.end.q, way.q
+
+    phase, continues, result, end, _ = begin(np.array([5.0, 0.0, 5.0, 5.0]), np.array([0, 1, 7, -1]))
+    np.testing.assert_array_equal(phase, [0, 1, 1, 0])
+    np.testing.assert_array_equal(continues, [True, True, False, False])
+    unknown = int(lj.RESULTS.no_such_phase._value)
+    np.testing.assert_array_equal(result, [0, 0, unknown, unknown])
+    np.testing.assert_array_equal(end, [5.0, 0.0, np.nan, np.nan])
+    by_name = [int(hybrid.starting(start).first) for start in ("flying", "lying", 1, np.int64(1))]
+    assert by_name == [0, 1, 1, 1]
+
+
+@pytest.mark.exhaustive
 def test_lanes_start_in_their_own_phases():
     """A ball falls from 5 to 3.75 while another lies; a number that no phase has is a failure, and nothing is finite.
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.jaxtools import hashable_partition
 from lagjax.jaxtools.cache import PROGRAMS
+from lagjax.system import coordinates
 from tests.counting import compiles
 from tests.systems import HORIZONTAL, PARAMS, TS, cartesian_lagrangian, pendulum, rod, rod_pendulum
 
@@ -29,22 +31,28 @@ def traces(call):
 
 
 def test_a_second_call_traces_nothing():
-    """Numbers of any type trace at most L, if it reads a global; after the global has changed, all is traced again."""
-    fall = lambda q0, m, ts: lj.integrate(drop, q0, 0.0, {"m": m}, ts=ts).q[-1]
-    assert fall(1.0, 2.0, [0.0, 0.5, 1.0]) == pytest.approx(1.0 - 9.81 / 2, abs=1e-8)
-    for q0, m, ts in (
-        (1.5, 3.0, np.array([0.0, 0.25, 1.0])),
+    """Numbers of any type, times and tolerances trace at most L, if it reads a global, and compile nothing.
+
+    Twin: after the global has changed, all is traced again.
+    """
+    fall = lambda q0, m, ts, rtol=1e-9: lj.integrate(drop, q0, 0.0, {"m": m}, ts=ts, rtol=rtol).q
+    assert np.asarray(fall(1.0, 2.0, [0.0, 0.5, 1.0]))[-1] == pytest.approx(1.0 - 9.81 / 2, abs=1e-8)
+    of_all_types = (
+        (1.5, 3.0, np.array([0.0, 0.25, 1.0]), 1e-7),
         (np.float64(1.5), np.array(3.0), (0.0, 0.5, 1.0)),
-        (jnp.asarray(1.5, float), jnp.asarray(3.0, float), jnp.array([0.0, 0.5, 1.0])),
-    ):
-        found, count = traces(lambda: fall(q0, m, ts))
-        assert float(found) == pytest.approx(1.5 - 9.81 / 2, abs=1e-8) and count <= 1
-    swing = lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS).q[-1]
+        (jnp.asarray(1.5, float), jnp.asarray(3.0, float), jnp.array([0.0, 0.5, 1.0]), np.float64(1e-8)),
+    )
+    with compiles() as found:
+        for numbers in of_all_types:
+            q, count = traces(lambda: fall(*numbers))
+            assert np.asarray(q)[-1] == pytest.approx(1.5 - 9.81 / 2, abs=1e-8) and count <= 1
+    assert not found
+    swing = lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS)
     swing(0.5)
     assert traces(lambda: swing(0.6))[1] == 0
     globals()["GRAVITY"] = 1.62
-    found, count = traces(lambda: fall(1.5, 3.0, TS))
-    assert float(found) == pytest.approx(1.5 - 1.62 / 2, abs=1e-8) and count > 1
+    q, count = traces(lambda: fall(1.5, 3.0, TS))
+    assert np.asarray(q)[-1] == pytest.approx(1.5 - 1.62 / 2, abs=1e-8) and count > 1
 
 
 def falling(g, shift=0.0):
@@ -79,13 +87,27 @@ def test_the_same_program_serves():
 
 
 def test_a_whole_number_that_counts_stays_whole():
-    """A whole number in params stays whole, as an index must; the motion is that of the float, also after a float."""
+    """A whole number in params stays whole, as an index must; one of the start becomes a float.
+
+    Twin: the program of another kind of number is another one.
+    """
+    given = lambda k: coordinates.prepared(0, 1, 0, {"k": k, "which": 2})
+    for k, kind in ((1.0, "f"), (1, "i"), (np.array([1, 2]), "i")):
+        found = given(k)
+        assert [np.result_type(x).kind for x in (*found[:3], found.params["k"], found.params["which"])] == [
+            *"fff", kind, "i"]  # fmt: skip
+    of = lambda k: hashable_partition(given(k))[1]
+    assert of(1.0) == of(2.5) != of(1)
+
+
+@pytest.mark.exhaustive
+def test_a_whole_number_is_an_index():
+    """The motion with a whole number is that of the float, also after a float."""
     table = jnp.array([1.0, 4.0, 9.0])
     spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * table[p["which"]] * q**2)
     swing = lambda k, which: float(lj.integrate(spring, 1.0, 0.0, {"k": k, "which": which}, ts=TS).q[-1])
-    assert swing(1.0, 1) == pytest.approx(np.cos(2.0 * TS[-1]), abs=1e-7)
-    assert swing(1, 2) == pytest.approx(np.cos(3.0 * TS[-1]), abs=1e-7)
-    assert swing(4, 1) == pytest.approx(np.cos(4.0 * TS[-1]), abs=1e-7)
+    for k, which, rate in ((1.0, 1, 2.0), (1, 2, 3.0), (4, 1, 4.0)):
+        assert swing(k, which) == pytest.approx(np.cos(rate * TS[-1]), abs=1e-7)
 
 
 def test_another_function_is_looked_at():
@@ -115,7 +137,9 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 import lagjax as lj
+from lagjax.jaxtools import hashable_partition
 from lagjax.jaxtools.cache import PROGRAMS
+from lagjax.system import coordinates
 PROGRAMS.most = int(sys.argv[1])
 used = []
 for i in [*range(6), 0]:

@@ -60,7 +60,7 @@ def test_ending_the_motion():
     assert len(ended.switches) == 0 and abs(float(ended.end.v) + np.sqrt(2 * G)) < 1e-12
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_forces_that_jump():
     """A push upward from a time between two bounces on agrees with the closed form; twin: from another time on."""
     pushed = lj.System(falling, force=lambda t, q, v, params: jnp.where(t < params, 0.0, 20.0))

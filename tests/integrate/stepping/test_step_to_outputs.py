@@ -34,37 +34,36 @@ def test_outputs_shorten_few_steps():
     assert 100 <= many <= alone + 100
 
 
+ONE = np.asarray(1.0)
+
+
+def stepping(ts, **limits):
+    """A controller that ends steps at `ts`, and its choice, compiled, after a step from t0 to t1 with some error."""
+    pid = diffrax.PIDController(rtol=1e-6, atol=1e-6, **limits)
+    controller = StepToOutputs(pid, jnp.array(ts), jnp.array(WHOLE_STEPS))
+    choose = lambda t0, t1, error, state: controller.adapt_step_size(t0, t1, ONE, ONE, None, error, 5, state)
+    return controller, jax.jit(choose)
+
+
 def test_the_size_proposed_before_is_kept():
     """After a step shortened to an output, the next one is as long as was proposed before."""
-    controller = StepToOutputs(
-        diffrax.PIDController(rtol=1e-6, atol=1e-6), jnp.array([0.0, 1.0, 1.001, 5.0]), jnp.array(WHOLE_STEPS)
-    )
-    before = jnp.asarray(0.4)
+    (controller, choose), before = stepping([0.0, 1.0, 1.001, 5.0]), 0.4
     inner = controller.controller.init(None, 0.0, 5.0, 1.0, 0.4, None, lambda *a: 0.0, 5)[1]
-    state = inner, jnp.asarray(2), before, jnp.asarray(0)
-    keep, t0, t1, _, (_, index, proposed, _), _ = controller.adapt_step_size(
-        1.0, 1.001, jnp.asarray(1.0), jnp.asarray(1.0), None, jnp.asarray(1e-9), 5, state
-    )
+    state = inner, np.asarray(2), np.asarray(before), np.asarray(0)
+    keep, t0, t1, _, (_, index, proposed, _), _ = choose(*map(np.asarray, (1.0, 1.001, 1e-9)), state)
     assert keep and index == 3 and proposed >= before
-    np.testing.assert_allclose(t1 - t0, proposed)
+    np.testing.assert_allclose(np.asarray(t1) - np.asarray(t0), proposed)
     assert 10 * (1.001 - 1.0) < 0.05 * before  # what the shortened step alone would have allowed
 
 
 @pytest.mark.parametrize("first", [1.5e-3, 0.9e-3])
 def test_a_rejected_step_is_not_tried_again(first):
     """Steps between one and two least steps that are rejected shrink until the least step ends the motion."""
-    controller = StepToOutputs(
-        diffrax.PIDController(rtol=1e-6, atol=1e-6, dtmin=1e-3, force_dtmin=False), jnp.array([0.0, 5.0]),
-        jnp.array(WHOLE_STEPS),
-    )  # fmt: skip
-    t1, state = controller.init(
-        None, jnp.asarray(0.0), 5.0, jnp.asarray(1.0), jnp.asarray(first), None, lambda *a: 0.0, 5
-    )
-    one, result = jnp.asarray(1.0), diffrax.RESULTS.successful
+    controller, choose = stepping([0.0, 5.0], dtmin=1e-3, force_dtmin=False)
+    begin = jax.jit(lambda dt0: controller.init(None, jnp.zeros(()), 5.0, ONE, dt0, None, lambda *a: 0.0, 5))
+    t1, state = begin(first)
     for _ in range(20):
-        keep, _, t1, _, state, result = controller.adapt_step_size(
-            jnp.asarray(0.0), t1, one, one, None, jnp.asarray(2e-6 * 1.01), 5, state
-        )
+        keep, _, t1, _, state, result = choose(np.asarray(0.0), t1, np.asarray(2e-6 * 1.01), state)
         assert not keep
         if result == diffrax.RESULTS.dt_min_reached:
             break
@@ -88,7 +87,7 @@ def test_steps_that_have_collapsed_end_a_motion():
         lj.integrate(ENDLESS, 1.0, 0.0, 2.0, ts=ts, rtol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_long_honest_motions_go_on():
     """Steps that stay short for long, but arrive: strong damping by an explicit method, at the edge of its stability;
     outputs that crowd together over twelve decades; a comet that passes its sun at 2e-6, there and back."""

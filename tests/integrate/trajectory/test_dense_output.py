@@ -1,65 +1,124 @@
 """The motion between outputs: its order, its constraints, its derivatives, and where it is not available."""
 
 import copy
+from dataclasses import replace
+from types import SimpleNamespace
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import ellipj, ellipk
+from scipy.special import ellipk
 
 import lagjax as lj
 from lagjax.integrate.trajectory.films import hermite
+from tests.by_hand import ASKED, HOW, by_hand, with_problem
+from tests.by_hand import swing as exact_swing
 from tests.counting import compiles
+from tests.systems import motion, pendulum, rod_pendulum
 
-TS = np.linspace(0.0, 4.0, 9)
+TS = np.linspace(0.0, 4.0, 8)
 AMPLITUDE = 2.0
 BETWEEN = np.array([3.3, 0.1, 1.7, 2.6])
-
-
-def pendulum(t, q, v, params):
-    """A pendulum of length and mass 1."""
-    return 0.5 * v**2 + params["g"] * jnp.cos(q)
+START = {"x": np.sin(AMPLITUDE), "y": -np.cos(AMPLITUDE)}, {"x": 0.0, "y": 0.0}
 
 
 def swing(q0=AMPLITUDE, g=1.0, ts=TS, **settings):
-    """The pendulum released at `q0`."""
-    return lj.integrate(lj.System(pendulum), q0, 0.0, {"g": g}, ts=ts, **settings)
+    """A pendulum of length 1 released at `q0`."""
+    return lj.integrate(pendulum, q0, 0.0, {"g": g, "l": 1.0}, ts=ts, **settings)
 
 
 def exact(t):
-    """The angle and its rate: Landau & Lifshitz, *Mechanics*, §11."""
-    k = np.sin(AMPLITUDE / 2)
-    sn, cn, dn, _ = ellipj(ellipk(k**2) - np.asarray(t), k**2)
-    return 2 * np.arcsin(k * sn), -2 * k * cn * dn / np.sqrt(1 - (k * sn) ** 2)
-
-
-def on_a_circle(t, q, v, params):
-    """The pendulum in Cartesian coordinates."""
-    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"]
-
-
-circle = lj.System(
-    on_a_circle, {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["length"] ** 2)}
-)
-START = {"x": np.sin(AMPLITUDE), "y": -np.cos(AMPLITUDE)}, {"x": 0.0, "y": 0.0}
+    """The angle and its rate."""
+    return exact_swing(t, AMPLITUDE)
 
 
 def rotate(ts=TS, g=1.0, **settings):
     """The same motion on the circle."""
-    return lj.integrate(circle, *START, {"g": g, "length": 1.0}, ts=ts, **settings)
+    return lj.integrate(rod_pendulum, *START, {"g": g, "l": 1.0}, ts=ts, **settings)
 
 
 def test_times_of_any_shape():
-    """Within the tolerance of the exact motion, in the requested order and shape; at outputs bit for bit."""
+    """Within the tolerance of the exact motion, in the requested order and shape; at outputs bit for bit.
+
+    Another motion of the system at other times compiles nothing; twin: a new function does.
+    """
     traj = swing()
     for t in (BETWEEN, BETWEEN.reshape(2, 2), 1.25, 2, [0.5, 0.75], np.zeros((0, 3))):
         found, (q, v) = traj.at(t), exact(t)
         assert isinstance(found, lj.Snapshot) and found.t.shape == found.q.shape == np.shape(t)
         np.testing.assert_allclose(found.q, q, atol=1e-9)
         np.testing.assert_allclose(found.v, v, atol=1e-9)
-    np.testing.assert_array_equal(traj.at(TS[::-1]).q, traj.q[::-1])
+    np.testing.assert_array_equal(traj.at(TS[::-1]).q, np.asarray(traj.q)[::-1])
+    other = swing(q0=1.0, g=2.0)
+    with compiles() as again:
+        other.at([0.7, 2.9])
+    with compiles() as of_another:
+        jax.jit(lambda x: x + 1.25)(1.0)
+    assert not again and of_another
+
+
+def straight_on(system, q, v, params, ts, guards, settings):
+    """In place of an integration: on along a line; the multiplier is the time of the output from which it goes on."""
+    line = jax.tree.map(lambda q, v: q + v * (ts - ts[0]), q, v)
+    rows = jax.tree.map(lambda v: v + 0.0 * ts, v)
+    if system.constraints:
+        ASKED_FOR.append(settings)
+    found = {name: ts[0] + 0.0 * ts for name in system.constraints}
+    return SimpleNamespace(q=line, v=rows, multipliers=found, result=lj.RESULTS.successful)
+
+
+ASKED_FOR = []
+FREE = lj.System(lambda t, q, v, p: 0.5 * v**2)
+NODES = np.array([0.0, 1.0, 3.0]), np.array([10.0, 20.0, 40.0]), np.array([1.0, 2.0, 3.0])
+
+
+def of_nodes(backward=False, **fields):
+    """A motion through three outputs, from each of which it goes straight on."""
+    nodes = [x[::-1] for x in NODES] if backward else NODES
+    return by_hand(FREE, *nodes, how=HOW._replace(backward=backward), solve=straight_on, **fields)
+
+
+def test_continued_from_the_output_before():
+    """Forward from the earlier output, backward from the later one, also from a copy; in a program NaN elsewhere."""
+    between = np.array([2.5, 0.5])
+    forward, backward = of_nodes(), of_nodes(backward=True)
+    np.testing.assert_array_equal(forward.at(between).q, [23.0, 10.5])
+    for traj in (backward, copy.deepcopy(backward)):
+        np.testing.assert_array_equal(traj.at(between).q, [38.5, 19.0])
+        np.testing.assert_array_equal(traj.at(between).v, [3.0, 2.0])
+    for traj in (forward, backward):
+        with pytest.raises(ValueError, match="known from t = 0 to 3"):
+            traj.at(3.1)
+        inside = jax.jit(lambda traj, t: traj.at(t).q)(traj, np.array([-0.1, 2.5, 0.5, 1.0, 3.1]))
+        np.testing.assert_array_equal(inside, [np.nan, *np.asarray(traj.at(between).q), 20.0, np.nan])
+
+
+def test_continued_as_it_was_asked_for():
+    """On the constraints, at the motion's tolerances by size, over jumps; each with its multipliers."""
+    traj = with_problem(motion("rod pendulum"), max_step=np.asarray(0.5), jumps="ignored")
+    static = traj.static._replace(integrate=straight_on)
+    found = replace(traj, static=static).at([0.8, 0.125])
+    np.testing.assert_array_equal(found.multipliers["rod"], [0.75, 0.0])
+    asked = ASKED_FOR[-1]
+    assert (asked.drift, asked.by_size, asked.jumps, asked.method) == ("project", True, "ignored", None)
+
+
+@pytest.mark.slow
+def test_constraints_hold():
+    """States are projected and have multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1.
+
+    Backward from its end it is the same motion.
+    """
+    traj, (q, v) = rotate(), exact(BETWEEN)
+    found = traj.at(BETWEEN)
+    np.testing.assert_allclose(found.q["x"], np.sin(q), atol=1e-8)
+    np.testing.assert_allclose(found.q["x"] ** 2 + found.q["y"] ** 2, 1.0, atol=1e-14)
+    np.testing.assert_allclose(found.q["x"] * found.v["x"] + found.q["y"] * found.v["y"], 0.0, atol=1e-14)
+    np.testing.assert_allclose(-2 * found.multipliers["rod"], v**2 + np.cos(q), atol=1e-7)
+    back = lj.integrate(pendulum, *map(float, exact(4.0)), {"g": 1.0, "l": 1.0}, ts=TS[::-1])
+    np.testing.assert_allclose(back.at(BETWEEN).q, q, atol=1e-8)
 
 
 def errors_at_step(h):
@@ -79,38 +138,24 @@ def test_order_of_the_method():
     assert abs(of_at - 5.0) < 0.35 and abs(of_cubic - 4.0) < 0.35
 
 
-def test_constraints_hold():
-    """States are projected and have multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1."""
-    found = rotate().at(BETWEEN)
-    q, v = exact(BETWEEN)
-    np.testing.assert_allclose(found.q["x"], np.sin(q), atol=1e-8)
-    np.testing.assert_allclose(found.q["x"] ** 2 + found.q["y"] ** 2, 1.0, atol=1e-14)
-    np.testing.assert_allclose(found.q["x"] * found.v["x"] + found.q["y"] * found.v["y"], 0.0, atol=1e-14)
-    np.testing.assert_allclose(-2 * found.multipliers["rod"], v**2 + np.cos(q), atol=1e-7)
-
-
-def test_backward():
-    """A motion that runs backward in time is continued backward, even from a copy of the trajectory."""
-    end_q, end_v = map(float, exact(4.0))
-    traj = lj.integrate(lj.System(pendulum), end_q, end_v, {"g": 1.0}, ts=TS[::-1])
-    np.testing.assert_allclose(traj.at(BETWEEN).q, exact(BETWEEN)[0], atol=1e-8)
-    np.testing.assert_array_equal(copy.deepcopy(traj).at(BETWEEN).q, traj.at(BETWEEN).q)
-    with pytest.raises(ValueError, match="known from t = 0 to 4"):
-        traj.at(4.1)
-
-
 def test_where_there_is_no_motion():
-    """Times outside, or after an event, are refused with the reason, NaN in a program; the event itself is known."""
-    lowest = lj.Crossing(lambda t, q, v, params: q)
-    traj = swing(events={"lowest": lowest})
-    end = float(ellipk(np.sin(AMPLITUDE / 2) ** 2))
+    """Times outside, or after an event, are refused with the reason; the event itself is known."""
+    end = lj.Snapshot(2.5, 23.0, 2.0, {})
+    ended = of_nodes(end=end, result=lj.RESULTS.event_occurred)
+    np.testing.assert_array_equal(ended.at([end.t, 2.0]).q, [end.q, 22.0])
+    for t, words in ((2.6, "ended by its event"), (-0.1, "outside of the motion"), (np.nan, "outside of the motion")):
+        with pytest.raises(ValueError, match=words):
+            ended.at(t)
+    with pytest.raises(TypeError, match="a time or an array of times, not 'noon'"):
+        ended.at("noon")
+
+
+@pytest.mark.exhaustive
+def test_at_an_event():
+    """The state there is that of the event; in a program a motion goes as far as it."""
+    traj, end = swing(events={"lowest": lj.Crossing(lambda t, q, v, p: q)}), float(ellipk(np.sin(AMPLITUDE / 2) ** 2))
     assert abs(float(traj.at(traj.end.t).q)) < 1e-9 and abs(float(traj.end.t) - end) < 1e-8
     np.testing.assert_allclose(traj.at(end - 0.01).q, exact(end - 0.01)[0], atol=1e-9)
-    for t, words in ((3.0, "ended by its event"), (-0.1, "outside of the motion"), (np.nan, "outside of the motion")):
-        with pytest.raises(ValueError, match=words):
-            traj.at(t)
-    with pytest.raises(TypeError, match="a time or an array of times, not 'noon'"):
-        traj.at("noon")
     inside = jax.jit(lambda traj, t: traj.at(t).q)(traj, np.array([-0.1, 1.0, 3.0]))
     assert list(np.isnan(inside)) == [True, False, True] and abs(inside[1] - exact(1.0)[0]) < 1e-9
 
@@ -130,12 +175,13 @@ def test_batches():
 
 
 def test_what_cannot_be_continued():
-    """Outputs off the constraints and planned steps cannot be continued."""
-    with pytest.raises(ValueError, match="outputs are off the constraints"):
-        rotate(drift="none").at(0.3)
-    planned = dict(method=lj.Tsit5(), stepsize_controller=diffrax.StepTo(TS))
+    """Outputs off the constraints and planned steps cannot be continued; twin: without constraints none are off."""
+    for drift in ("none", "baumgarte"):
+        with pytest.raises(ValueError, match="outputs are off the constraints"):
+            with_problem(motion("rod pendulum"), drift=drift).at(0.3)
     with pytest.raises(ValueError, match="StepTo plans the steps"):
-        swing(**planned, throw=False).at(0.3)
+        of_nodes(asked=ASKED._replace(stepsize_controller=diffrax.StepTo(TS))).at(0.3)
+    assert of_nodes(asked=ASKED._replace(drift="none")).at(0.5).q == 10.5
 
 
 @pytest.mark.exhaustive
@@ -162,14 +208,3 @@ def test_second_derivative_at_an_output():
         twice = jax.grad(jax.grad(lambda t: traj.at(t).q))(t)
         np.testing.assert_allclose(twice, -np.sin(exact(t)[0]), atol=1e-8)
     assert abs(np.sin(exact(TS[3])[0])) > 0.1
-
-
-def test_one_program_for_all_times():
-    """Another motion of the system at other times compiles nothing; twin: many more times do."""
-    swing().at([0.3, 0.5])
-    other = swing(q0=1.0, g=2.0)
-    with compiles() as again:
-        other.at([0.7, 2.9])
-    with compiles() as of_many:
-        other.at(np.linspace(0.1, 3.9, 20))
-    assert not again and of_many

@@ -8,15 +8,22 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.trajectory.films import hermite
-from tests.systems import PARAMS, TS, pendulum
+from tests.by_hand import by_hand, swing
+from tests.systems import PARAMS, pendulum
 
 DENSE = np.linspace(0.0, 2.0, 41)
+RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
+
+
+def swung_at(t):
+    """A pendulum's exact motion, with outputs at these times."""
+    return by_hand(pendulum, t, *swing(t, 1.0, RATE), PARAMS)
 
 
 @pytest.fixture(scope="module")
 def traj():
     """A pendulum for a period, densely."""
-    return lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE)
+    return swung_at(DENSE)
 
 
 def bob(t, q, params):
@@ -61,75 +68,49 @@ def test_frames_follow_the_motion(traj):
     assert ends.shape == (81, 2, 2) and not ends[:, 0].any()
     np.testing.assert_allclose(np.hypot(*ends[:, 1].T), PARAMS["l"], atol=1e-14)
     np.testing.assert_allclose(ends[::2, 1, 0], PARAMS["l"] * np.sin(traj.q), atol=1e-14)
-    finer = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 2.0, 81))
-    np.testing.assert_allclose(ends[:, 1, 0], PARAMS["l"] * np.sin(finer.q), atol=1e-4)
+    np.testing.assert_allclose(ends[:, 1, 0], PARAMS["l"] * np.sin(swing(film.t, 1.0, RATE)[0]), atol=1e-4)
 
 
-@pytest.mark.slow
-def test_ends_where_an_event_ended_the_motion():
-    """NaN after an event are cut off, and the last frame is the event."""
-    down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
-    traj = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE, event=down)
-    assert np.isnan(traj.q).any()
-    film = traj.animate(bob)
-    assert film.t[-1] == float(traj.end.t) < 1.0
-    np.testing.assert_allclose(film.points["rod"][-1, 1], [0.0, -PARAMS["l"]], atol=1e-9)
+def ended(at, result):
+    """The motion until some time, with NaN after it."""
+    (q, v), end = swing(DENSE, 1.0, RATE), lj.Snapshot(np.asarray(at), *map(np.asarray, swing(at, 1.0, RATE)), {})
+    q, v = (np.where(at >= DENSE, x, np.nan) for x in (q, v))
+    return by_hand(pendulum, DENSE, q, v, PARAMS, end=end, result=result)
 
 
-@pytest.mark.slow
-def test_a_motion_that_failed_plays_as_far_as_it_came():
-    """With throw=False the film ends at the last output that was reached; one that never began is refused."""
-    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
-    traj = lj.integrate(kepler, 1.0, 0.0, ts=np.linspace(0.0, 2.0, 201), throw=False)
-    film = traj.animate(lambda t, q, params: (q, 0.0))
-    np.testing.assert_allclose(film.t[-1], 1.11, atol=1e-12)
+def test_ends_with_the_motion():
+    """NaN after an event are cut off, and the last frame is the event; of a motion that failed, the last output.
+
+    One that never began is refused.
+    """
+    film = ended(0.52, lj.RESULTS.event_occurred).animate(bob)
+    angle, _ = swing(0.52, 1.0, RATE)
+    np.testing.assert_allclose(film.points["rod"][-1, 1], PARAMS["l"] * np.array([np.sin(angle), -np.cos(angle)]))
+    assert film.t[-1] == 0.52
+    np.testing.assert_allclose(ended(0.52, lj.RESULTS.not_finite).animate(bob).t[-1], 0.5, atol=1e-15)
     with refused("0 states", "failed at its start"):
-        lj.integrate(kepler, 0.0, 0.0, ts=DENSE, throw=False).animate(bob)
+        ended(-1.0, lj.RESULTS.start_not_finite).animate(bob)
 
 
 @pytest.mark.exhaustive
+def test_motions_that_end_early():
+    """An event, and a collision that the steps cannot pass: the film ends there."""
+    down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
+    traj = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE, event=down)
+    film = traj.animate(bob)
+    assert np.isnan(traj.q).any() and film.t[-1] == float(traj.end.t) < 1.0
+    np.testing.assert_allclose(film.points["rod"][-1, 1], [0.0, -PARAMS["l"]], atol=1e-9)
+    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
+    traj = lj.integrate(kepler, 1.0, 0.0, ts=np.linspace(0.0, 2.0, 201), throw=False)
+    np.testing.assert_allclose(traj.animate(lambda t, q, params: (q, 0.0)).t[-1], 1.11, atol=1e-12)
+
+
 def test_a_batch_is_animated_lane_by_lane():
     """The error for a batch says how to take one lane of it, and the lane can be animated."""
-    batch = jax.vmap(lambda q0: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=DENSE))(np.array([0.5, 1.0]))
+    lanes = jax.tree.map(lambda *x: np.stack(x), *(by_hand(pendulum, DENSE, *swing(DENSE, a, RATE)) for a in (0.5, 1)))
     with refused("batch of shape", r"traj\).animate\(positions\)"):
-        batch.animate(bob)
-    assert len(jax.tree.map(lambda x: x[0], batch).animate(bob).t) == 51
-
-
-def test_positions_that_are_no_points(traj):
-    """Four coordinates, a number, words, a changing number of points and NaN are refused by name, with a fix."""
-    with refused(r"shape \(4,\) for 'bob'", "Usual cause"):
-        traj.animate(lambda t, q, params: {"bob": (q, q, q, q)})
-    with refused("of the plane or points of space"):
-        traj.animate(lambda t, q, params: {"bob": (q, q, q), "pin": (q, q)})
-    with refused(r"shape \(\)"):
-        traj.animate(lambda t, q, params: q)
-    with refused("a str"):
-        traj.animate(lambda t, q, params: "here")
-    with refused("the same points"):
-        traj.animate(lambda t, q, params: [(q, q)] * (1 + (t > 1)))
-    with refused("the same points"):
-        traj.animate(lambda t, q, params: {})
-    with refused("NaN or infinity for 'bob' at t = ", "Usual cause"):
-        traj.animate(lambda t, q, params: {"bob": (jnp.sqrt(q), q)})
-
-
-def test_outputs_too_far_apart(traj):
-    """A motion with too few outputs for interpolation is refused."""
-    coarse = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, 6.0, 7))
-    with refused("7 outputs are too few", "% of the picture", r"jnp.linspace\(0, 6, 57\)"):
-        coarse.animate(bob)
-    with refused("2 states"):
-        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS[:2]).animate(bob)
-
-
-def test_no_time_to_play(traj):
-    """A film of no length, or without an end, is refused."""
-    for seconds in (0.0, -1.0, np.inf, np.nan):
-        with refused("is not a film"):
-            traj.animate(bob, seconds=seconds)
-    with refused("is not a film"):
-        traj.animate(bob, trail=-1.0)
+        lanes.animate(bob)
+    assert len(jax.tree.map(lambda x: x[0], lanes).animate(lambda t, q, params: (q, 0.0)).t) == 51
 
 
 ROD = lj.Body("rod", 1.0, (0.1, 0.1, 0.01))
@@ -139,6 +120,66 @@ SHAPES = [lj.box(ROD, (0.1, 0.1, 1.0)), lj.trail(ROD.at((0.0, 0.0, -0.5))), lj.l
 def swung(t, q, params):
     """The rod of a pendulum in the plane y = 0: down at q = 0, turned about -y."""
     return {"rod": lj.Pose.at((0.5 * jnp.sin(q), 0.0, -0.5 * jnp.cos(q)), axis=(0.0, -1.0, 0.0), angle=q)}
+
+
+WRONG_POINTS = {
+    "four coordinates": (lambda t, q, params: {"bob": (q, q, q, q)}, r"shape \(4,\) for 'bob'", "Usual cause"),
+    "of plane and space": (
+        lambda t, q, params: {"bob": (q, q, q), "pin": (q, q)}, "of the plane or points of space"),
+    "a number": (lambda t, q, params: q, r"shape \(\)"),
+    "words": (lambda t, q, params: "here", "a str"),
+    "a changing number": (lambda t, q, params: [(q, q)] * (1 + (t > 1)), "the same points"),
+    "none": (lambda t, q, params: {}, "the same points"),
+    "not finite": (
+        lambda t, q, params: {"bob": (jnp.sqrt(q), q)}, "NaN or infinity for 'bob' at t = ", "Usual cause"),
+    "unknown poses": (SHAPES, "where the body 'rod' is", "lj.Drawing"),
+    "nothing": (None, "nothing says how this system is drawn"),
+    "what does not move": (lj.sphere(lj.ground, 1.0), "fixed in space"),
+    "the plane beside space": (lj.Drawing([*SHAPES, bob], swung), "some in space"),
+}  # fmt: skip
+WRONG_SHAPES = {
+    "NaN": (ValueError, lj.Drawing(SHAPES, lambda t, q, params: {"rod": lj.Pose.at((jnp.nan * q, 0.0, 0.0))}),
+            "'rod' is NaN or infinite at t = 0"),
+    "no pose": (ValueError, lj.Drawing(SHAPES, lambda t, q, params: {"rod": (q, q)}), r"has the shapes \(\) and \(\)"),
+    "one size": (ValueError, lj.Drawing([lj.box(ROD, 0.3)], swung),
+                 "the size of a shape must be three finite numbers, and is 0.3"),
+    "a negative size": (ValueError, lj.Drawing([lj.sphere(ROD, -0.3)], swung), "is negative"),
+    "a body": (TypeError, ROD, "not Body"),
+    "bodies": (TypeError, [ROD], "list of Body"),
+    "an empty list": (TypeError, [], "not list"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG_POINTS)
+def test_positions_that_are_no_points(name, traj):
+    """What are no points, poses that are not known, and nothing that moves are refused by name, with a fix."""
+    wrong, *words = WRONG_POINTS[name]
+    with refused(*words):
+        traj.animate(wrong)
+
+
+@pytest.mark.parametrize("name", WRONG_SHAPES)
+def test_shapes_that_cannot_be_drawn(name, traj):
+    """Wrong poses and sizes, and bodies for shapes: each says what it is."""
+    kind, wrong, words = WRONG_SHAPES[name]
+    with pytest.raises(kind, match=words):
+        traj.animate(wrong)
+
+
+def test_outputs_too_far_apart():
+    """A motion with too few outputs for interpolation is refused."""
+    with refused("7 outputs are too few", "% of the picture", r"jnp.linspace\(0, 6, 57\)"):
+        swung_at(np.linspace(0.0, 6.0, 7)).animate(bob)
+    with refused("2 states"):
+        swung_at(DENSE[:2]).animate(bob)
+
+
+def test_no_time_to_play(traj):
+    """A film of no length, or without an end, is refused; each says its frames, seconds and size."""
+    for wrong in ({"seconds": 0.0}, {"seconds": -1.0}, {"seconds": np.inf}, {"seconds": np.nan}, {"trail": -1.0}):
+        with refused("is not a film"):
+            traj.animate(bob, **wrong)
+    assert repr(traj.animate(bob)).startswith("Animation of 51 frames, 2 s, ")
 
 
 def test_bodies_by_their_poses(traj):
@@ -155,34 +196,11 @@ def test_bodies_by_their_poses(traj):
 
 
 def test_sizes_by_params(traj):
-    """Lengths and points that are functions of params have their values; a single number is refused."""
+    """Lengths and points that are functions of params have their values."""
     disk = lj.disk(ROD.at(lambda params: (0.0, 0.0, -params["l"])), radius=lambda params: 0.1 * params["l"])
     drawn = traj.animate(lj.Drawing(lambda params: [disk], swung)).points
     np.testing.assert_allclose(drawn.shapes[0].size, 0.1 * PARAMS["l"])
     np.testing.assert_allclose(drawn.shapes[0].anchors[0].point, [0.0, 0.0, -PARAMS["l"]])
-    with pytest.raises(ValueError, match="the size of a shape must be three finite numbers, and is 0.3"):
-        traj.animate(lj.Drawing([lj.box(ROD, 0.3)], swung))
-    with pytest.raises(ValueError, match="is negative"):
-        traj.animate(lj.Drawing([lj.sphere(ROD, -0.3)], swung))
-
-
-def test_shapes_that_cannot_be_drawn(traj):
-    """Unknown poses, bodies for shapes, nothing that moves, plane beside space, wrong poses: each says what to do."""
-    with refused("where the body 'rod' is", "lj.Drawing"):
-        traj.animate(SHAPES)
-    with refused("nothing says how this system is drawn"):
-        traj.animate()
-    with refused("fixed in space"):
-        traj.animate(lj.sphere(lj.ground, 1.0))
-    with refused("some in space"):
-        traj.animate(lj.Drawing([*SHAPES, bob], swung))
-    with pytest.raises(ValueError, match="'rod' is NaN or infinite at t = 0"):
-        traj.animate(lj.Drawing(SHAPES, lambda t, q, params: {"rod": lj.Pose.at((jnp.nan * q, 0.0, 0.0))}))
-    with pytest.raises(ValueError, match=r"has the shapes \(\) and \(\)"):
-        traj.animate(lj.Drawing(SHAPES, lambda t, q, params: {"rod": (q, q)}))
-    for wrong, word in ((ROD, "not Body"), ([ROD], "list of Body"), ([], "not list")):
-        with pytest.raises(TypeError, match=word):
-            traj.animate(wrong)
 
 
 def test_figures(traj):
@@ -197,10 +215,4 @@ def test_figures(traj):
     for times in ([2.1], -0.1, 0, []):
         with refused("between 0 and 2"):
             traj.draw(bob, times=times)
-    start = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS[:2])
-    assert start.draw(bob, times=1).axes
-
-
-def test_prints_what_it_is(traj):
-    """Frames, seconds and size."""
-    assert repr(traj.animate(bob)).startswith("Animation of 51 frames, 2 s, ")
+    assert swung_at(DENSE[:2]).draw(bob, times=1).axes

@@ -1,5 +1,6 @@
 """Trajectories in files come back bit for bit, with the system passed again; interrupted writing does no harm."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import diffrax
@@ -10,6 +11,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.solve.phases import traced_phases
+from lagjax.system import coordinates
+from tests.by_hand import by_hand, with_problem
+from tests.systems import motion, rod_pendulum
 
 TS = np.linspace(0.0, 1.0, 4)
 
@@ -53,53 +58,59 @@ def swing(g=9.81, **settings):
     return lj.integrate(rod, *START, {"g": g}, ts=TS, **settings)
 
 
+def of_springs(q0, params=None, **fields):
+    """A motion with coordinates in this structure, irregular numbers, and their errors."""
+    rng = np.random.default_rng(0)
+    rows = lambda: jax.tree.map(lambda x: rng.normal(size=(4, *np.shape(x))).astype(np.result_type(x)), q0)
+    start = coordinates.prepared(0.0, q0, q0, params)
+    return by_hand(traced_phases(springs, start), TS, rows(), rows(), start.params, off=(rows(), rows()), **fields)
+
+
 def check(traj, system, path):
-    """Check that a trajectory comes back: arrays bit for bit and of the same kind, all else equal, and its print."""
+    """Check that a trajectory comes back: arrays bit for bit and of the same kind, and all else equal."""
     traj.save(path)
     again = lj.load_trajectory(path, system, classes=[Pair, Place])
-    pairs = list(zip(jax.tree.leaves(traj), jax.tree.leaves(again), strict=True))
-    for a, b in pairs:
+    for a, b in zip(jax.tree.leaves(traj), jax.tree.leaves(again), strict=True):
         assert type(a) is type(b)
         if isinstance(a, (jax.Array, np.ndarray)):
             assert a.dtype == b.dtype and np.asarray(a).tobytes() == np.asarray(b).tobytes()
         else:
             assert a == b
-    assert jax.tree.structure(traj) == jax.tree.structure(again) and repr(traj) == repr(again)
+    assert jax.tree.structure(traj) == jax.tree.structure(again)
     return again
 
 
+STRUCTURES = {
+    "all": {
+        "a/b": 1.0, "a.b": [2.0, Pair(1.0, (2.0, np.ones((2, 2))))], "A.B": {"b": np.ones(3)}, "å": 4.0,
+        "t": Place(np.array(1.0), "here"),
+    },
+    "float32": {"x": np.float32(1.0), "y": np.float32(2.0)},
+    "number": 1.0,
+    "vector": np.array([1.0, 2.0]),
+    "tuple": (1.0, np.ones((2, 2))),
+    "list": [1.0, 2.0],
+    "named": Pair(1.0, 2.0),
+    "object": Place(np.array(1.0), "here"),
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "q0",
-    [
-        1.0,
-        jnp.array([1.0, 2.0]),
-        (1.0, jnp.ones((2, 2))),
-        [1.0, 2.0],
-        Pair(1.0, 2.0),
-        {"a": {"b": [1.0, Pair(1.0, (2.0,))]}, "t": jnp.ones(3)},
-        {"a/b": 1.0, "a.b": 2.0, "A.B": 3.0, "å": 4.0},
-        Place(jnp.array(1.0), "here"),
-        {"x": np.float32(1.0), "y": np.float32(2.0)},
-    ],
-    ids=["number", "vector", "tuple", "list", "named", "nested", "odd names", "object", "float32"],
+    "name", ["all", "float32", *(pytest.param(name, marks=pytest.mark.slow) for name in list(STRUCTURES)[2:])]
 )
-@pytest.mark.slow
-def test_structures(q0, tmp_path):
+def test_structures(name, tmp_path):
     """Every structure that coordinates may have, and both dtypes, come back."""
-    traj = lj.integrate(springs, q0, jax.tree.map(jnp.zeros_like, q0), ts=TS)
-    check(traj, springs, tmp_path / "x.npz")
+    check(of_springs(STRUCTURES[name]), springs, tmp_path / "x.npz")
 
 
-@pytest.mark.slow
 def test_how_it_ended(tmp_path):
     """After an event or a failure, the result, the end and NaN beyond it come back."""
-    low = {"low": lj.Crossing(lambda t, q, v, params: q["y"] + 0.9)}
-    for traj, result in (
-        (swing(events=low), lj.RESULTS.event_occurred),
-        (swing(max_steps=5, throw=False), lj.RESULTS.max_steps_reached),
-    ):
-        again = check(traj, rod, tmp_path / "x.npz")
-        assert bool(again.result == result) and np.isnan(again.q["x"][-1]) and again.end.t == traj.end.t
+    traj = motion("rod pendulum")
+    q = {name: np.append(np.asarray(x)[:3], np.nan) for name, x in traj.q.items()}
+    end = traj.end._replace(t=np.asarray(0.875))
+    for result in (lj.RESULTS.event_occurred, lj.RESULTS.max_steps_reached):
+        again = check(replace(traj, q=q, end=end, result=result), rod_pendulum, tmp_path / "x.npz")
+        assert bool(again.result == result) and np.isnan(again.q["x"][-1]) and again.end.t == 0.875
 
 
 @pytest.mark.exhaustive
@@ -107,10 +118,20 @@ def test_methods_and_controllers(tmp_path):
     """The method and the steps asked for come back, so that `at` continues the motion as before."""
     pid = dict(method=diffrax.Dopri5(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
     implicit = dict(method=lj.Radau5(), max_step=0.1, jump_ts=[0.5])
-    for settings in (pid, implicit):
+    low = dict(events={"low": lj.Crossing(lambda t, q, v, params: q["y"] + 0.9, terminal=False)})
+    for settings in (pid, implicit, low):
         traj = swing(**settings)
         again = check(traj, rod, tmp_path / "x.npz")
         np.testing.assert_array_equal(again.at(0.3).q["x"], traj.at(0.3).q["x"])
+        assert repr(again) == repr(traj)
+
+
+def test_the_method_asked_for(tmp_path):
+    """A method, a controller and limits on steps come back, each of its kind."""
+    pid = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+    times = dict(max_step=np.asarray(0.1), jump_ts=np.array([0.5]))
+    for asked in (dict(method=diffrax.Dopri5(), stepsize_controller=pid), dict(method=lj.Radau5(), **times)):
+        check(with_problem(of_springs(1.0), **asked), springs, tmp_path / "x.npz")
 
 
 @pytest.mark.exhaustive
@@ -134,15 +155,13 @@ def test_many_motions(tmp_path):
 
 def test_a_million_outputs(tmp_path):
     """A million outputs come back bit for bit, with NaN and the sign of zero; twin: a single changed bit is seen."""
-    traj, rng = lj.integrate(springs, {"x": 1.0}, {"x": 0.0}, ts=TS), np.random.default_rng(0)
-    x = rng.normal(size=1_000_000)
+    x = np.random.default_rng(0).normal(size=1_000_000)
     x[:3] = np.nan, -0.0, 5e-324
-    fields = {"t": np.linspace(0.0, 1.0, len(x)), "q": {"x": x}, "v": {"x": -x}}
-    long = type(traj)(**(vars(traj) | jax.tree.map(jnp.asarray, fields) | {"error": None}))
-    long.save(tmp_path / "long.npz")
+    fields = np.linspace(0.0, 1.0, len(x)), {"x": x}, {"x": -x}
+    by_hand(springs, *fields).save(tmp_path / "long.npz")
     again = lj.load_trajectory(tmp_path / "long.npz")
     bits = lambda tree: [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
-    assert bits((again.t, again.q, again.v)) == bits(tuple(fields.values()))
+    assert bits((again.t, again.q, again.v)) == bits(fields)
     x[-1] = np.nextafter(x[-1], 9.0)
     assert bits(again.q) != bits({"x": x})
 
@@ -150,11 +169,9 @@ def test_a_million_outputs(tmp_path):
 def test_parameters(tmp_path):
     """All data in params come back, and networks with functions of JAX; a function of the user's is refused by name."""
     net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
-    params = {"f": jnp.cos, "net": net, "half": jnp.ones(2, jnp.bfloat16), "n": 3, "x": 2.5, "who": "me", "no": None}
+    params = {"f": jnp.cos, "net": net, "half": np.ones(2, jnp.bfloat16), "n": 3, "x": 2.5, "who": "me", "no": None}
     params |= {"many": [True, (1, np.float32(2.0))], "inf": float("inf"), "by number": {7: np.arange(3)}}
-    traj = lj.integrate(springs, 1.0, 0.0, {"of": params}, ts=TS)
-    check(traj, springs, tmp_path / "x.npz")
-    traj = lj.integrate(springs, 1.0, 0.0, {"f": [lambda x: x]}, ts=TS)
+    check(of_springs(1.0, {"of": params}), springs, tmp_path / "x.npz")
     with pytest.raises(TypeError, match=r"params.f\[0\] is a function \(<lambda>\), and functions are not data"):
-        traj.save(tmp_path / "y.npz")
+        of_springs(1.0, {"f": [lambda x: x]}).save(tmp_path / "y.npz")
     assert not (tmp_path / "y.npz").exists()

@@ -43,21 +43,23 @@ def test_solves_as_lapack(size):
     np.testing.assert_allclose(solve(jnp.asarray(r)), np.linalg.solve(left, r), rtol=1e-11)
 
 
-def test_ill_conditioned():
-    """Alternating masses of ratio 1e6: residuals no larger than LAPACK's."""
+@pytest.mark.parametrize("wider", [0, 1])
+def test_ill_conditioned_and_singular(wider):
+    """Alternating masses of ratio 1e6: residuals no larger than LAPACK's; a singular band gives no plausible number."""
     m = 64
     inverse_mass = np.where(np.arange(m + 1) % 2, 1e6, 1.0)
     a = np.diag(inverse_mass[:-1] + inverse_mass[1:]) - np.diag(inverse_mass[1:-1], 1) - np.diag(inverse_mass[1:-1], -1)
     r = np.random.default_rng(0).normal(size=m)
-    band = jnp.stack([jnp.diag(a), jnp.append(0.0, jnp.diag(a, 1))], axis=1)
-    wider = jnp.concatenate([band, jnp.zeros((m, 1))], axis=1)
+    bands = np.zeros((2, m, 2 + wider))
+    bands[0, :, 0], bands[0, 1:, 1] = np.diag(a), np.diag(a, 1)
+    bands[1, :, 0], bands[1, 1, 1] = 1.0, 1.0
+    good, singular = np.asarray(jax.jit(jax.vmap(lambda band: banded.solver(band)(r)))(bands))
 
     def backward_error(x):
         return np.max(np.abs(a @ x - r) / (np.abs(a) @ np.abs(x) + np.abs(r)))
 
-    lapack = backward_error(np.linalg.solve(a, r))
-    for entries in (band, wider):
-        assert backward_error(np.asarray(banded.solver(entries)(jnp.asarray(r)))) <= max(4 * lapack, 1e-15)
+    assert backward_error(good) <= max(4 * backward_error(np.linalg.solve(a, r)), 1e-15)
+    assert not np.all(np.abs(singular) < 1e12)
 
 
 @pytest.mark.slow
@@ -78,13 +80,6 @@ def test_derivatives_pass_by_the_elimination(half_bandwidth):
     expected = -jnp.linalg.solve(a, r) / 4
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(mode(solution)(2.0), expected, rtol=1e-12)
-
-
-def test_singular_is_never_plausible():
-    """A singular band gives NaN, infinity or an enormous number."""
-    for wider in (0, 1):
-        band = jnp.concatenate([jnp.array([[1.0, 0.0], [1.0, 1.0], [3.0, 0.0]]), jnp.zeros((3, wider))], axis=1)
-        assert not np.all(np.abs(banded.solver(band)(jnp.array([1.0, 2.0, 3.0]))) < 1e12)
 
 
 @pytest.mark.slow

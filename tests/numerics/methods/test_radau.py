@@ -1,5 +1,7 @@
 """Radau IIA and its Newton iteration: order, stability, published stiff end states, derivatives, failures."""
 
+from functools import cache
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import pytest
 import lagjax as lj
 from lagjax.numerics.methods import radau
 from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
+from tests.numerics.methods.driven_pendulum import in_numpy
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -50,18 +53,82 @@ def test_tableau():
     assert abs(radau.GAMMA - (3 + np.cbrt(9.0) - np.cbrt(3.0))) < 1e-13
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+def turning(t, y, args):
+    """y' = z y in the complex plane, and another term that makes it blow up."""
+    along, across, explodes = args
+    return jnp.stack([along * y[0] - across * y[1] + explodes * (1 + y[0] ** 2), across * y[0] + along * y[1]])
+
+
+def a_step(length, y0, args):
+    """The end of a step from 0, its error, whether it succeeded, and the stages."""
+    method, term = Radau5(root_finder=EXACT), diffrax.ODETerm(turning)
+    state = method.init(term, 0.0 * length, length, y0, args)
+    y1, error, dense, _, result = method.step(term, 0.0 * length, length, y0, args, state, False)
+    return y1, error, result == diffrax.RESULTS.successful, dense["stages"]
+
+
+Z = np.array([-1e6, -1e2, -3.0, 0.5, 1e-3j, 1j, 30j, 1e6j, -1 + 2j, -50 + 1e4j])
+# Length of the step, start, z, and whether it explodes: into tan(0.1) and beyond its pole.
+CASES = np.array([*((1, 1, z, 0) for z in Z), (0.1, 0, 0, 1), (30, 0, 0, 1), (1, 1, np.nan, 0)])
+
+
+@cache
+def steps():
+    """All these steps, in lanes: y, its derivative by the real part of z, and the rest of `a_step`."""
+
+    @jax.jit
+    @jax.vmap
+    def both(length, start, along, across, explodes):
+        step = lambda along: a_step(length, jnp.stack([start, 0.0]), (along, across, explodes))
+        (y1, *others), (slope, *_) = jax.jvp(step, (along,), (jnp.ones(()),))
+        return y1, slope, *others
+
+    length, start, z, explodes = CASES.T
+    return jax.tree.map(np.asarray, both(length.real, start.real, z.real, z.imag, explodes.real))
+
+
+def stages_of(z):
+    """The stages of y' = z y from 1, less 1: (1 - z A)^-1 - 1."""
+    return np.linalg.solve(np.eye(3) - z * radau.A, np.ones(3)) - 1
+
+
 def test_stability():
     """One step is R(z) of Hairer & Wanner II, table IV.3.3 in all of the left half-plane; R(-1e6) = 3e-6 (L-stable)."""
-    z = np.array([-1e6, -1e2, -3.0, 0.5, 1e-3j, 1j, 30j, 1e6j, -1 + 2j, -50 + 1e4j])
-    turn = lambda t, y, z: jnp.stack([z[0] * y[0] - z[1] * y[1], z[1] * y[0] + z[0] * y[1]])
-    step = lambda z: constant(turn, jnp.array([1.0, 0.0]), z, 1).ys[0]
-    found = np.asarray(jax.jit(jax.vmap(step))(np.stack([np.real(z), np.imag(z)], axis=1))) @ np.array([1, 1j])
-    expected = (1 + 2 * z / 5 + z**2 / 20) / (1 - 3 * z / 5 + 3 * z**2 / 20 - z**3 / 60)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-13)
-    assert np.max(np.abs(found[np.real(z) <= 0])) <= 1 + 1e-15
+    y1, slope, *_ = (x[: len(Z)] for x in steps())
+    above, below = 1 + 2 * Z / 5 + Z**2 / 20, 1 - 3 * Z / 5 + 3 * Z**2 / 20 - Z**3 / 60
+    found = y1 @ [1, 1j]
+    np.testing.assert_allclose(found, above / below, rtol=1e-9, atol=1e-13)
+    assert np.max(np.abs(found[np.real(Z) <= 0])) <= 1 + 1e-15
     assert abs(found[0]) < 4e-6
+    rates = ((2 / 5 + Z / 10) * below - above * (-3 / 5 + 3 * Z / 10 - Z**2 / 20)) / below**2
+    np.testing.assert_allclose(slope @ [1, 1j], rates, rtol=1e-8, atol=1e-13)
+
+
+def test_error_estimate():
+    """It is that of Hairer & Wanner II, (8.19), and where that rejects the step (8.20); twin: (8.19) everywhere."""
+    s6, gamma = np.sqrt(6.0), 1 / radau.GAMMA
+    weighted = [gamma / 3 * np.dot([-13 - 7 * s6, -13 + 7 * s6, -1.0], stages_of(z)) for z in Z]
+    once = (gamma * Z + weighted) / (1 - gamma * Z)
+    twice = (gamma * Z * (1 + once) + weighted) / (1 - gamma * Z)
+    rejected = np.abs(once) > 1e-12
+    assert 0 < rejected.sum() < len(Z) and np.max(np.abs(twice - once)) > 0.1
+    np.testing.assert_allclose(steps()[2][: len(Z)] @ [1, 1j], np.where(rejected, twice, once), rtol=1e-7, atol=1e-15)
+
+
+def test_dense_output():
+    """Within a step it is the polynomial through its stages, of degree 3."""
+    i = int(np.flatnonzero(Z == -3.0)[0])
+    dense = radau.Collocation(0.0, 1.0, np.ones(1), steps()[4][i, :, :1])
+    at = in_numpy(dense.at, 0.0)
+    np.testing.assert_allclose([at(t)[0] for t in (0.0, *radau.C)], [1.0, *(1 + stages_of(-3.0))], rtol=1e-10)
+
+
+def test_unsolvable_step():
+    """A step whose equations have no solution, or of NaN, says so, has infinite error, and is finite itself."""
+    y1, slope, error, success, _ = (x[-3:] for x in steps())
+    np.testing.assert_array_equal(success, [True, False, False])
+    assert abs(y1[0, 0] - np.tan(0.1)) < 1e-6 and np.isfinite(error[0]).all()
+    assert np.isfinite(y1[1:]).all() and np.isinf(error[1:]).all() and np.isfinite(slope[:2]).all()
 
 
 def predator(t, y, args):
@@ -119,6 +186,7 @@ def test_order_of_a_motion(name):
 # Stiff equations -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_robertson():
     """Robertson's reaction at t = 1e11, to 10 rtol of the published values (IVP test set, problem ROBER)."""
 
@@ -139,8 +207,7 @@ def van_der_pol(t, y, epsilon):
     return jnp.stack([y[1], ((1 - y[0] ** 2) * y[1] - y[0]) / epsilon])
 
 
-@pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_van_der_pol():
     """Van der Pol's oscillator at epsilon = 1e-6, to 10 rtol of the published values (IVP test set, problem VDPOL)."""
     published = np.array([0.1706167732170483e1, -0.8928097010247975])
@@ -210,7 +277,7 @@ def gradient_of_decay(k, y0):
     return np.array([-(y0**2), 1.0]) / (1 + k * y0) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_forward_derivative():
     """The derivative of an end state with respect to parameter and start equals the closed form."""
     forward = jax.jit(jax.jacfwd(lambda p: end_of_decay(p, diffrax.ForwardMode())))
@@ -246,6 +313,7 @@ def towards(t, y, k):
     return -k * (y - jnp.cos(t))
 
 
+@pytest.mark.slow
 def test_lanes_in_float32():
     """Lanes of stiffness 1 to 1e7 in single precision: the NaN lane fails, the others are correct."""
     k = np.array([1.0, 1e3, 1e5, 1e7, np.nan], np.float32)
@@ -257,44 +325,31 @@ def test_lanes_in_float32():
     np.testing.assert_array_equal(found.result == diffrax.RESULTS.successful, [True, True, True, True, False])
 
 
-def test_unsolvable_step():
-    """A step whose equations have no solution says so, has infinite error, and ends a solve of constant steps."""
-    explosion = lambda t, y, args: 1 + y**2
-    term, y0 = diffrax.ODETerm(explosion), jnp.array(0.0)
-    method = Radau5(root_finder=EXACT)
-
-    def step(t1):
-        state = method.init(term, jnp.array(0.0), t1, y0, None)
-        y1, error, _, _, result = method.step(term, jnp.array(0.0), t1, y0, None, state, False)
-        return y1, error, result == diffrax.RESULTS.successful
-
-    y1, error, success = jax.jit(jax.vmap(step))(np.array([0.1, 30.0]))
-    np.testing.assert_array_equal(success, [True, False])
-    assert abs(y1[0] - np.tan(0.1)) < 1e-6 and np.isfinite(error[0])
-    assert np.isfinite(y1[1]) and np.isinf(error[1])
-
-
 # The root finder -----------------------------------------------------------------------------------------------------
 
 
 def test_jacobian_is_renewed_where_it_fails():
     """From a start with the wrong slope the kept Jacobian diverges with that result; recomputed, it finds the root."""
-    cubic = lambda y, a: y**3 + y - a
-    far, near = jnp.array([0.0]), jnp.array([1.2])
-    found = {}
-    for name, start, slow in (("renewed", far, 0.3), ("kept", far, np.inf), ("kept, near", near, np.inf)):
+
+    def roots(slow):
         finder = SimplifiedNewton(rtol=1e-12, atol=1e-12, slow=slow)
-        found[name] = optx.root_find(cubic, finder, start, jnp.array([2.0]), throw=False, max_steps=40)
-    for name in ("renewed", "kept, near"):
-        assert found[name].result == optx.RESULTS.successful
-        assert abs(found[name].value[0] - 1) < 1e-12
-    assert found["kept"].result == optx.RESULTS.nonlinear_divergence
+        find = lambda y: optx.root_find(lambda y, a: y**3 + y - a, finder, y, 2.0, throw=False, max_steps=40)
+        found = jax.vmap(find)(np.array([[0.0], [1.2]]))
+        codes = (optx.RESULTS.successful, optx.RESULTS.nonlinear_divergence)
+        return found.value[:, 0], *(found.result == code for code in codes)
+
+    y, well, diverged = map(np.concatenate, zip(*jax.jit(lambda: (roots(0.3), roots(np.inf)))()))
+    good = np.array([True, True, False, True])
+    np.testing.assert_array_equal([well, diverged], [good, ~good])
+    np.testing.assert_allclose(y[good], 1.0, rtol=1e-12)
 
 
 def test_tolerances_for_constant_steps():
     """A root finder without a controller gets the given tolerances; an implicit Euler step is then y/(1 + h k)."""
     method = with_tolerances(diffrax.ImplicitEuler(root_finder=OF_CONTROLLER()), 1e-10, 1e-12)
-    found = constant(lambda t, y, k: -k * y, jnp.array(1.0), 1e3, 4, method=method)
-    assert abs(found.ys[0] / (1 + 250.0) ** -4 - 1) < 1e-9
+    assert method.root_finder.rtol == 1e-10 and method.root_finder.atol == 1e-12
+    term = diffrax.ODETerm(lambda t, y, k: -k * y)
+    y1 = jax.jit(lambda y: method.step(term, 0.0, 0.25, y, 1e3, method.init(term, 0.0, 0.25, y, 1e3), False)[0])(1.0)
+    assert abs(y1 * 251.0 - 1) < 1e-9
     explicit = diffrax.Tsit5()
     assert with_tolerances(explicit, 1e-10, 1e-12) is explicit

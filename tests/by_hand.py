@@ -1,0 +1,48 @@
+"""Finished motions made of given numbers, without an integration: for what prints, draws, writes and judges them."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.special import ellipj, ellipk
+
+import lagjax as lj
+from lagjax.integrate.solve.programs import trajectory_of
+from lagjax.integrate.trajectory.error_report import Errors
+from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
+
+ASKED = SolveOptions(None, None, None, np.asarray(np.inf), None, "project")
+HOW = SolveInfo("Dopri8", 8, 13, "tolerance")
+
+
+def by_hand(
+    system, t, q, v, params=None, *, off=None, steps=100, more=200, asked=ASKED, how=HOW, solve: Any = trajectory_of,
+    tolerance=(1e-9, 1e-9), **fields,
+) -> lj.Trajectory:  # fmt: skip
+    """A motion through q, v at the times t, in so many steps; `off`: their estimated errors, by `more` steps."""
+    t, of_end = np.asarray(t, np.result_type(*jax.tree.leaves(q))), jax.tree.map(lambda x: np.asarray(x)[-1], (q, v))
+    none, many = fields.get("multipliers", {}), np.asarray(steps)
+    arrays, static = pack((system, params, asked), how, solve)
+    error = None if off is None else Errors(*off, none, {}, lj.RESULTS.successful, np.asarray(more))
+    end = Snapshot(t[-1], *of_end, jax.tree.map(lambda x: x[-1], none))
+    usual = {
+        "multipliers": none, "end": end, "scaled_error": np.asarray(0.0), "result": lj.RESULTS.successful, "events": {},
+        "stats": {"num_steps": many, "num_accepted_steps": many, "num_rejected_steps": np.asarray(0)},
+        "tolerance": tuple(np.full(2, x) for x in tolerance), "error": error,
+    }  # fmt: skip
+    return lj.Trajectory(t=t, q=q, v=v, arrays=arrays, static=static, **(usual | fields))
+
+
+def with_problem(traj, system=None, params=None, **asked):
+    """The same numbers as a motion of another system, with other parameters, asked for otherwise."""
+    problem = system or traj.system, traj.params if params is None else params, traj.asked._replace(**asked)
+    arrays, static = pack(problem, traj.static.how, traj.static.integrate)
+    return replace(traj, arrays=arrays, static=static)
+
+
+def swing(t, amplitude: float, rate=1.0):
+    """A pendulum's angle and its rate after a release: Landau & Lifshitz, *Mechanics*, §11."""
+    k = np.sin(amplitude / 2)
+    sn, cn, dn, _ = ellipj(ellipk(k**2) - rate * np.asarray(t), k**2)
+    return 2 * np.arcsin(k * sn), -2 * k * rate * cn * dn / np.sqrt(1 - (k * sn) ** 2)
