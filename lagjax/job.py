@@ -3,9 +3,10 @@
 For each scene: error against run time by method and tolerance beside a peer written by hand, the time of the first
 answer, the results of stiff and extreme cases, what its source gets wrong; work-precision diagrams and a picture as
 PNG, all numbers as JSON. `--full` adds what repeats this: second variations of a motion by all methods, slow peers,
-further cases, the whole stability report (`python -m lagjax stability` prints it alone). The exit status is 1 if a scene
-misses its accuracy, or a row of the stability report is silently wrong or has another outcome than expected. Parts run
-side by side, one per core: most of their time is compilation, which uses one thread. Each is printed as it ends.
+further cases, the whole stability report (`python -m lagjax stability` prints it alone). The exit status is 1 if a
+scene misses its accuracy, or a row of the stability report is silently wrong or has another outcome than expected.
+Parts run side by side, one per core: most of their time is compilation, which uses one thread. Each is printed as it
+ends.
 """
 
 import argparse
@@ -88,14 +89,14 @@ def _parts(options, folder) -> Iterator[tuple[str, JobPart]]:
     context = get_context("forkserver" if "forkserver" in get_all_start_methods() else "spawn")
     if context.get_start_method() == "forkserver":
         context.set_forkserver_preload([__name__])
-    pool, started = ProcessPoolExecutor(at_a_time, context), time.perf_counter()
+    pool = ProcessPoolExecutor(at_a_time, context)
     try:
         running = {pool.submit(_part, *tasks[name]): name for name in order}
         while running:
             at_work = [name for future, name in running.items() if future.running()][:at_a_time]
             left = sum(_seconds(name, options.tier) for name in running.values()) / at_a_time
-            about = f", about {left:.0f} s left" if left else ""
-            _progress(f"{', '.join(at_work)}: tracing and compiling; {len(tasks) - len(running)} of {len(tasks)} done{about}")
+            done = f"{len(tasks) - len(running)} of {len(tasks)} done" + (f", about {left:.0f} s left" if left else "")
+            _progress(f"{', '.join(at_work)}: tracing and compiling; {done}")
             ended, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
             _progress("")
             for future in ended:
@@ -173,7 +174,9 @@ def _stability(tier) -> JobPart:
 
 def _scene(scene, tier, folder) -> JobPart:
     """Check, time and draw a scene."""
-    found = [(run, report.work_precision(run, tier, **SETTINGS[tier])) for run in scene.runs() if run.tier <= tier]
+    runs = [run for run in scene.runs() if run.tier <= max(tier, MAIN)]
+    runs = runs[:1] if tier == QUICK else runs
+    found = [(run, report.work_precision(run, tier, **SETTINGS[tier])) for run in runs]
     cases = scene.cases(tier)
     picture = _draw(scene, found, folder, tier)
     rows = [row for run, of_run in found for row in report.rows_of(run, of_run)]
@@ -204,7 +207,7 @@ def _draw(scene, found, folder, tier) -> str:
         plots.work_precision(panels).savefig(folder / work)
     if tier == QUICK and panels:
         return work
-    scene.picture().savefig(folder / motion)
+    scene.picture(tier).savefig(folder / motion)
     return motion
 
 
@@ -251,7 +254,8 @@ def _plan(options):
     at_a_time, total = _at_a_time(options), sum(_seconds(name, options.tier) for name in options.scenes)
     side_by_side = f", {at_a_time} at a time, which slow each other down" if at_a_time > 1 else ""
     about = f", about {total / at_a_time:.0f} s in all, most of them of tracing and compiling" if total else ""
-    return f"{len(options.scenes)} part{'s' * (len(options.scenes) > 1)}{side_by_side}{about}; each is printed as it ends"
+    parts = f"{len(options.scenes)} part{'s' * (len(options.scenes) > 1)}"
+    return f"{parts}{side_by_side}{about}; each is printed as it ends"
 
 
 def _machine():

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.integrate import Crossing, Trajectory
-from lagjax.system import System
-from lagjax.work_precision import WorkPrecision, in_ms, table, usual_others
+from lagjax.system import System, coordinates
+from lagjax.work_precision import WorkPrecision, in_ms, table, usual_methods, usual_others
 from lagjax.work_precision import work_precision as compared
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
@@ -37,7 +37,7 @@ class Run:
     - `events`: `Crossing`s by name that end the motion.
     - `by_hand`: accelerations and multipliers derived by hand, as a function of `(t, q, v, params)`, for other tools.
     - `drawn`: whether the run is long enough for meaningful run times.
-    - `tier`: the least that includes it: `QUICK`, `MAIN`, or `FULL` for a variation of another run.
+    - `tier`: `FULL` for a variation of another run, which only `--full` makes; `--quick` makes a scene's first.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Case:
 class Scene:
     """A worked system: where it comes from, what the source gets wrong, and how it is checked.
 
-    `runs`, `cases` and `picture` are functions, so that importing a scene computes nothing; `cases` takes a tier.
+    `runs`, `cases` and `picture` are functions, so that importing a scene computes nothing; the last two take a tier.
     """
 
     name: str
@@ -86,8 +86,8 @@ class Scene:
     source: str
     misprints: tuple[str, ...]
     runs: Callable[[], Sequence[Run]]
-    cases: Callable[[int], Sequence[Case]]
-    picture: Callable[[], Any]
+    cases: Callable[..., Sequence[Case]]
+    picture: Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,15 @@ class Row:
 
 
 def work_precision(run: Run, tier: int = FULL, **settings: Any) -> WorkPrecision:
-    """Compare methods on a run, and with other tools where accelerations by hand are there: above `QUICK` with
-    diffrax, in `FULL` also with SciPy, slower by a hundred. `settings` are those of `lj.work_precision`."""
+    """Compare methods on a run, and with other tools where accelerations by hand are there.
+
+    `MAIN` compares the default method, another, and diffrax; `FULL` all methods, and SciPy, slower by a hundred.
+    `settings` are those of `lj.work_precision`.
+    """
     instead, by_hand = None, run.by_hand
+    if tier == MAIN:
+        start = coordinates.state(run.ts[0], run.q0, run.v0, run.params)
+        settings |= {"methods": dict([*usual_methods(run.system, start).items()][:2])}
     if tier > QUICK and by_hand is not None:
         instead = usual_others(lambda *state: by_hand(*state)[0], run.q0, run.v0, run.params, run.ts)
         instead = instead if tier == FULL else dict([*instead.items()][:1])

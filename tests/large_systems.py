@@ -23,9 +23,9 @@ def chain(count, seed=0):
     angle = np.linspace(0.3, 1.2, count)
     link = np.stack([np.sin(angle), -np.cos(angle)], 1) / count
     turning = rng.normal(size=(count, 1)) * np.stack([-link[:, 1], link[:, 0]], 1)
-    params = {"m": jnp.asarray(rng.uniform(0.5, 2.0, count)) / count, "g": 9.81, "l": 1.0 / count}
+    params = {"m": rng.uniform(0.5, 2.0, count) / count, "g": 9.81, "l": 1.0 / count}
     system = lj.System(particles, {"links": lj.Holonomic(links)})
-    return system, jnp.asarray(np.cumsum(link, 0)), jnp.asarray(np.cumsum(turning, 0)), params
+    return system, np.cumsum(link, 0), np.cumsum(turning, 0), params
 
 
 def loop(count):
@@ -33,13 +33,8 @@ def loop(count):
     angle = 2 * np.pi * np.arange(count) / count
     q = np.stack([np.cos(angle), np.sin(angle)], 1) / (2 * count * np.sin(np.pi / count))
     closed = lj.Holonomic(lambda t, q, params: jnp.sum((q - jnp.roll(q, 1, axis=0)) ** 2, axis=1) - params["l"] ** 2)
-    params = {"m": jnp.ones(count) / count, "g": 9.81, "l": 1.0 / count}
-    return (
-        lj.System(particles, {"links": closed}),
-        jnp.asarray(q),
-        jnp.asarray(np.stack([-q[:, 1], q[:, 0]], 1)),
-        params,
-    )
+    params = {"m": np.ones(count) / count, "g": 9.81, "l": 1.0 / count}
+    return lj.System(particles, {"links": closed}), q, np.stack([-q[:, 1], q[:, 0]], 1), params
 
 
 def net(width, height):
@@ -58,8 +53,8 @@ def net(width, height):
         "left": lj.Holonomic(lambda t, q, p: q[0] - corners[0]),
         "right": lj.Holonomic(lambda t, q, p: q[width - 1] - corners[1]),
     }
-    params = {"m": jnp.ones(width * height), "g": 9.81}
-    return lj.System(particles, constraints), jnp.asarray(q), jnp.zeros(q.shape), params
+    params = {"m": np.ones(width * height), "g": 9.81}
+    return lj.System(particles, constraints), q, np.zeros(q.shape), params
 
 
 def bars(count):
@@ -69,9 +64,8 @@ def bars(count):
         half, angle = 0.5 * params["l"], q["angle"]
         vx, vy = v["x"] + half * jnp.cos(angle) * v["angle"], v["y"] + half * jnp.sin(angle) * v["angle"]
         turning = params["l"] ** 2 / 12 * v["angle"] ** 2
-        return params["m"] * jnp.sum(
-            0.5 * (vx**2 + vy**2 + turning) - params["g"] * (q["y"] - half * jnp.cos(angle))
-        )  # fmt: skip
+        kinetic, height = 0.5 * (vx**2 + vy**2 + turning), q["y"] - half * jnp.cos(angle)
+        return params["m"] * jnp.sum(kinetic - params["g"] * height)
 
     def joints(t, q, params):
         x = q["x"] + params["l"] * jnp.sin(q["angle"])
@@ -79,9 +73,9 @@ def bars(count):
         held = lambda end: jnp.concatenate([jnp.zeros(1), end[:-1]])
         return jnp.concatenate([q["x"] - held(x), q["y"] - held(y)])
 
-    angle = jnp.linspace(0.3, 1.2, count)
-    x, y = jnp.cumsum(jnp.sin(angle)) / count, -jnp.cumsum(jnp.cos(angle)) / count
-    q = {"x": x - jnp.sin(angle) / count, "y": y + jnp.cos(angle) / count, "angle": angle}
-    v = {name: jnp.zeros(count) for name in q}
+    angle = np.linspace(0.3, 1.2, count)
+    x, y = np.cumsum(np.sin(angle)) / count, -np.cumsum(np.cos(angle)) / count
+    q = {"x": x - np.sin(angle) / count, "y": y + np.cos(angle) / count, "angle": angle}
+    v = {name: np.zeros(count) for name in q}
     params = {"m": 1.0 / count, "g": 9.81, "l": 1.0 / count}
     return lj.System(lagrangian, {"joints": lj.Holonomic(joints)}), q, v, params

@@ -24,8 +24,8 @@ SCENE = report.Scene(
     source="nowhere",
     misprints=("prints 1 for 2.",),
     runs=lambda: [swing(1e-12)],
-    cases=lambda: [report.Case("easy", "went well", 0.0, 0.0)],
-    picture=lambda: plots.figure()[0],
+    cases=lambda tier: [report.Case("easy", "went well", 0.0, 0.0)],
+    picture=lambda tier: plots.figure()[0],
 )
 
 
@@ -44,7 +44,9 @@ def run(monkeypatch, tmp_path, capsys):
 
 def test_tables_pictures_and_numbers(run, monkeypatch):
     """Both tables are printed, the pictures and the numbers written, and the status is 0."""
-    monkeypatch.setattr(job, "FULL", job.QUICK)
+    monkeypatch.setitem(job.SETTINGS, job.MAIN, job.SETTINGS[job.QUICK])
+    monkeypatch.setattr(report, "usual_methods", lambda *system: job.SETTINGS[job.QUICK]["methods"])
+    monkeypatch.setattr(job, "SECONDS", {"tiny": (1, 60, 99)})
     status, printed, folder = run(SCENE, "tiny")
     assert status == 0
     for part in (
@@ -58,19 +60,27 @@ def test_tables_pictures_and_numbers(run, monkeypatch):
         "went well",
         "prints 1 for 2.",
         "a given number",
+        "1 part, about 60 s in all",
     ):
         assert part in printed, part
+    # The summary: a line for each part, with its picture, below all else.
+    line = next(line for line in printed.splitlines()[-3:] if line.startswith("tiny"))
+    assert "1e-12 (<= 1e-09)" in line and "1 of 1" in line and line.rstrip().endswith("tiny.png")
     assert {path.name for path in folder.iterdir()} == {"tiny.png", "tiny_work_precision.png", "report.json"}
     rows = json.loads((folder / "report.json").read_text())["scenes"]["tiny"]["runs"]
     assert [row["tolerance"] for row in rows] == [1e-6, 1e-10]
     assert all(row["seconds"] > 0 and row["steps"] > 0 for row in rows)
 
 
-def test_what_compiles_for_long_is_not_quick(run):
-    """A scene marked `long` is left out of `--quick`, unless it is named."""
-    long = replace(SCENE, long=True, runs=tuple)
-    assert "went well" not in run(long, "--quick")[1] and "went well" in run(long, "tiny", "--quick")[1]
-    assert "went well" in run(replace(long, long=False), "--quick")[1]
+def test_variations_are_left_for_full(run):
+    """`--quick` makes a scene's first run and one picture; variations are made by `--full` alone."""
+    seen = []
+    varied = replace(swing(1e-12), tier=report.FULL, name="swing, longer")
+    scene = replace(SCENE, runs=lambda: [swing(1e-12), varied], cases=lambda tier: seen.append(tier) or [])
+    _, printed, folder = run(scene, "tiny", "--quick")
+    assert "swing, longer" not in printed and {path.suffix for path in folder.iterdir()} == {".png", ".json"}
+    assert seen == [report.QUICK] and not (folder / "tiny.png").exists()
+    assert [r.name for r in scene.runs() if r.tier <= report.MAIN] == ["swing"]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +88,7 @@ def test_what_compiles_for_long_is_not_quick(run):
     [
         (replace(SCENE, runs=lambda: [swing(1e-8)]), "tiny: swing"),
         (replace(SCENE, runs=lambda: [swing(float("nan"))]), "tiny: swing"),
-        (replace(SCENE, cases=lambda: [report.Case("hard", "went wrong", 1.0, 0.1)]), "tiny: hard"),
+        (replace(SCENE, cases=lambda tier: [report.Case("hard", "went wrong", 1.0, 0.1)]), "tiny: hard"),
     ],
 )
 def test_a_miss_is_named_and_fails(run, scene, named):
@@ -97,8 +107,8 @@ def test_unknown_scene(run, capsys):
 
 
 @pytest.mark.exhaustive
-def test_side_by_side_prints_the_same_in_order(tmp_path, capsys, monkeypatch):
-    """Two scenes in separate processes print and save the same as one after the other, except for times."""
+def test_side_by_side_prints_the_same(tmp_path, capsys, monkeypatch):
+    """Two scenes in separate processes print and save the same as one after the other, except for times and order."""
     monkeypatch.setattr(job, "_machine", lambda: "here")
     names = ["bead_on_hoop", "sliding_wedge"]
 

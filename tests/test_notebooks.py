@@ -3,12 +3,11 @@
 import json
 from pathlib import Path
 
-import matplotlib
 import pytest
 
 from tests.tiers import exhaustive_but
 
-matplotlib.use("agg")
+
 FOLDER = Path(__file__).parent.parent / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
 # These compile for 10 s or more; their content is tested by `motion/`, `scenes/`, `analysis/` and `fitting/`.

@@ -377,7 +377,7 @@ def _thousand_turns():
     return Case("1000 turns, embedded", happened, float(path.residual()), 1e-12)
 
 
-def picture():
+def picture(tier=FULL):
     """Integrated great circles over the azimuth, and the saddle of an arc longer than half a turn."""
     fig, axes = plots.figure(1, 2, size=(4.8, 3.6))
     axis, theta = axes[0, 0], np.linspace(-np.pi, np.pi, DRAWN)

@@ -1,5 +1,6 @@
 """Error against run time and against evaluations, of several methods on one motion."""
 
+from lagjax.work_precision.methods import usual_methods
 from lagjax.work_precision.other_solvers import usual_others
 from lagjax.work_precision.over_horizons import Horizons, horizons
 from lagjax.work_precision.result import WorkPrecision, in_ms, table

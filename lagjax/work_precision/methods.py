@@ -21,7 +21,7 @@ TIGHTEST = {np.dtype("float64"): 1e-13, np.dtype("float32"): 2e-6}
 FIX = 'methods={"Dopri8": lj.Dopri8(), "Tsit5": lj.Tsit5()}, or leave it out'
 
 
-def usual(system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
+def usual_methods(system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
     """The explicit methods that suit a system, starting with the default of `integrate`."""
     by_stages: dict[str, diffrax.AbstractSolver] = {"Dopri8": Dopri8(), "Tsit5": Tsit5()}
     model = model_of(system, *start)
@@ -34,7 +34,7 @@ def usual(system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
 def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.AbstractSolver]:
     """The methods by name; raise if one is not an adaptive solver for this system."""
     if methods is None:
-        return usual(system, start)
+        return usual_methods(system, start)
     if isinstance(methods, (str, diffrax.AbstractSolver, type)) or not isinstance(methods, Iterable):
         fix = f"methods=[{as_code(methods)}]" if isinstance(methods, diffrax.AbstractSolver) else FIX
         raise TypeError(

@@ -25,7 +25,7 @@ from lagjax.integrate import Trajectory, arguments, ended_well, is_suited
 from lagjax.jaxtools import is_eager, is_traced
 from lagjax.numerics import EqualSteps, Gauss, Radau5, Splitting
 from lagjax.system import State, System, by_name, check_system, coordinates, model_of
-from lagjax.work_precision.methods import as_code, usual
+from lagjax.work_precision.methods import as_code, usual_methods
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram, seconds_of
 from lagjax.work_precision.references import compared_of, computed_reference, given_reference
 from lagjax.work_precision.result import in_ms, table
@@ -211,7 +211,7 @@ def horizons(
     last = period * np.linspace(1 / OUTPUTS, 1.0, OUTPUTS)
     motion = ComparedMotion(system, start, np.append(0.0, period * (ends[0] - 1) + last).astype(start.t.dtype), options)
     programs = {name: TimedProgram(motion, solver) for name, solver in solvers.items()}
-    kinds = usual(system, start) | {"Radau5": Radau5()}
+    kinds = usual_methods(system, start) | {"Radau5": Radau5()}
     rows, next_of = {}, dict.fromkeys(solvers, 0)
     for end in ends:
         motion = motion._replace(ts=np.append(0.0, period * (end - 1) + last).astype(start.t.dtype))
@@ -263,7 +263,7 @@ def _usual(system: System, start: State) -> list[Any]:
     """The methods that suit a system: the explicit ones, and those of equal steps."""
     model = model_of(system, *start)
     equal = [method for method in EQUAL if is_suited(method, model)]
-    return [*usual(system, start).values(), *equal]
+    return [*usual_methods(system, start).values(), *equal]
 
 
 def _checked(period: Any, periods: Any, error: Any, methods: Any, reference: Any) -> list[float]:

@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 from lagjax.integrate import Crossing, Trajectory, ended_well, message, runs_backward
 from lagjax.numerics import Radau5
 from lagjax.system import coordinates
-from lagjax.work_precision.methods import TIGHTEST, usual
+from lagjax.work_precision.methods import TIGHTEST, usual_methods
 from lagjax.work_precision.programs import ComparedMotion, TimedProgram
 
 # A given reference is wrong if it is this many times farther from solves than these are from each other.
@@ -185,7 +185,7 @@ def computed_reference(
 ) -> KnownAnswer:
     """The reference that two methods of different kinds compute."""
     dtype = motion.ts.dtype
-    kinds: dict[str, diffrax.AbstractSolver] = usual(motion.system, motion.start) | {"Radau5": Radau5()}
+    kinds: dict[str, diffrax.AbstractSolver] = usual_methods(motion.system, motion.start) | {"Radau5": Radau5()}
     tolerance = TIGHTEST.get(dtype, 1e-2)
     found, reasons, first = {}, [], None
     for name, solver in kinds.items():

@@ -167,7 +167,7 @@ def test_powers_are_the_rate_of_h(sign):
     np.testing.assert_allclose(found["constraint 'edge'"], sign * edge, atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_wedge_takes_what_the_mass_gives():
     """The normal force does -W on the mass and +W on the wedge, W = ½ M Ẋ²; twin: pushing the other way, +W and -W."""
     traj = lj.integrate(

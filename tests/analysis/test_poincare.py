@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import special
 
 import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
+from tests.analysis.closed_forms import slope_of_swinging, swinging
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, pendulum
 
@@ -24,44 +24,36 @@ def swing(q0, l, span=20.0):
     return lj.poincare(pendulum, q0, 0.0 * q0, params, section=bottom, ts=[0.0, span], events=ALSO, **TIGHT)
 
 
-def of_pendulum(q0, l):
-    """The period and its derivatives: T = 4 √(l/g) K(m), m = sin²(q0/2), dK/dm = (E - (1 - m) K) / (2 m (1 - m))."""
-    m, root = np.sin(q0 / 2) ** 2, np.sqrt(l / PARAMS["g"])
-    k, e = special.ellipk(m), special.ellipe(m)
-    slope = (e - (1 - m) * k) / (2 * m * (1 - m))
-    return 4 * root * k, 4 * root * slope * np.sin(q0) / 2, 2 * root * k / l
-
-
 # The pendulum.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("q0", [0.5, 2.0, 3.0])
-def test_periods_of_the_pendulum(q0):
-    """Each period is the complete elliptic integral to 1e-9; twin: the period of small swings is off by more."""
-    section, exact = swing(q0, PARAMS["l"]), of_pendulum(q0, PARAMS["l"])[0]
+def test_pendulum(q0):
+    """Periods are the complete elliptic integral to 1e-9, states follow from the energy, ½ v² = (g/l) (1 - cos q0).
+
+    Turning points are at the release and opposite, half a period apart; the release itself is not one. Twin: the period
+    of small swings is off by more.
+    """
+    section, exact = swing(q0, PARAMS["l"]), swinging(q0)
     count = int(section.count)
-    found = lj.periods(section)
+    found = np.asarray(lj.periods(section))
     assert count == int(20.0 / exact + 0.25) and found.shape == (499,)
     np.testing.assert_allclose(found[: count - 1], exact, rtol=1e-9)
     assert np.isnan(found[count - 1 :]).all()
     assert abs(2 * np.pi * np.sqrt(PARAMS["l"] / PARAMS["g"]) / exact - 1) > 1e-2
-
-
-def test_states_at_the_bottom():
-    """At the bottom q is zero and v follows from the energy, ½ v² = (g/l) (1 - cos q0), from the third quarter on."""
-    found, period = swing(2.0, PARAMS["l"]).crossings.found(), of_pendulum(2.0, PARAMS["l"])[0]
-    np.testing.assert_allclose(found.q, 0.0, atol=1e-12)
-    np.testing.assert_allclose(found.v, np.sqrt(2 * PARAMS["g"] / PARAMS["l"] * (1 - np.cos(2.0))), rtol=1e-9)
-    np.testing.assert_allclose(found.t, period * (0.75 + np.arange(len(found.t))), rtol=1e-9)
-
-
-def test_turning_points_of_the_pendulum():
-    """Turning points are at the release and opposite, half a period apart; the release itself is not one."""
-    turns = swing(2.0, PARAMS["l"]).trajectory.events["turn"]
-    found = turns.found()
-    np.testing.assert_allclose(found.q, 2.0 * (-1.0) ** (1 + np.arange(len(found.t))), rtol=1e-9)
-    np.testing.assert_allclose(found.v, 0.0, atol=1e-13)
-    np.testing.assert_allclose(lj.periods(found), of_pendulum(2.0, PARAMS["l"])[0] / 2, rtol=1e-9)
+    crossed, turns = section.crossings.found(), section.trajectory.events["turn"].found()
+    np.testing.assert_allclose(crossed.q, 0.0, atol=1e-12)
+    np.testing.assert_allclose(crossed.v, np.sqrt(2 * PARAMS["g"] / PARAMS["l"] * (1 - np.cos(q0))), rtol=1e-9)
+    np.testing.assert_allclose(crossed.t, exact * (0.75 + np.arange(count)), rtol=1e-9)
+    np.testing.assert_allclose(turns.q, q0 * (-1.0) ** (1 + np.arange(len(turns.t))), rtol=1e-9)
+    np.testing.assert_allclose(turns.v, 0.0, atol=1e-13)
+    np.testing.assert_allclose(lj.periods(turns), exact / 2, rtol=1e-9)
+    # The print has counts, the mean period and its spread, the times' error and doubts.
+    words = repr(section)
+    assert f"crossings   {count}, at t = {0.75 * exact:.9g}, " in words
+    assert f"period      {exact:.9g} on average" in words and "standard deviation" in words
+    assert "uncertain   no" in words and "error       of the times at most" in words
 
 
 @pytest.mark.exhaustive
@@ -73,10 +65,11 @@ def test_derivatives_of_the_period():
         found = lj.periods(lj.poincare(pendulum, *start, section=bottom, ts=[0.0, 15.0], **TIGHT))
         return jnp.stack([found[0], jnp.nanmean(found)])
 
-    x = jnp.array([2.5, PARAMS["l"]])
-    _, *slopes = of_pendulum(*x)
+    x = np.array([2.5, PARAMS["l"]])
+    amplitude, l = 2.5, PARAMS["l"]
+    slopes = slope_of_swinging(amplitude), swinging(amplitude) / (2 * l)
     forward, (value, pull) = jax.jacfwd(period)(x), jax.vjp(period, x)
-    np.testing.assert_allclose(value, of_pendulum(*x)[0], rtol=1e-9)
+    np.testing.assert_allclose(value, swinging(amplitude), rtol=1e-9)
     for found in (forward[0], forward[1], pull(jnp.array([1.0, 0.0]))[0], pull(jnp.array([0.0, 1.0]))[0]):
         np.testing.assert_allclose(found, slopes, rtol=1e-8)
 
@@ -99,19 +92,6 @@ def test_nothing_beyond_the_last_one_is_differentiated():
     np.testing.assert_array_equal(right, [-1.0, 0.0, 1.0, 0.0, 0.0])
     assert np.isnan(wrong).any()
     np.testing.assert_array_equal([backward[:2], lanes[0, :2]], [[1.5, 2.0]] * 2)
-
-
-def test_what_is_printed():
-    """The print has counts, the mean period and its spread, the times' error and doubts; it also works while traced."""
-    section = swing(2.0, PARAMS["l"])
-    period = of_pendulum(2.0, PARAMS["l"])[0]
-    words = repr(section)
-    assert f"crossings   {int(section.count)}, at t = {0.75 * period:.9g}, " in words
-    assert f"period      {period:.9g} on average" in words and "standard deviation" in words
-    assert "uncertain   no" in words and "error       of the times at most" in words
-    traced = []
-    jax.eval_shape(lambda section: traced.append(repr(section)), section)
-    assert traced == ["Poincaré section, being traced, room for 500 crossings"]
 
 
 # Central motions.
@@ -197,12 +177,16 @@ def orbit(y, span=70.0, **settings):
     return lj.poincare(henon_heiles, *start, section=plane, ts=np.array([0.0, span]), events=back, **settings)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_section_of_henon_and_heiles():
-    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points."""
-    section = orbit(0.125)
+    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points.
+
+    Crossings that are not kept are warned of.
+    """
+    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
+        section = orbit(0.125, span=120.0)
     found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
-    assert len(found.t) == int(section.count) == 11
+    assert len(found.t) == KEPT and int(section.count) == 19
     for crossed, sign in ((found, 1), (other, -1)):
         np.testing.assert_allclose(crossed.q["x"], 0.0, atol=1e-14)
         assert (sign * crossed.v["x"] > 0.1).all()
@@ -211,19 +195,7 @@ def test_section_of_henon_and_heiles():
     assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
     # The kinetic energy of y varies, so that a wrong energy would be seen.
     assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
-
-
-@pytest.mark.slow
-def test_more_than_there_is_room_for():
-    """Crossings that are not kept are warned of, printed and drawn; twin: no such note if there is room."""
-    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
-        section = orbit(0.125, span=120.0)
-    assert int(section.count) == 19 and np.isfinite(section.t).all() and section.t.shape == (KEPT,)
-    assert "19, of which the first 12 are kept" in repr(section)
-    assert "the first 12 of up to 19 crossings" in section.plot().get_suptitle()
-    room = orbit(0.125)
-    assert room.plot().get_suptitle() == "" and "kept" not in repr(room)
-    np.testing.assert_allclose(section.t[:11], room.t[:11], rtol=1e-9)
+    np.testing.assert_allclose(section.t[:11], orbit(0.125).t[:11], rtol=1e-9)
 
 
 @pytest.mark.exhaustive
@@ -272,6 +244,16 @@ def test_pictures():
     lost, _ = in_a_plane(count=19)
     assert "19, of which the first 5 are kept" in repr(lost) and "kept" not in repr(section)
     assert "the first 5 of up to 19 crossings" in lost.plot().get_suptitle()
+
+
+def test_what_is_printed():
+    """The print of one motion has counts, periods and doubts; it also works while traced."""
+    section, traced = in_a_plane()[0], []
+    words = repr(section)
+    assert "crossings   4, at t = 1, " in words and "period      1 on average, 1 to 1, standard deviation 0" in words
+    assert "uncertain   no" in words and "error" not in words
+    jax.eval_shape(lambda section: traced.append(repr(section)), section)
+    assert traced == ["Poincaré section, being traced, room for 5 crossings"]
 
 
 def test_lanes_in_words_and_pictures():
@@ -342,10 +324,10 @@ def test_refused_elsewhere():
     with pytest.raises(TypeError, match="by its name, not as int"):
         lj.turning_points(0)
     assert [getattr(lj.turning_points("r", direction=1), name) for name in ("direction", "terminal")] == [1, False]
-    section = swing(2.0, PARAMS["l"])
+    section, _ = in_a_plane()
     with pytest.raises(TypeError, match="not from a Trajectory"):
         lj.periods(section.trajectory)
     with pytest.raises(ValueError, match="only one crossing was kept"):
         lj.periods(crossings(np.ones(1)))
-    with pytest.raises(ValueError, match="no event 'top'; recorded: 'section', 'turn'"):
+    with pytest.raises(ValueError, match="no event 'top'; recorded: 'section'"):
         lj.PoincareSection(section.trajectory, "top")

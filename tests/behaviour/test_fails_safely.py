@@ -22,7 +22,6 @@ def test_names_are_different():
     assert len(fails_safely.FAMILIES) * fails_safely.COUNT >= 300
 
 
-@pytest.mark.optimised
 @pytest.mark.slow
 def test_broken_systems_are_reported_and_healthy_ones_are_not():
     """Too few steps are reported alone and in lanes; the twins are accurate to 100 tolerances."""

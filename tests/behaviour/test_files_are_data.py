@@ -22,7 +22,9 @@ from lagjax.files import npz
 from lagjax.files import table as file_table
 from lagjax.sweep import chunks, metadata, result, store
 from tests import mutated
+from tests.by_hand import with_problem
 from tests.mutated import describe, mutated_file, mutated_store
+from tests.systems import motion
 
 T = np.linspace(0.0, 3.0, 16)
 AXES = {"k": np.arange(1.0, 3.0), "x": np.linspace(0.1, 1.0, 8)}
@@ -160,9 +162,8 @@ def attack_stores(good, folder, numbers):
 def good(tmp_path_factory):
     """A trajectory and a store to be changed."""
     folder = tmp_path_factory.mktemp("good")
-    fall = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - params["g"] * q["x"])
-    traj = lj.integrate(fall, {"x": 0.0}, {"x": 3.0}, {"g": jnp.array(10.0), "kind": "steel"}, ts=T, method=lj.Tsit5())
-    traj.save(folder / "trajectory.npz")
+    found = motion("rod pendulum")
+    with_problem(found, params=found.params | {"kind": "steel"}).save(folder / "trajectory.npz")
     run = lambda point: {"y": jnp.stack([point["x"] * point["k"]] * 2), "n": (10 * point["k"]).astype(int)}
     lj.sweep(run, AXES, store=folder / "store", chunk=8, workers=1, progress=False)
     return folder

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-import sympy
 
 import lagjax as lj
 from tests.systems import motion
@@ -124,6 +123,8 @@ def changed(t, q, v, params):
 
 def by_sympy(t, q, v, params):
     """A function for symbols."""
+    import sympy
+
     return 0.5 * v["theta"] ** 2 + sympy.cos(q["theta"])
 
 

@@ -9,7 +9,6 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib import image
 
 import lagjax as lj
 from benchmarks.speed.browser import Browser, installed
@@ -270,6 +269,8 @@ def tumbling():
 
 def pixels(page, tmp_path):
     """What is visible, as numbers (rows, columns, 3)."""
+    from matplotlib import image
+
     page.picture(tmp_path / "seen.png")
     return image.imread(tmp_path / "seen.png")[:, :, :3]
 

@@ -12,13 +12,14 @@ from scipy import special
 import lagjax as lj
 from lagjax.numerics import Quintic
 from tests.behaviour.test_bad_input import refusal
+from tests.systems import pendulum
 
+PARAMS = {"g": 1.0, "l": 1.0}
 HALF, MANY, FEW = np.sin(0.6), np.linspace(0.0, 6.0, 121), np.array([0.0, 6.0])
 TIMES = np.linspace(0.0, 2.0, 21)
-swing = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.cos(q))
 # As many numbers as reverse mode replays for; their sum is one.
 shared = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
-SHARES = jnp.full(40, 1 / 40)
+SHARES = np.full(40, 1 / 40)
 rod = lj.System(
     lambda t, q, v, p: 0.5 * (v @ v) - jnp.sum(p) * q[1], {"rod": lj.Holonomic(lambda t, q, p: q @ q - 1.0)}
 )
@@ -55,34 +56,48 @@ def test_order_of_the_polynomial(end_rate, orders):
         assert np.log2(a / b) == pytest.approx(order, abs=0.35)
 
 
-@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+def swung(ts, rtol, **how):
+    """The pendulum released at 1.2."""
+    return lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=ts, rtol=rtol, **how)
+
+
 @pytest.mark.parametrize("rtol", [1e-3, 1e-6])
 def test_as_accurate_as_the_steps(rtol):
-    """Of 121 outputs none is much further off than the outputs of Tsit5's own steps, and no step is added for them."""
-    of = lambda ts, **how: lj.integrate(swing, 1.2, 0.0, ts=ts, rtol=rtol, **how)
-    found, steps = of(MANY, **between), of(FEW, method=lj.Tsit5(), estimate_error=False).stats["num_steps"]
-    assert found.stats["num_steps"] == steps and found.static.method == "Tsit5, outputs interpolated"
+    """Of 121 outputs none is much further off than the end, and no step is added for them."""
+    found = swung(MANY, rtol, **between)
+    # As many outputs, all but the last in the first step.
+    early = swung(np.append(1e-9 * MANY[:-1], 6.0), rtol, **between)
+    assert found.stats["num_steps"] == early.stats["num_steps"] < 60 and found.end.q == early.end.q
+    assert found.static.method == "Tsit5, outputs interpolated"
     # The phase error of 1e-3 is larger than that of the polynomial; q and v are of order one.
     reached = np.max(np.abs(np.array(exact(6.0)) - [found.end.q, found.end.v]))
     assert max(worst(found)) < 3 * reached + 15 * rtol
     assert "outputs interpolated" in repr(found)
-    judged = lj.integrate(swing, 1.2, 0.0, ts=MANY, rtol=rtol, outputs="interpolated")
-    assert "the outputs: fewer" not in repr(judged) and max(worst(judged)) < 3 * float(np.nanmax(judged.error.v))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
+def test_as_those_of_plain_steps():
+    """The same steps as those of Tsit5 alone, and errors that the estimate covers."""
+    for rtol in (1e-3, 1e-6):
+        plain = swung(FEW, rtol, method=lj.Tsit5(), estimate_error=False)
+        judged = swung(MANY, rtol, outputs="interpolated")
+        assert judged.stats["num_steps"] == plain.stats["num_steps"] and judged.end.q == plain.end.q
+        assert "the outputs: fewer" not in repr(judged) and max(worst(judged)) < 3 * float(np.nanmax(judged.error.v))
+
+
+def loss(p, q0, ts, **how):
+    """A function of all outputs."""
+    traj = lj.integrate(shared, q0, 0.0, p, ts=ts, throw=False, **how)
+    return jnp.sum(traj.q**2) + jnp.sum(jnp.sin(traj.v))
 
 
 @pytest.mark.slow
 def test_derivatives():
-    """The replay gives the forward derivative of the same steps; that by parameters, start and times is right."""
-
-    def loss(p, q0, ts, **how):
-        traj = lj.integrate(shared, q0, 0.0, p, ts=ts, throw=False, **how)
-        return jnp.sum(traj.q**2) + jnp.sum(jnp.sin(traj.v))
-
-    point, along = (SHARES, jnp.asarray(1.2), jnp.asarray(MANY)), (jnp.arange(40.0) / 40, jnp.asarray(0.3))
+    """The gradient by parameters, start and times, which replays the steps, is right."""
+    point = SHARES, jnp.asarray(1.2), jnp.asarray(MANY)
     gradient = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-5, **between), (0, 1, 2)))
     loose = gradient(*point)
-    pushed = jax.jvp(lambda *x: loss(*x, MANY, rtol=1e-5, **between), point[:2], along)[1]
-    assert sum(jnp.sum(a * b) for a, b in zip(loose, along)) == pytest.approx(float(pushed), rel=1e-10)
     angle, rate = exact(MANY)
     by_angle, by_rate = 2 * angle, np.cos(rate)
     # At another sum g of the parameters the motion is as fast as √g, and the rate √g as large.
@@ -95,7 +110,15 @@ def test_derivatives():
     by_times[0] = -np.sum(by_times[1:])
     for a, b in zip(loose, (by_sum * np.ones(40), by_start, by_times)):
         assert np.max(np.abs(a - b)) < 2e-3 * np.max(np.abs(b))
-    # Lanes with different numbers of steps and a shared output time.
+
+
+@pytest.mark.exhaustive
+def test_derivatives_in_forward_mode_and_lanes():
+    """The replay gives the forward derivative of the same steps; and in lanes with different numbers of steps."""
+    point, along = (SHARES, jnp.asarray(1.2), jnp.asarray(MANY)), (jnp.arange(40.0) / 40, jnp.asarray(0.3))
+    gradient = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-5, **between), (0, 1, 2)))
+    pushed = jax.jvp(lambda *x: loss(*x, MANY, rtol=1e-5, **between), point[:2], along)[1]
+    assert sum(jnp.sum(a * b) for a, b in zip(gradient(*point), along)) == pytest.approx(float(pushed), rel=1e-10)
     starts = jnp.array([0.2, 1.2, 3.0])
     each = [gradient(SHARES, q0, point[2])[0] for q0 in starts]
     together = jax.grad(lambda p: jnp.sum(jax.vmap(lambda q0: loss(p, q0, MANY, rtol=1e-5, **between))(starts)))(SHARES)
@@ -136,16 +159,16 @@ def test_beside_events_and_in_float32():
     # The period is proportional to 1/√(sum of p).
     slope = jax.grad(lambda p: of(p, **between).events["down"].t[0])(SHARES)
     assert slope == pytest.approx(np.full(40, -quarter / 2), rel=1e-4)
-    single = lj.integrate(swing, np.float32(1.2), np.float32(0.0), ts=MANY.astype(np.float32), **between)
+    single = lj.integrate(pendulum, np.float32(1.2), np.float32(0.0), PARAMS, ts=MANY.astype(np.float32), **between)
     assert single.q.dtype == np.float32 and max(worst(single)) < 3e-4
 
 
 def test_refused():
     """Unknown words, and methods whose steps are too long for the polynomial."""
     with refusal(ValueError, "outputs must be 'exact' or 'interpolated'", 'outputs="exact"'):
-        lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="linear")
+        lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="linear")
     with refusal(ValueError, "which Dopri8 does not go with", r"method=lj.Tsit5\(\)"):
-        lj.integrate(swing, 1.2, 0.0, ts=FEW, outputs="interpolated", method=lj.Dopri8())
+        lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="interpolated", method=lj.Dopri8())
 
 
 @pytest.mark.slow

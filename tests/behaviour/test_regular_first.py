@@ -1,6 +1,7 @@
 """Sweeps first assume regular motions: lanes that are not settled are computed entirely with the robust program."""
 
 import contextlib
+import threading
 from collections import Counter
 
 import jax
@@ -57,9 +58,11 @@ def regular_alone(run, axes=BOTH):
 
 
 @pytest.fixture(autouse=True)
-def compiled(monkeypatch):
+def compiled(monkeypatch, request):
     """Count the compiled programs of each kind, starting with an empty cache."""
     count, compiled = Counter(), batch_program.compiled
+    if not request.node.get_closest_marker("exhaustive"):
+        return count
 
     def counted(*args):
         count["robust" if args[-1] else "regular"] += 1
@@ -93,11 +96,36 @@ def test_lanes_that_are_not_regular(compiled):
     assert not np.isin(status.result[~settled], batch_program.TRUSTED).any()
 
 
+@pytest.mark.exhaustive
 def test_where_all_are_regular(compiled):
     """No robust program is compiled if all motions are regular."""
     swept = quiet(first_coordinate, DEFINITE)
     np.testing.assert_allclose(swept.values, exact(DEFINITE["k"]), rtol=1e-7)
     assert swept.ok.all() and compiled == {"regular": 1}
+
+
+@pytest.mark.parametrize(("axes", "kinds"), [(DEFINITE, {"regular": 1}), (BOTH, {"regular": 1, "robust": 1})])
+def test_which_lanes_need_the_robust_program(axes, kinds, compiled, monkeypatch):
+    """Lanes that a first program does not settle are those of a robust one, which is compiled only for them."""
+    monkeypatch.setattr(batch_program, "program_of", lambda key, make: make())
+
+    def made(run, axes, chunk, devices, layout, patience, robust):
+        compiled["robust" if robust else "regular"] += 1
+
+        def call(point, count):
+            k = point["k"][:count]
+            settled = None if robust else k > 1
+            values = exact(k) if robust else np.where(settled, exact(k), np.nan)
+            result = np.where(np.isnan(values), lj.RESULTS.not_finite._value, lj.RESULTS.successful._value)
+            return values, batch_program.Status(result, *3 * [np.zeros(count)]), settled
+
+        value = jax.ShapeDtypeStruct((), float)
+        return batch_program.Program(call, chunk, value, 0, "", threading.Event(), not robust)
+
+    monkeypatch.setattr(batch_program, "compiled", made)
+    swept = quiet(lambda point: point["k"], axes)
+    assert swept.ok.all() and compiled == kinds
+    np.testing.assert_array_equal(swept.values, exact(axes["k"]))
 
 
 @pytest.mark.exhaustive

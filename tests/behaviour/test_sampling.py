@@ -1,6 +1,5 @@
 """NUTS on a fit's density, in standardised coordinates, against known posteriors."""
 
-import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,8 @@ TS, ROUGH, PRIOR = np.array([0.5, 1.0, 3.6, 3.8]), 0.2, (4.0, 1.5)
 
 def nuts(density, n, key):
     """Draws (DRAWS, n) of a nearly standard normal density of z, started at its peak; the first 200 are discarded."""
+    import blackjax
+
     kernel = blackjax.nuts(density, step_size=0.5, inverse_mass_matrix=jnp.ones(n))
 
     @jax.jit
@@ -30,6 +31,8 @@ def nuts(density, n, key):
 
 def errors(x, mean, sd, quantile):
     """The deviations of mean, variance and the share below the 90 % quantile, in Monte-Carlo errors."""
+    import blackjax
+
     size = lambda y: float(blackjax.diagnostics.effective_sample_size(jnp.asarray(y)[None]))
     x = np.asarray(x)
     squares, below = (x - mean) ** 2, (x < quantile).astype(float)

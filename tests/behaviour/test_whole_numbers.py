@@ -8,6 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.system import coordinates
 from tests.counting import compiles
+from tests.systems import TS as FOUR, rod_pendulum
 from tests.tiers import exhaustive_but
 
 PARAMS = {"g": 3.0, "k": 2.0}
@@ -39,11 +40,11 @@ QUICK = {
     "accelerations": by_name("accelerations"),
     "constraint_residual": by_name("constraint_residual", rod),
     "noether_charge": lambda q, v: lj.noether_charge(system, turning)(0, q, v, PARAMS),
-    "integrate": lambda q, v: lj.integrate(system, q, v, PARAMS, ts=[0, 1], estimate_error=False).q,
-    "action": lambda q, v: lj.action(system, lambda t: {"x": t, "y": q["y"]}, PARAMS, 0, 1),
+    "integrate": lambda q, v: lj.integrate(rod_pendulum, q, v, {"g": 3, "l": 1}, ts=FOUR).q,
     "in a program": lambda q, v: jax.jit(lambda q, v: lj.momentum(system, 0, q, v, PARAMS))(q, v),
 }
 LONG = {
+    "action": lambda q, v: lj.action(system, lambda t: {"x": t, "y": q["y"]}, PARAMS, 0, 1),
     "constraint_force": by_name("constraint_force", rod),
     "consistent_state": by_name("consistent_state", rod),
     "explain": lambda q, v: lj.explain(rod, 0, q, v, PARAMS).degrees_of_freedom,
@@ -88,7 +89,7 @@ def test_at_one_state(door):
 
 
 # One program of each kind; the others compile for long.
-KEPT = ("constraint_force", "on a rod", "equilibria", "linearise", "normal_modes", "symmetries", "periodic_orbit")
+KEPT = ("action", "constraint_force", "on a rod", "equilibria", "linearise", "normal_modes", "symmetries", "periodic_orbit")
 
 
 @pytest.mark.slow

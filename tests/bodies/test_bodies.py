@@ -158,19 +158,21 @@ def test_a_cardan_joint_and_a_weld():
 def test_single_precision():
     """In float32 all that bodies, joints and loads give is float32, though markers hold Python's numbers."""
     rod = lj.Body("rod", 1, (1, 1, 2))
-    pose = lj.Pose(jnp.array([0.0, 0.0, 1.0], jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32))
-    pose = pose.turned((1.0, 0.0, 0.0), 0.5)
-    q, v = {"rod": pose}, {"rod": pose.moving((1.0, 0.0, 0.0), (0.0, 2.0, 0.0))}
     a, b = lj.ground.at((0.1, 0.0, 0.0), (1.0, 1.0, 0.0)), rod.at(lambda params: (0.0, params, 0.0))
-    half = jnp.float32(0.5)
-    given = [rod.kinetic(q, v), lj.fixed(a, b).g(0.0, q, half), lj.prismatic(a, b).g(0.0, q, half)]
     loads = lj.weight([rod]), lj.spring(a, b, 2), lj.torsion(a, b, 2)
-    given += [load.potential(0.0, q, v, half) for load in loads if load.potential is not None]
     damper, drive = lj.spring(a, b, 2, damping=1).dissipation, lj.motor(a, b, 2).power
     assert damper is not None and drive is not None
-    given += [damper(0.0, q, v, half), drive(0.0, q, v, v, half)]
-    given += jax.tree.leaves((q, v)) + [rod.angular_momentum(q, v)]
-    assert {jnp.asarray(x).dtype for x in given} == {np.dtype("float32")}
+
+    def given(place, turn, half):
+        pose = lj.Pose(place, turn).turned((1.0, 0.0, 0.0), 0.5)
+        q, v = {"rod": pose}, {"rod": pose.moving((1.0, 0.0, 0.0), (0.0, 2.0, 0.0))}
+        found = [rod.kinetic(q, v), lj.fixed(a, b).g(0.0, q, half), lj.prismatic(a, b).g(0.0, q, half)]
+        found += [load.potential(0.0, q, v, half) for load in loads if load.potential is not None]
+        found += [damper(0.0, q, v, half), drive(0.0, q, v, v, half), q, v, rod.angular_momentum(q, v)]
+        return jax.tree.map(jnp.asarray, found)
+
+    shapes = jax.eval_shape(given, *(np.ones(shape, np.float32) for shape in (3, 4, ())))
+    assert {x.dtype for x in jax.tree.leaves(shapes)} == {np.dtype("float32")}
 
 
 def test_bad_bodies_and_joints():
@@ -308,11 +310,12 @@ def test_an_arm_in_space():
 def test_poses_of_a_tree_are_refused():
     """Those of a tree have a matrix beside them, and are none of `lj.multibody`."""
     links, hinges, weight, q, v = arm(2)
-    tree = lj.Tree(links, hinges)
+    tree, system = lj.Tree(links, hinges), lj.multibody(links, hinges, weight)
     with pytest.raises(
         TypeError, match="'link 0' of q and v of lj.multibody must be a lj.Pose, and is that of a lj.Tree"
     ):
-        lj.accelerations(lj.multibody(links, hinges, weight), 0.0, tree.poses(q), tree.rates(q, v), None)
+        of_poses = lambda q, v: lj.accelerations(system, 0.0, tree.poses(q), tree.rates(q, v), None)
+        jax.eval_shape(of_poses, q, v)
 
 
 @pytest.mark.exhaustive

@@ -9,7 +9,8 @@ from lagjax.display import CUBE, DISK, SPHERE, InSpace
 from lagjax.integrate.trajectory.subject import subject_of
 
 A, B = lj.Body("a", 2.0, (0.1, 0.2, 0.25)), lj.Body("b", lambda params: params["m"], lambda params: (1.0, 1.0, 0.0))
-POSE = lj.Pose.at((1.0, 2.0, 3.0), axis=(1.0, 1.0, 0.0), angle=0.7)
+# Turned by 0.7 about (1, 1, 0), as by `lj.Pose.at`, which would compute.
+POSE = lj.Pose(np.array([1.0, 2.0, 3.0]), np.array([np.cos(0.35), *np.sin(0.35) * np.sqrt([0.5, 0.5, 0.0])]))
 
 
 def drawn(system, params=None, **poses):

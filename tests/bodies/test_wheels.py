@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 import lagjax as lj
 from lagjax.bodies.contact_point import least_of
 from lagjax.bodies.wheels import tangents
+from tests.jaxtools.in_numpy import evaluated
 
 G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
 MASS = 1.3
@@ -416,7 +417,7 @@ def test_distances():
     def gap(f, is_distance):
         touches = lj.rolling_sphere(ball.at(), lj.Surface(f, is_distance=is_distance), SMALL)["touches"]
         assert isinstance(touches, lj.Holonomic)
-        return touches.g(0.0, q, None)
+        return evaluated(lambda q: touches.g(0.0, q, None), q)[0]
 
     def pipe(r, params):
         return LARGE - jnp.sqrt(r[0] ** 2 + r[1] ** 2)

@@ -55,7 +55,7 @@ class Case(NamedTuple):
 
 
 # Fits of it take their motions from a formula, `in_closed_form`; integrated it would be NaN.
-formula = lj.System(lambda t, q, v, params: np.nan * v)
+formula = lj.System(lambda t, q, v, params: np.nan * sum(jax.tree.leaves(v)))
 Motion = NamedTuple("Motion", [(name, Any) for name in ("t", "q", "v", "multipliers", "end", "result", "params")])
 End = NamedTuple("End", [(name, Any) for name in "tqv"])
 

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import optimistix as optx
 import pytest
 from scipy.optimize import least_squares
@@ -278,6 +277,8 @@ def test_inside_a_program(swinging):
 @pytest.mark.exhaustive
 def test_other_optimisers(swinging):
     """Another least-squares solver, and minimisers with reverse-mode derivatives, end at the same point."""
+    import optax
+
     data = noisy(swinging[0])
     fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
     ours = fit()

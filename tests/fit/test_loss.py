@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from scipy.optimize import least_squares
 
@@ -35,6 +34,8 @@ def quietly(*args, **options):
 
 def trained(loss, unknowns, optimiser, steps, batch=None, seed=0):
     """The recipe of `docs/learned.md`: the unknowns after some steps of an optimiser of optax."""
+    import optax
+
 
     @jax.jit
     def train(unknowns):
@@ -156,6 +157,8 @@ def test_unknowns_have_the_structure_of_params():
 
 def test_what_does_not_go_together():
     """A batch of joined windows; optax or arguments of a training in `fit`, which name the recipe."""
+    import optax
+
     residuals = lj.fit_residuals(spring, record(known=False), {"k": 3.9}, window=1.0)
     with pytest.raises(ValueError, match="continue each other and make no batches.\nFix: joined=False"):
         residuals({}, [0])
@@ -189,6 +192,8 @@ def test_starts_of_their_own():
 @pytest.mark.exhaustive
 def test_what_fails_moves_nothing():
     """A motion with NaN has a constant loss without a slope, and the others are still fitted; a fit then tells."""
+    import optax
+
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p["k"] + 0.0 * jnp.sqrt(p["sane"])) * q**2)
     records = [record(i, params={"sane": sane}) for i, sane in enumerate((1.0, -1.0, 1.0))]
     loss = lj.fit_loss(system, records, {"k": 3.0, "sane": 1.0}, free="k", **EXACTLY)
@@ -221,6 +226,8 @@ def records_of_well():
 @pytest.mark.exhaustive
 def test_a_potential_is_learned():
     """By the recipe, with batches: held-back residuals fall, the force is found, and a seed is reproducible."""
+    import optax
+
     *records, one, other = records_of_well()
     start = {"potential": lj.learned.Network(1.0, key=jax.random.key(0))}
     cut = {"window": 1.0, "joined": False, "rtol": 1e-6, "atol": 1e-6}
@@ -243,6 +250,8 @@ def test_a_potential_is_learned():
 @pytest.mark.exhaustive
 def test_inside_of_a_program():
     """Under jit and in lanes, a training gives the same as a single call."""
+    import optax
+
 
     def stiffness(q):
         seen = lj.Record(T, q=q, q0=1.0, v0=0.0, sigma=0.01)
@@ -257,6 +266,8 @@ def test_inside_of_a_program():
 @pytest.mark.exhaustive
 def test_bounds_forgiveness_and_other_solvers():
     """Bounds hold, a Huber loss tolerates outliers; SciPy's least squares ends where the fit does."""
+    import optax
+
     rng = np.random.default_rng(1)
     r = record(3)
     wild = np.where(rng.random(len(T)) < 0.1, 1.0, 0.0)

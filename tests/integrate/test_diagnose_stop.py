@@ -142,9 +142,8 @@ def test_each_cause_is_told_apart(case):
     assert all(re.search(KINDS[kind][1], said) for kind in kinds), said
 
 
-@pytest.mark.parametrize(
-    "backward", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("backward", (False, True))
 def test_the_number_of_steps_is_the_one_that_is_missing(backward):
     """The advised max_steps suffices, and is less than three times what is needed; also backward in time."""
     ts = np.array([0.0, 300.0])

@@ -54,18 +54,6 @@ def test_gradients_in_both_modes():
 
 
 @pytest.mark.exhaustive
-def test_second_derivative_forward():
-    """Forward over forward agrees with a central difference of first derivatives."""
-    final = lambda k: lj.integrate(
-        pendulum, 1.0, 0.0, {"g": k, "l": 1.25}, ts=np.array([0.0, 0.5]), rtol=1e-11, atol=1e-11
-    ).q[-1]
-    slope = jax.jit(jax.jacfwd(final))
-    second = jax.jacfwd(jax.jacfwd(final))(9.8125)
-    step = 1e-3
-    np.testing.assert_allclose(second, (slope(9.8125 + step) - slope(9.8125 - step)) / (2 * step), rtol=1e-5)
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
 )

@@ -1,14 +1,14 @@
 """Settings of a motion: a pytree whose numbers are arrays; and the patience with its steps."""
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from lagjax.integrate.settings import PATIENCE, Settings, patient
 
 BASIC = Settings(
-    method=None, controller=None, event=None, adjoint=None, rtol=jnp.full(2, 1e-9), atol=jnp.full(2, 1e-12), dt0=None,
-    max_step=jnp.asarray(jnp.inf), jump_ts=None, shares=jnp.ones(2), repeated_up_to=jnp.asarray(20_000), by_size=True,
+    method=None, controller=None, event=None, adjoint=None, rtol=np.full(2, 1e-9), atol=np.full(2, 1e-12), dt0=None,
+    max_step=np.asarray(np.inf), jump_ts=None, shares=np.ones(2), repeated_up_to=np.asarray(20_000), by_size=True,
     apart=False, max_steps=4096, drift="project", progress=None,
 )  # fmt: skip
 

@@ -237,7 +237,7 @@ def check_products(sizes):
 
 def test_products_of_many_multiplications():
     """Around 4,096 multiplications, where XLA may take a sum for a library product, which must not occur."""
-    check_products([16, 63, 64, 65])
+    check_products([64, 65])
 
 
 @pytest.mark.exhaustive

@@ -8,6 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.jaxtools.linearity import is_linear
 from tests.jaxtools.in_numpy import evaluated
+from tests.tiers import exhaustive_but
 
 E, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -85,7 +86,9 @@ def test_what_jax_traces():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["a jitted helper", "cross", "where between two", "vjp", "while_loop"])
+@pytest.mark.parametrize(
+    "name", exhaustive_but(["while_loop"], ["a jitted helper", "cross", "where between two", "vjp", "while_loop"])
+)
 def test_a_block_on_a_floor(name):
     """Friction however it is written: a = -3 and x(0.5) = 0.625, a slope of -g by the coefficient; abs is refused."""
     kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * q[2]

@@ -10,6 +10,7 @@ import pytest
 from lagjax.integrate.integrate import integrate
 from lagjax.mechanics.accelerations import accelerations
 from lagjax.scenes import rolling_hoop as hoop
+from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
 from tests.tiers import exhaustive_but
 
@@ -62,12 +63,6 @@ def single_evaluations():
     return got
 
 
-def rolled(params, ts, theta=1.25, theta_rate=0.0):
-    """The hoop held to the cylinder, at the tolerance of the tests."""
-    q, v = hoop.start(params, theta, theta_rate)
-    return integrate(hoop.system, q, v, params, ts=ts, rtol=1e-10, atol=1e-10)
-
-
 def test_closed_forms_match_the_references():
     """Forces, departures, elliptic motion and flight agree with the references to 1e-12."""
     found = single_evaluations()
@@ -104,55 +99,24 @@ def test_multipliers_from_the_lagrangian():
             assert float(a["theta"]) != pytest.approx(float(hoop.rate(params)) ** 2 * np.cos(theta), rel=1e-3)
 
 
-@pytest.mark.exhaustive
-def test_motion_and_departure_when_integrated():
-    """θ(0.5), θ̇(0.5) and the time and angle of the departure are right to 1e-9, and outputs after it are NaN."""
-    down, *_ = hoop.runs()
-    tolerance = {"rtol": 1e-10, "atol": 1e-10}
-    got = hoop.roll(PARAMS, 1.25, 0.0, down.ts, **tolerance)
-    assert float(got.q["theta"][2]) == pytest.approx(reference(HOOP_REST + "theta(t=0.5)"), rel=1e-9)
-    assert float(got.v["theta"][2]) == pytest.approx(reference(HOOP_REST + "thetadot(t=0.5)"), rel=1e-9)
-    assert float(got.end.t) == pytest.approx(reference("s2.hoop.tdep.start_theta0=1.25"), rel=1e-9)
-    angle = reference("s2.hoop.depart_angle_from_theta0=1.25_rad")
-    assert float(got.end.q["theta"]) == pytest.approx(angle, rel=1e-9)
-    assert float(got.end.q["theta"]) != pytest.approx(np.pi / 6, rel=1e-2)
-    assert abs(float(got.end.multipliers["contact"])) < 1e-12
-    exact = hoop.exact_multipliers(PARAMS, np.asarray(got.q["theta"][:4]), 1.25)
-    assert np.allclose(got.multipliers["contact"][:4], exact.contact, rtol=1e-9, atol=0)
-    assert np.allclose(got.multipliers["rolling"][:4], exact.rolling, rtol=1e-9, atol=0)
-    assert np.isnan(got.q["theta"][4])
-    assert down.error(got) <= 1e-9
-    assert float(got.residual()) <= 1e-12
+def test_flight_is_the_same_lagrangian_without_constraints():
+    """Unconstrained, the parabola is a motion in polar coordinates, and never touches again."""
+    left = by_numpy(hoop.leaving)(PARAMS, TOP)
 
+    def at(t):
+        return hoop.flight_in_polar(hoop.flight(PARAMS, left, t), PARAMS)
 
-@pytest.mark.exhaustive
-def test_departures_of_other_starts():
-    """Near the top, on the left, pushed either way, other inertia: angles and times to 1e-9, none on the top."""
-    starts = {
-        "s2.hoop.tdep.start_pi/2-2^-3": (1.0, TOP - 2.0**-3, 0.0, 1e-10),
-        "s2.sphere.tdep.start_pi/2-2^-3": (0.4, TOP - 2.0**-3, 0.0, 1e-10),
-        "s2.sphere.tdep.start_theta0=1.25": (0.4, 1.25, 0.0, 1e-10),
-        "s2.hoop.tdep.start_theta0=1.25": (1.0, np.pi - 1.25, 0.0, 1e-10),
-        "s2.hoop.tdep.start_pi/2-2^-10": (1.0, TOP - 2.0**-10, 0.0, 1e-12),
-        "s2.sphere.tdep.start_pi/2-2^-10": (0.4, TOP - 2.0**-10, 0.0, 1e-12),
-        # θ represents a tilt of 2^-20 to 1e-10 of itself at best, so the tolerance must be tighter.
-        "s2.hoop.tdep.start_pi/2-2^-20": (1.0, TOP - 2.0**-20, 0.0, 1e-13),
-        "s2.sphere.tdep.start_pi/2-2^-20": (0.4, TOP - 2.0**-20, 0.0, 1e-13),
-        "downhill": (1.0, 1.25, -1.5, 1e-10),
-        "uphill": (1.0, 1.25, 0.75, 1e-10),
-    }
-    times, angles, left, _ = zip(*map(hoop.departure, starts.values()))
-    assert all(left)
-    for (key, (beta, theta0, rate0, _)), t, angle in zip(starts.items(), times, angles):
-        sine = hoop.departure_sine(PARAMS | {"beta": beta}, theta0, rate0)
-        assert np.sin(angle) == pytest.approx(float(sine), rel=1e-9), key
-        assert (angle > TOP) == (theta0 > TOP or rate0 > 0), key
-        if key.startswith("s2"):
-            assert t == pytest.approx(reference(key), rel=1e-9), key
-    assert angles[-2] == pytest.approx(reference("s2.hoop.theta0=1.25,thetadot0=-1.5.depart_rad"), rel=1e-9)
-    # Without the start's own velocity the departure would be another one.
-    assert np.sin(angles[-2]) != pytest.approx(float(hoop.departure_sine(PARAMS, 1.25)), rel=1e-2)
-    assert hoop._top().passed
+    (q, v), (rate, second) = by_numpy(lambda t: jax.jvp(at, (t,), (1.0,)))(0.25)
+    a = equations(hoop.in_flight, 0.0, q, v, PARAMS).a
+    for name in ("r", "theta"):
+        assert [rate[name], second[name]] == pytest.approx([float(v[name]), float(a[name])], rel=1e-12)
+    assert a["phi"] == 0.0 and v["phi"] == left.spin
+    assert q["r"] ** 2 == pytest.approx(reference("s2.parabola.rho^2(0.25)"), rel=1e-13)
+    t, L = np.linspace(0.0, 0.25, 3), PARAMS["R"] + PARAMS["a"]
+    gap, speed, cosine = hoop.flight(PARAMS, left, t), np.hypot(left.vx, left.vy), left.x / L
+    quartic = L**2 + PARAMS["g"] * speed * cosine * t**3 + PARAMS["g"] ** 2 * t**4 / 4
+    assert np.allclose(gap.x**2 + gap.y**2, quartic, rtol=1e-13)
+    assert not np.allclose(hoop.flight(PARAMS, left._replace(vy=-left.vy), t).y[1:], gap.y[1:], rtol=1e-2)
 
 
 @pytest.mark.parametrize("theta, theta_rate", [(1.25, -3.0), (-0.5, 0.0), (3.5, 0.0)])
@@ -160,51 +124,6 @@ def test_a_start_without_contact_is_refused(theta, theta_rate):
     """A negative normal force at the start raises, with its value and what to do."""
     with pytest.raises(ValueError, match="not held by the cylinder.*\n.*in_flight"):
         hoop.roll(PARAMS, theta, theta_rate, np.array([0.0, 1.0]))
-
-
-@pytest.mark.slow
-def test_flight_is_the_same_lagrangian_without_constraints():
-    """Unconstrained, the hoop follows the parabola to 1e-9, never touching again."""
-    _, air, _ = hoop.runs()
-    got = integrate(hoop.in_flight, air.q0, air.v0, PARAMS, ts=air.ts, rtol=1e-10, atol=1e-10)
-    assert air.error(got) <= 1e-9
-    r, theta = float(got.q["r"][-1]), float(got.q["theta"][-1])
-    assert r * np.cos(theta) == pytest.approx(reference("s2.parabola.x(0.25)"), rel=1e-9)
-    assert r * np.sin(theta) == pytest.approx(reference("s2.parabola.y(0.25)"), rel=1e-9)
-    assert r**2 == pytest.approx(reference("s2.parabola.rho^2(0.25)"), rel=1e-9)
-    assert float(got.v["phi"][-1]) == pytest.approx(reference("s2.depart.spin_phidot"), rel=1e-12)
-    t, L = air.ts, PARAMS["R"] + PARAMS["a"]
-    left = hoop.leaving(PARAMS, TOP)
-    gap = hoop.flight(PARAMS, left, t)
-    speed, cosine = np.hypot(left.vx, left.vy), left.x / L
-    quartic = L**2 + PARAMS["g"] * speed * cosine * t**3 + PARAMS["g"] ** 2 * t**4 / 4
-    assert np.allclose(gap.x**2 + gap.y**2, quartic, rtol=1e-13)
-    assert not np.allclose(hoop.flight(PARAMS, left._replace(vy=-left.vy), t).y[1:], gap.y[1:], rtol=1e-2)
-
-
-@pytest.mark.exhaustive
-def test_swings_about_the_bottom():
-    """Twenty swings follow Jacobi's functions, with residuals below 1e-12; a disk would not."""
-    *_, run = hoop.runs()
-    got = integrate(hoop.system, run.q0, run.v0, PARAMS, ts=run.ts, rtol=1e-10, atol=1e-10)
-    assert run.error(got) <= run.required
-    assert float(got.residual()) <= 1e-12
-    assert float(got.drift()) <= 1e-9
-    other = hoop.exact_motion(PARAMS | {"beta": 0.5}, hoop.BOTTOM + 1.0, run.ts)[0]["theta"]
-    assert np.max(np.abs(other - got.q["theta"])) > 0.1
-
-
-@pytest.mark.exhaustive
-def test_a_thousand_swings_stay_on_the_constraints():
-    """1,000 natural periods: residuals stay below 1e-12; errors of phase and energy only accumulate."""
-    theta0 = hoop.BOTTOM + 1.0
-    ts = np.linspace(0.0, 1000 * hoop.period(PARAMS, theta0), 201)
-    got = rolled(PARAMS, ts, theta0)
-    assert float(got.residual()) <= 1e-12
-    assert float(got.drift()) <= 1e-6
-    exact, _ = hoop.exact_motion(PARAMS, theta0, ts)
-    assert np.max(np.abs(got.q["theta"] - exact["theta"])) <= 1e-5
-    assert np.allclose(got.q["phi"], exact["phi"], rtol=0, atol=1e-4)
 
 
 def exact_final(params):
@@ -222,7 +141,8 @@ def test_gradients(mode):
     ts = np.array([0.0, 0.5])
 
     def final(params):
-        got = rolled(params, ts)
+        start = hoop.start(params, 1.25, 0.0)
+        got = integrate(hoop.system, *start, params, ts=ts, rtol=1e-10, atol=1e-10)
         return jnp.stack([got.q["theta"][-1], got.multipliers["contact"][-1]])
 
     params = jax.tree.map(jnp.asarray, PARAMS)

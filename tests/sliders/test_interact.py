@@ -8,6 +8,7 @@ import re
 import threading
 from base64 import b64decode
 from collections.abc import Sized
+from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,9 @@ import lagjax as lj
 from lagjax.sliders.interact import Values, controls_of, start_of, words
 from tests.counting import compiles
 
-pytest.importorskip("ipywidgets", reason='sliders need ipywidgets. Fix: pip install "lagjax[interact]"')
+pytestmark = pytest.mark.skipif(
+    find_spec("ipywidgets") is None, reason='sliders need ipywidgets. Fix: pip install "lagjax[interact]"'
+)
 
 TS = np.linspace(0.0, 3.0, 31)
 SWING = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))

@@ -6,8 +6,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from matplotlib import rcParams
-from PIL import Image
 
 from lagjax.sliders.picture import FINE, MOST_PANELS, MOST_POINTS, Picture
 from lagjax.sweep.web_page import drawn
@@ -29,6 +27,8 @@ def of(amplitude, words="", picture=None, **more):
 
 def pixels_of(png):
     """The colours of a PNG (rows, columns, 3)."""
+    from PIL import Image
+
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), int)
 
 
@@ -73,6 +73,8 @@ def test_axes_of_the_svg(bbox, monkeypatch):
 
     So they do when the user's figures are saved without margins.
     """
+    from matplotlib import rcParams
+
     monkeypatch.setitem(rcParams, "savefig.bbox", bbox)
     picture = Picture()
     written = picture.of_curves(drawn({"t": T[None], "<b>x": T[None]}), "a < b & 5 $")

@@ -5,8 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import zarr
-from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from lagjax.sweep.chunks import Spec, chunk_file, nothing, read_chunk, write_chunk
 from tests.sweep.small_stores import flip_bit
@@ -16,6 +14,9 @@ from tests.sweep.small_stores import flip_bit
 @pytest.mark.parametrize("compressed", [True, False])
 def test_zarr_would_write_the_same(tmp_path, dtype, compressed):
     """Metadata and files are those that zarr writes, in meaning; zarr reads them, and detects a flipped bit."""
+    import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
     x = np.arange(15).reshape(5, 3).astype(dtype)
     spec = Spec((5, 3), (2, 3), x.dtype, nothing(x.dtype), ["a", "b"], compressed)
     codecs = [ZstdCodec(level=0)] * compressed + [Crc32cCodec()]

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import zarr
 
 import lagjax as lj
 from lagjax.sweep import metadata
@@ -40,6 +39,8 @@ def test_other_versions(store):
 
 def test_only_what_is_missing(tmp_path):
     """Unmarked blocks are computed again, whatever values they contain."""
+    import zarr
+
     path, whole = tmp_path / "sweep", swept_points(worker.quick)
     swept_points(worker.quick, path)
     store = Store(path)

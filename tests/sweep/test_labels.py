@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import xarray
 
 import lagjax as lj
 from tests.sweep.small_stores import AXES, run, swept
@@ -37,6 +36,8 @@ def test_paired_and_labelled():
 
 def test_axes_with_names_that_are_taken(tmp_path):
     """A value named like a dimension, axes named like a status, and axis names that a store cannot keep."""
+    import xarray
+
     axes = {"steps": np.arange(3.0), "y_0": np.arange(2.0)}
     of = lambda point: {"y": point["y_0"] * jnp.ones(4), "result": point["steps"]}
     data = swept_in_blocks(tmp_path / "store", of, axes).to_xarray()

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import xarray
 
 import lagjax as lj
 
@@ -134,6 +133,8 @@ def test_the_system_given_again(store):
 @pytest.mark.slow
 def test_labelled_with_the_axes_in_front(store):
     """Labels equal those xarray reads from the store, and those of each trajectory."""
+    import xarray
+
     data, opened = xarray.open_zarr(store).load(), lj.open_sweep(store, classes=[Pair])
     assert data["motion.q.x"].dims == ("k", "x", "motion.t") and np.array_equal(data["motion.t"], TS)
     np.testing.assert_allclose(data["motion.q.x"], EXACT, atol=1e-8)
@@ -152,6 +153,8 @@ def test_times_of_their_own(tmp_path):
 
     An axis named like the times keeps its name.
     """
+    import xarray
+
     of = lambda point: swing({"k": point["t"], "x": 1.0}, ts=TS * point["t"])
     axes = {"t": AXES["k"]}
     swept = quiet(of, axes, store=tmp_path / "own")
@@ -166,6 +169,8 @@ def test_times_of_their_own(tmp_path):
 @pytest.mark.slow
 def test_part_of_it(store, tmp_path):
     """Points not run are NaN but have times; the others have values."""
+    import xarray
+
     half = quiet(run, store=tmp_path / "store", chunk=1, part=(0, 2))
     data = xarray.open_zarr(tmp_path / "store").load()
     not_run = data["result"].values == -1

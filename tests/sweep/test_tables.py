@@ -7,9 +7,7 @@ import warnings
 
 import jax.numpy as jnp
 import numpy as np
-import pandas
 import pytest
-import xarray
 
 import lagjax as lj
 from lagjax.sweep.store import Store
@@ -52,6 +50,8 @@ def grid(*names):
 @pytest.mark.parametrize("way", WAYS)
 def test_xarray_opens_a_store_as_it_lies(store, way):
     """Names of the axes, values in closed form, no warning (an error here); equal to `to_xarray`."""
+    import xarray
+
     data = xarray.open_zarr(store, **way).load()
     k, x = grid("k", "x")
     y = k * x * np.ones((1, 1, 2))
@@ -71,6 +71,8 @@ def test_xarray_opens_a_store_as_it_lies(store, way):
 
 def test_half_filled(tmp_path):
     """Points not run are NaN and marked; twin: the others have values, and a complete store has no such points."""
+    import xarray
+
     part = swept(tmp_path / "store", part=(1, 3))
     data = xarray.open_zarr(tmp_path / "store").load()
     meanings = dict(zip(data["result"].attrs["flag_values"], data["result"].attrs["flag_meanings"].split()))
@@ -86,6 +88,8 @@ def test_half_filled(tmp_path):
 
 def test_paired_axes(tmp_path):
     """One dimension, the point, with all axes as its coordinates."""
+    import xarray
+
     swept(tmp_path / "store", paired, PAIRS, paired=True)
     for way in WAYS:
         data = xarray.open_zarr(tmp_path / "store", **way).load()
@@ -109,6 +113,8 @@ def test_blocks_end_with_the_axes(store):
 
 def test_a_short_block_is_mended(store, tmp_path):
     """Only the points of a short block at the end of a row are computed again."""
+    import xarray
+
     copied = shutil.copytree(store, tmp_path / "store")
     file = copied / "y/c/1/1/0"
     file.write_bytes(file.read_bytes()[:9])
@@ -121,6 +127,8 @@ def test_a_short_block_is_mended(store, tmp_path):
 
 def test_other_attributes_are_nobodys_harm(store, tmp_path):
     """Attributes added by a user stay and do not count as damage; nor does consolidating the metadata again."""
+    import xarray
+
     copied = shutil.copytree(store, tmp_path / "store")
     file = copied / "y/zarr.json"
     said = json.loads(file.read_text())
@@ -135,6 +143,8 @@ def test_other_attributes_are_nobodys_harm(store, tmp_path):
 
 def test_pandas():
     """One row per point, bit for bit; one column per number of an array; the result as a category."""
+    import pandas
+
     found = lj.sweep(run, AXES, progress=False)
     table = found.to_pandas()
     assert len(table) == 42 and list(table)[:6] == ["k", "x", "w[0]", "w[1]", "w[2]", "both.a_b[0]"]

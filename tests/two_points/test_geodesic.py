@@ -104,6 +104,7 @@ def test_antipodal_points():
     assert abs(found.length - np.pi * R) < 1e-12 and found.kind == "degenerate: ends are conjugate"
 
 
+@pytest.mark.slow
 def test_coincident_points():
     """Identical points: no length, and no direction."""
     a = np.array([1.0, 2.0])

@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
 import lagjax as lj
+from tests.systems import motion as reference_motion
 
 T, PARAMS = 3.0, {"m": 2.0, "k": 1.5}
 
@@ -145,7 +146,7 @@ def test_a_swing_up_is_held():
 
 def test_questions_that_are_wrong():
     """Controls that are no function, an end's cost without an end, and a control for nothing."""
-    motion = lj.integrate(driven, 1.0, 0.0, PARAMS, ts=np.linspace(0.0, T, 5), estimate_error=False)
+    motion = reference_motion("driven")
     with pytest.raises(TypeError, match="about a trajectory controls are a function of time, not dict"):
         lj.lqr(mass, {"push": 0.0}, motion, squares, PARAMS)
     with pytest.raises(ValueError, match="end_cost belongs to a trajectory"):

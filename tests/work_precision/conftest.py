@@ -10,9 +10,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.work_precision.programs import ComparedMotion
-from tests.systems import PARAMS, motion, pendulum
+from tests.systems import motion
 from tests.work_precision.test_work_precision import compared, swing
-
 
 MODULES = [import_module(f"lagjax.work_precision.{name}") for name in ("work_precision", "references")]
 

@@ -1,7 +1,6 @@
 """Comparisons in pandas and xarray: the same numbers, and unknown ones marked as such."""
 
 import numpy as np
-import pandas
 import pytest
 
 import lagjax as lj
@@ -22,6 +21,8 @@ found = lj.WorkPrecision({"A": Curve("A", None, 2.5, ALL), "B": Curve("B", None,
 
 def test_pandas():
     """One row per point, bit for bit; unknown numbers are not zero."""
+    import pandas
+
     table = found.to_pandas()
     assert len(table) == 4 and table["method"].tolist() == ["A", "A", "A", "B"]
     for name in ("tolerance", "error", "seconds", "least", "trusted", "result"):

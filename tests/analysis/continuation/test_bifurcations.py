@@ -51,7 +51,7 @@ def test_flutter_of_a_column():
     assert flutter_load(ZIEGLER) > 1.3 * damped_flutter_load(ZIEGLER)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_several_zeros_together():
     """A rotating spherical pendulum: at ω² = g/l its stiffness vanishes in all directions, but it stays stable."""
     params = {"omega": 0.2, "g": 4.0}
@@ -61,7 +61,7 @@ def test_several_zeros_together():
     check(critical, lambda p: jnp.sqrt(p["g"]), params, "omega")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rolling_disk():
     """Rolling straight ahead it is stable above √(g/(3 r)): one of many zero roots grows; no branch crosses."""
     velocity = {name: 8.0 * rate for name, rate in straight_on(UPRIGHT_DISK, DISK).items()}

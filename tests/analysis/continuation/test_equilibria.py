@@ -118,7 +118,7 @@ def test_column():
     assert lj.continue_equilibria(column, COLUMN, np.zeros(2), along="P", to=6.0, crossings=False).status != ""
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_cross_rails():
     """ω² = k/m: a line of equilibria; ω² = K/m: the equilibrium goes to infinity, from both sides."""
     params = cross_rails.PARAMS

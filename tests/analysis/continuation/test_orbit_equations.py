@@ -6,7 +6,8 @@ import pytest
 from scipy import integrate
 
 import lagjax as lj
-from tests.analysis.continuation.test_orbits import UNIT, swinging
+from tests.analysis.closed_forms import swinging
+from tests.analysis.continuation.test_orbits import UNIT
 from tests.systems import rod_pendulum
 
 
@@ -18,7 +19,7 @@ def test_pendulum_on_a_rod(along, to):
     orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
     branch = lj.continue_orbits(orbit, along=along, to=to)
     energy, length = (branch.parameter, 1.0) if along == "energy" else (-np.cos(1.0), branch.parameter)
-    np.testing.assert_allclose(branch.period, swinging(np.arccos(-energy / length), length), rtol=1e-10)
+    np.testing.assert_allclose(branch.period, swinging(np.arccos(-energy / length), UNIT | {"l": length}), rtol=1e-10)
     np.testing.assert_allclose(np.hypot(branch.q["x"], branch.q["y"]), length, rtol=1e-12)
     assert branch.status == "the end of the range" and branch.stable.all()
 
@@ -37,7 +38,7 @@ def test_relative_orbits():
     assert abs(branch.period[0] - np.pi) > 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_combination_resonance():
     """Two oscillators coupled by a drive near the sum of their frequencies: two pairs meet, by SciPy's multipliers."""
 

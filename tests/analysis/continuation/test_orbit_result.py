@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.continuation.test_orbits import DRIVEN, duffing
+from tests.analysis.closed_forms import duffing
+from tests.analysis.continuation.test_orbits import DRIVEN
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_is_drawn_and_refused():
     """Stable parts are solid, unstable dashed, folds are marked; unknown names and an empty range are refused."""
     orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)

@@ -6,14 +6,10 @@ import pytest
 from scipy import integrate, optimize, special
 
 import lagjax as lj
+from tests.analysis import closed_forms as known
 from tests.systems import PARAMS, pendulum
 
 UNIT = {"g": 1.0, "l": 1.0}
-
-
-def swinging(amplitude, length=1.0):
-    """The pendulum's period for g = 1, 4 √l K(sin²(amplitude/2))."""
-    return 4 * np.sqrt(length) * special.ellipk(np.sin(amplitude / 2) ** 2)
 
 
 def after_a_period(rate, period, z):
@@ -42,7 +38,7 @@ def test_pendulum_by_its_amplitude():
     """The period is 4 K(k) √(l/g) at every point; twin: that of small swings is different."""
     orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, UNIT)
     branch = lj.continue_orbits(orbit, along="q", to=3.0)
-    np.testing.assert_allclose(branch.period, swinging(branch.q), rtol=1e-11)
+    np.testing.assert_allclose(branch.period, known.swinging(branch.q, UNIT), rtol=1e-11)
     assert len(branch) > 20 and float(branch.q[-1]) == pytest.approx(3.0, abs=1e-13) and branch.stable.all()
     assert np.max(np.abs(branch.period / (2 * np.pi) - 1)) > 1
     np.testing.assert_allclose(branch.high, branch.q, atol=1e-6)
@@ -58,41 +54,29 @@ def test_pendulum_by_its_amplitude():
     assert by_energy.status.startswith("a period that grows without end, near energy = 1")
     by_period = lj.continue_orbits(orbit, along="period", to=9.0)
     np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
-    np.testing.assert_allclose(by_period.period, swinging(by_period.q), rtol=1e-11)
+    np.testing.assert_allclose(by_period.period, known.swinging(by_period.q, UNIT), rtol=1e-11)
 
 
 # Driven systems.
 
 
-def duffing_lagrangian(t, q, v, p):
-    """A hardening spring with a driving force."""
-    return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
+DRIVEN = known.DUFFING | {"omega": 0.5}
 
 
-duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
-DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 0.5, "c": 0.125}
-
-
-def duffing_rate(omega):
-    """The same equation for SciPy."""
-    b, f, _, c = DRIVEN.values()
-    return lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_resonance_curve():
     """Both folds, every orbit and its stability agree with SciPy's shooting; amplitudes are near harmonic balance.
 
     Twin: a state off by a millionth is not SciPy's orbit, and beyond the folds there is only one orbit.
     """
-    orbit = lj.periodic_orbit(duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
+    orbit = lj.periodic_orbit(known.duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=3.0)
     assert [c.kind for c in branch.critical] == ["fold", "fold"] and branch.status == "the end of the range"
     np.testing.assert_allclose(branch.period * branch.parameter, 2 * np.pi, rtol=1e-12)
     upper, lower = branch.critical
     for i in [*range(5, len(branch), 37), upper.index - 6, lower.index + 6]:
         omega = float(branch.parameter[i])
-        rate, period = duffing_rate(omega), 2 * np.pi / omega
+        rate, period = known.duffing_rate(DRIVEN | {"omega": omega}), 2 * np.pi / omega
         z = np.array([branch.q[i], branch.v[i]])
         exact, found = shot(rate, period, z + 1e-4)
         np.testing.assert_allclose(z, exact, atol=1e-8)
@@ -118,7 +102,7 @@ def test_resonance_curve():
     for fold in branch.critical:
         omega = float(fold.parameter)
         z = np.array([branch.q[fold.index], branch.v[fold.index]])
-        found = np.linalg.eigvals(monodromy(duffing_rate(omega), 2 * np.pi / omega, z))
+        found = np.linalg.eigvals(monodromy(known.duffing_rate(DRIVEN | {"omega": omega}), 2 * np.pi / omega, z))
         assert np.abs(found - 1).min() < 1e-6 and np.abs(found - 1).max() > 0.1
 
 
@@ -150,21 +134,12 @@ def test_tongues_of_a_parametric_pendulum():
 # Cycles of autonomous systems.
 
 
-def oscillator(t, q, v, p):
-    """A unit mass on a unit spring."""
-    return 0.5 * v**2 - 0.5 * q**2
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_van_der_pol_family():
-    """Periods are those in the literature; at μ = 0, where all circles are orbits, the multiplier passes 1.
-
-    Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382; 6.663286859323130 and 7.629874479674862: Andersen & Geer (1982).
-    """
-    system = lj.System(oscillator, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
-    orbit = lj.periodic_orbit(system, (2.0, 0.0), 6.5, {"mu": 1})
+    """Periods are those in the literature; at μ = 0, where all circles are orbits, the multiplier passes 1."""
+    orbit = lj.periodic_orbit(known.van_der_pol, (2.0, 0.0), 6.5, {"mu": 1})
     branch = lj.continue_orbits(orbit, along="mu", to=10.0)
-    np.testing.assert_allclose(branch.period[[0, -1]], [6.663286859323130, 19.07836957], atol=2e-8)
+    np.testing.assert_allclose(branch.period[[0, -1]], [known.VAN_DER_POL[1.0], known.VAN_DER_POL[10.0]], atol=2e-8)
     assert branch.stable.all() and not branch.critical
     back = lj.continue_orbits(orbit, along="mu", to=-1.0)
     (critical,) = back.critical
@@ -174,15 +149,15 @@ def test_van_der_pol_family():
     np.testing.assert_allclose(back.period[-1], back.period[0], rtol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_cycle_that_shrinks_and_one_that_folds():
     """x'' + x = (μ + a² - a⁴) x' on average: it folds at μ = -1/4, and shrinks to rest at μ = 0 (Hopf), or 2 √μ."""
-    small = lj.System(oscillator, force=lambda t, q, v, p: (p["mu"] - q**2) * v)
+    small = lj.System(known.spring_lagrangian, force=lambda t, q, v, p: (p["mu"] - q**2) * v)
     branch = lj.continue_orbits(lj.periodic_orbit(small, (1.0, 0.0), 6.5, {"mu": 0.25}), along="mu", to=-0.5)
     assert branch.status == "a state of rest, near mu = 0" and not branch.critical
     # By energy: r' = ε r (μ + 2 r² - r⁴) has circles r² = 1 ± √(1 + μ).
     push = lambda t, q, v, p: 0.01 * (p["mu"] + 2 * (q**2 + v**2) - (q**2 + v**2) ** 2) * v
-    folds = lj.System(oscillator, force=push)
+    folds = lj.System(known.spring_lagrangian, force=push)
     orbit = lj.periodic_orbit(folds, (np.sqrt(2.0), 0.0), 6.3, {"mu": 0.0})
     branch = lj.continue_orbits(orbit, along="mu", to=-2.0)
     (fold,) = branch.critical
@@ -194,12 +169,11 @@ def test_a_cycle_that_shrinks_and_one_that_folds():
     assert not branch.stable[fold.index + 1 :].any() and branch.status.startswith("a state of rest, near mu = ")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_torus_of_a_driven_van_der_pol():
     """With less drive entrainment is lost: a pair passes the unit circle, as SciPy's multipliers do."""
-    lagrangian = lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2 + p["f"] * q * jnp.cos(2 * t)
-    system = lj.System(lagrangian, force=lambda t, q, v, p: 0.5 * (1 - q**2) * v)
-    orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0})
+    lagrangian = lambda t, q, v, p: known.spring_lagrangian(t, q, v, p) + p["f"] * q * jnp.cos(2 * t)
+    orbit = lj.periodic_orbit(lj.System(lagrangian, force=known.van_der_pol.force), (-2.0, 0.0), np.pi, {"f": 6.0, "mu": 0.5})
     branch = lj.continue_orbits(orbit, along="f", to=0.5)
     (torus,) = branch.critical
     assert torus.kind == "torus" and branch.stable[0] and not branch.stable[-1]

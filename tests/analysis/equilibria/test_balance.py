@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.equilibria.balance import shortest_multipliers
+from lagjax.analysis.equilibria.balance import Steady, SteadySymmetries, balance, departures, shortest_multipliers
+from lagjax.analysis.equilibria.result import Equilibria, merged
 from lagjax.scenes import cross_rails
+from lagjax.system.model import model_of
 from tests.analysis.steady_systems import DISK, UPRIGHT_DISK, disk, straight_on
+from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+from tests.tiers import exhaustive_but
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", exhaustive_but((1,), (1, 2)))
 def test_multiplier_and_redundant_rods(times):
     """2 y λ = g, shared by redundant rods as multipliers of least norm; twin: λ has the other sign above."""
     again = lj.Holonomic(lambda t, q, params: 2 * rod(t, q, params))
@@ -97,3 +102,35 @@ def test_roots_are_those_of_the_linearisation():
         assert mine.size == theirs.size > 0
         off = np.abs(mine[:, None] - theirs[None, :])
         assert max(off.min(axis=0).max(), off.min(axis=1).max()) < 1e-12 * largest
+
+
+def test_balance_and_departures_on_a_rod():
+    """r = M a - F - Aᵀ λ = 0 and g = 0 where 2 y λ = g; K is -2 λ, M is one. Twin: λ of the other sign."""
+    l, g = PARAMS["l"], PARAMS["g"]
+    steady = Steady(model_of(rod_pendulum, 0.0, {"x": 0.0, "y": -l}, {"x": 0.0, "y": 0.0}, PARAMS), np.array(0.0),
+                    np.zeros(0), np.array([0.0, -l]), SteadySymmetries())  # fmt: skip
+    at = by_numpy(lambda y: balance(steady, y))
+    for side in (-1, 1):
+        y = np.array([0.0, side * l, side * g / (2 * l)])
+        np.testing.assert_allclose(at(y), 0.0, atol=1e-14)
+        np.testing.assert_allclose(at(y * [1, 1, -1]), [0.0, 2 * g, 0.0], atol=1e-14)
+        jacobian = by_numpy(jax.jacfwd(lambda y: balance(steady, y)))(y)
+        found = by_numpy(lambda y, jacobian: departures(steady, y, jacobian))(y, jacobian)
+        np.testing.assert_allclose(found.stiffness, -2 * y[2] * np.eye(2), atol=1e-14)
+        np.testing.assert_allclose(found.mass, np.eye(2))
+        np.testing.assert_allclose([found.rows[0], found.pushes[0]], [[0.0, 2 * side * l]] * 2, atol=1e-14)
+        np.testing.assert_array_equal([*found.damping.ravel(), *found.slopes.ravel()], 0.0)
+
+
+def test_equal_equilibria_are_merged():
+    """Angles a turn apart, with the same roots and verdict, are one equilibrium; twin: lengths are two."""
+    q, of = np.array([0.25, 2 * np.pi + 0.25, 0.25, 0.5]), np.arange(4)
+    found = lambda angle, *radii: merged(Equilibria(**fields), np.array([angle]), np.array(radii))
+    fields = dict.fromkeys(Equilibria.__dataclass_fields__, None) | {"q": q, "v": 0 * q, "multipliers": {}}
+    fields |= {"eigenvalues": np.array([[1j, -1j], [1j, -1j], [2j, -2j], [1j, -1j]]), "symmetries": SteadySymmetries()}
+    fields |= dict.fromkeys(("rates", "momenta", "zero_modes", "soft", "imbalance"), of)
+    fields |= {"stable": of >= 0, "undecided": of < 0, "found": of >= 0}
+    assert found(True, 0, 0, 0, 0).of_start.tolist() == [0, 0, 1, 2] and len(found(True, 0, 0, 0, 0)) == 3
+    assert found(False, 0, 0, 0, 0).of_start.tolist() == [0, 1, 2, 3]
+    # At a multiple root, which is known to within a radius, the roots do not count.
+    assert found(True, 0, 0, 0, 1).of_start.tolist() == [0, 0, 1, 0]

@@ -44,7 +44,7 @@ def crank_state(x, u):
     return {"crank": angle, "x": x}, {"crank": -u / (CRANK["l"] * np.sin(angle)), "x": u}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_massless_crank():
     """θ's equation κ l² sin θ cos θ + λ l sin θ = 0 gives λ = -κ x, so x swings at √((k + κ)/m) and θ follows."""
     q0, v0 = crank_state(0.5, 1.0)
@@ -69,6 +69,7 @@ def test_massless_crank_reaches_its_dead_centre():
         lj.integrate(crank, *crank_state(0.5, speed), CRANK, ts=CRANK_TS, rtol=TIGHT, atol=TIGHT)
 
 
+@pytest.mark.slow
 def test_massless_crank_at_its_dead_centre():
     """At the dead centre the accelerations are refused by name."""
     q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
@@ -76,7 +77,7 @@ def test_massless_crank_at_its_dead_centre():
         lj.accelerations(crank, 0.0, q0, v0, CRANK)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_massless_crank_does_not_start_at_its_dead_centre():
     """A motion that starts at the dead centre is refused by name."""
     q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
@@ -84,13 +85,14 @@ def test_massless_crank_does_not_start_at_its_dead_centre():
         lj.integrate(crank, q0, v0, CRANK, ts=CRANK_TS, rtol=TIGHT, atol=TIGHT)
 
 
+@pytest.mark.slow
 def test_massless_crank_without_its_rod():
     """Without the constraint nothing replaces the missing mass: the accelerations are refused by name."""
     with refused_in(ValueError, "crank"):
         lj.accelerations(lj.System(crank_lagrangian), 0.0, *crank_state(0.5, 1.0), CRANK)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_massless_crank_without_its_rod_does_not_start():
     """Without its rod the crank is not integrated either."""
     with refused_in(ValueError, "crank"):
@@ -284,6 +286,7 @@ paced = lj.System(proper_time)
 PACED = ({"t": 0.0, "x": 0.0, "y": 0.0}, {"t": 1.25, "x": 0.5, "y": 0.25})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0.0, 0.5])
 def test_accelerations_of_an_arbitrary_parameter_are_refused(k):
     """The parametrisation is not determined, as M is singular along v: the accelerations are refused by name."""
@@ -291,7 +294,7 @@ def test_accelerations_of_an_arbitrary_parameter_are_refused(k):
         lj.accelerations(paced, 0.0, *PACED, {"k": k})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_arbitrary_parameter_is_not_integrated():
     """It is not integrated either, with a force (k) or without: the error names a coordinate of the singular M."""
     for k in (0.0, 0.5):
@@ -355,7 +358,7 @@ def test_through_the_pole_or_not_at_all():
         lj.integrate(polar, *polar_state(1e-15, -1.0), ts=np.array([-1.0, -0.25, 0.5, 1.25]), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_past_the_pole_with_fixed_steps_would_show():
     """Twin: fixed steps that are too long for the passage leave the great circle."""
     ts = np.array([-1.0, -0.25, 0.5, 1.25])
@@ -365,7 +368,7 @@ def test_past_the_pole_with_fixed_steps_would_show():
     assert distance_to_great_circle(traj, 0.05) > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_same_great_circle_in_cartesian_coordinates():
     """On |q| = 1 there is no pole: the motion passes through it, position and tension λ = -½ to the tolerance."""
     ts = np.linspace(-1.0, 1.25, 10)

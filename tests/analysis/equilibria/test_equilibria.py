@@ -20,6 +20,7 @@ tilt_of = lambda params: jnp.arccos(params["g"] / (params["a"] * params["omega"]
 # One system at rest.
 
 
+@pytest.mark.slow
 def test_pendulum():
     """Rest is stable below and unstable above; starts a turn apart are merged; twin: with -g it is the reverse."""
     found = lj.equilibria(pendulum, PARAMS, starts=[0.3, 3.0, -3.0, 2 * np.pi + 0.2])
@@ -33,7 +34,7 @@ def test_pendulum():
     assert upward.stable.tolist() == [False, True]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_double_pendulum():
     """Four equilibria from a grid of starts, one stable; those a turn away are merged."""
     starts = np.stack(np.meshgrid(*[np.linspace(-3.5, 3.5, 6)] * 2), axis=-1).reshape(-1, 2)
@@ -61,7 +62,7 @@ def test_bead_and_its_derivatives():
     assert jax.grad(bottom)(0.75) == 0.0 != jax.grad(at)(0.75)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_whole_numbers_and_one_start():
     """Integers work like floats; a single state is one start."""
     found = lj.equilibria(pendulum, {"g": 10, "l": 2}, starts=[3])
@@ -70,7 +71,7 @@ def test_whole_numbers_and_one_start():
     assert len(one) == 1 and bool(one.stable[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stability_by_the_critical_speed():
     """1,000 beads at the bottom: stable exactly where ω² < g/a."""
     rng = np.random.default_rng(0)
@@ -104,7 +105,7 @@ def test_cross_rails():
     assert "1 start led to none" in repr(none)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_driven_hoop():
     """Its angle turns at the motor's rate ω, given or found from the constraint; twin: at rest it does not last."""
     start = {"psi": 1.0, "theta": 0.0}
@@ -120,7 +121,7 @@ def test_the_driven_hoop():
     assert len(resting) == 0 and resting.status.tolist() == [NOT_LASTING]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_conical_pendulum():
     """Along a symmetry given as a function: cos θ = g/(Ω² l), λ = -½ Ω²; also with the momentum Ω l² sin²θ held."""
     params, omega = {"g": 9.0, "l": 1.25}, 4.0

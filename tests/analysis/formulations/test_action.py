@@ -31,7 +31,7 @@ def test_the_action_is_stationary_on_motions():
     np.testing.assert_allclose(jax.grad(lambda q1: off(0.0, q1))(1.0), w / np.tan(w * end), rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_action_of_a_trajectory():
     """The action from outputs, with ends between them and backward; twin: the part differs from the whole."""
     system, params, w = lj.System(swinging), {"k": 4.0}, 2.0
@@ -73,7 +73,7 @@ def test_the_action_does_not_depend_on_the_outputs():
     assert abs(many - action) < 0.02 * abs(few - action)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_action_in_a_program():
     """The action of a motion with two outputs and its derivative, in lanes; twin: the chord between them is far off."""
     system, ts = lj.System(swinging), np.array([0.0, 10.0])

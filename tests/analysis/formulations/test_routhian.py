@@ -65,7 +65,7 @@ def test_a_routhian_moves_as_the_whole():
     np.testing.assert_allclose(alone.q[:, 0], whole.q[:, 1], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_routhian_with_forces_on_what_is_left():
     """A top with a force on its tilt that contains a cyclic velocity, and friction; twins: without either."""
     push = lambda t, q, v, p: {"phi": 0.0 * t, "psi": 0.0 * t, "theta": p["f"] * jnp.cos(t) * v["phi"]}

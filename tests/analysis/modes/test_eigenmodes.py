@@ -11,7 +11,7 @@ from tests.analysis import small_systems as small
 from tests.analysis.modes.test_normal_modes import STILL
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_symmetries_are_told_from_critical_points():
     """A molecule free to move and turn in the plane is stable; so is q⁴, and twin: -q⁴ is not."""
 
@@ -29,7 +29,7 @@ def test_symmetries_are_told_from_critical_points():
     assert hill.verdict == "divergence" and "first term that does not vanish" in repr(hill)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_damping_what_gyroscopic_forces_hold():
     """A little damping makes the mode of negative energy grow, and the other one decay."""
     damped = lj.System(

@@ -14,7 +14,6 @@ from tests.analysis import small_systems as small
 from tests.analysis.modes.test_normal_modes import EQUAL
 from tests.systems import rod_pendulum
 
-
 FREE = lj.System(lambda t, q, v, params: 0.5 * v**2)
 
 

@@ -28,7 +28,10 @@ SQUARED = BEAD["g"] / BEAD["a"]
 BELOW, ABOVE = np.array([0.5, 2.0, 2.7]), np.array([2.9, 4.0, 9.0])
 ALPHA = np.arccos(SQUARED / ABOVE**2)
 # At the bottom below the critical speed and on the side above it; and where there is no steady motion.
-POINTS = np.array([*((0.0, x) for x in BELOW), *zip(ALPHA, ABOVE), (0.5, 1.0), (np.nan, 1.0), (0.0, np.nan)])
+POINTS = np.array([
+    *((0.0, x) for x in BELOW), *zip(ALPHA, ABOVE), (0.0, 3.0), (np.pi, 2.0), (0.5, 1.0), (np.nan, 1.0), (0.0, np.nan)
+])  # fmt: skip
+VERDICTS = ["stable"] * 6 + ["divergence"] * 2 + ["no steady motion"] * 3
 
 
 @cache
@@ -55,29 +58,22 @@ def test_the_bead():
     assert np.min(np.abs(got[3:6] / np.sqrt(ABOVE**2 - SQUARED) - 1)) > 1e-3
 
 
-def test_programs_never_hold_nan():
-    """In a program, states off equilibrium and NaN inputs give codes and residuals, never NaN."""
+def test_verdicts_in_a_program():
+    """Stable below the critical speed and beside, else divergent; off equilibrium and of NaN codes, and never NaN."""
     _, modes = beads()
     assert all(np.isfinite(x).all() for x in (modes.roots, modes.shapes, modes.code))
-    assert [lj.NormalModes.VERDICTS[code] for code in modes.code] == ["stable"] * 6 + ["no steady motion"] * 3
-    assert np.all(modes.linearisation.residual[:6] < 1e-12) and modes.linearisation.residual[6] > 0.1
-    assert modes.stable.tolist() == [True] * 6 + [False] * 3
+    assert [lj.NormalModes.VERDICTS[code] for code in modes.code] == VERDICTS
+    assert np.all(modes.linearisation.residual[:8] < 1e-12) and modes.linearisation.residual[8] > 0.1
+    assert modes.stable.tolist() == [verdict == "stable" for verdict in VERDICTS]
 
 
-def test_verdicts_of_the_bead():
-    """Stable or divergent at the bottom and the top, below and above the critical speed; at it θ⁴ decides."""
-    says = lambda at, omega: lj.normal_modes(small.bead, 0.0, at, 0.0, BEAD | {"omega": omega}).verdict
-    assert [says(0.0, 2.0), says(0.0, 3.0), says(np.pi, 2.0)] == ["stable", "divergence", "divergence"]
+@pytest.mark.slow
+def test_the_bead_at_its_critical_speed():
+    """There θ⁴ decides."""
     exactly = BEAD | {"a": 1.0, "g": 4.0, "omega": 2.0}
     modes = lj.normal_modes(small.bead, 0.0, 0.0, 0.0, exactly)
     assert modes.verdict == "stable" and bool(modes.zero[0]) and bool(modes.stable)
     assert np.isfinite(modes.roots).all()
-    with pytest.raises(IndexError, match="there are 1 modes"):
-        modes[1]
-    with pytest.raises(ValueError, match="not an equilibrium: 'q' accelerates by"):
-        lj.linearise(small.bead, 0.0, 0.3, 0.0, BEAD)
-    with pytest.raises(TypeError, match="bool"):
-        lj.linearise(small.bead, 0.0, True, 0, BEAD)
 
 
 # Many degrees of freedom.
@@ -121,10 +117,16 @@ def test_cross_rails():
     above = rails(cross_rails.PARAMS | {"omega": 8.0})
     assert list(above.energy) == [-1, 1] and bool(above.stable)
     check_shapes(above)
+    with pytest.raises(IndexError, match="there are 2 modes"):
+        above[2]
+    with pytest.raises(ValueError, match="not an equilibrium: 'R' accelerates by"):
+        lj.linearise(cross_rails.rotating_system, 0.0, {"R": 1.0, "r": 0.0}, {"R": 0.0, "r": 0.0}, cross_rails.PARAMS)
+    with pytest.raises(TypeError, match="bool"):
+        lj.linearise(small.bead, 0.0, True, 0, BEAD)
 
 
 def check_shapes(modes):
-    """Each mode solves M s² + (G + D) s + K + N = 0, the largest entry of its shape is one; twin: without G it does not."""
+    """Each mode solves M s² + (G + D) s + K + N = 0, and the largest entry of its shape is one; twin: without G."""
     of, twin = modes.linearisation, []
     position = np.asarray(of.stiffness) + np.asarray(of.circulatory)
     for root, shape in zip(modes.roots, np.stack(list(modes.shapes.values()), axis=1)):

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, special
+from scipy import integrate, linalg, special
 
 import lagjax as lj
-from tests.systems import PARAMS, pendulum
+from tests.analysis.closed_forms import VAN_DER_POL, van_der_pol
+from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum
 
 
 def mathieu_lagrangian(t, q, v, p):
@@ -79,71 +80,42 @@ def kapitza_lagrangian(t, q, v, p):
     return 0.5 * speed @ speed - p["g"] * place[1]
 
 
-kapitza = lj.System(kapitza_lagrangian)
-
-
-def free_lagrangian(t, q, v, p):
-    """A unit mass in a vertical plane."""
-    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"]
-
-
 def moving_rod(t, q, p):
     """The rod from the moving pivot."""
     return q["x"] ** 2 + (q["y"] - p["A"] * jnp.cos(p["Omega"] * t)) ** 2 - p["l"] ** 2
 
 
-kapitza_rod = lj.System(free_lagrangian, {"rod": lj.Holonomic(moving_rod)})
 SHAKEN = {"g": 9.8125, "l": 0.25, "A": 0.025}
+ON_A_ROD = {"x": 0.0, "y": SHAKEN["A"] + SHAKEN["l"]}, {"x": 0.0, "y": 0.0}
+UPRIGHT = [
+    (lj.System(kapitza_lagrangian), (0.0, 0.0)),
+    (lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(moving_rod)}), ON_A_ROD),
+]
 
 
-def upright(Omega, system=kapitza):
-    """The pendulum at rest on its moving pivot, upright."""
-    params = {**SHAKEN, "Omega": Omega}
-    start = (0.0, 0.0)
-    if system is kapitza_rod:
-        start = {"x": 0.0, "y": SHAKEN["A"] + SHAKEN["l"]}, {"x": 0.0, "y": 0.0}
-    return lj.floquet(system, 0.0, *start, params, 2 * jnp.pi / Omega)
-
-
-@pytest.mark.slow
-def test_kapitza():
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("system, start", UPRIGHT, ids=["angle", "rod"])
+def test_kapitza(system, start):
     """Upright it is stable exactly where a > a_0(q), a = -4g/(lΩ²), q = 2A/l, near A²Ω² = 2gl; twin: not just below."""
     edge = np.sqrt(-4 * SHAKEN["g"] / SHAKEN["l"] / special.mathieu_a(0, 2 * SHAKEN["A"] / SHAKEN["l"]))
-    found = jax.jit(jax.vmap(upright))(edge * np.array([1 - 1e-7, 1 + 1e-7]))
+    at = lambda Omega: lj.floquet(system, 0.0, *start, SHAKEN | {"Omega": Omega}, 2 * jnp.pi / Omega)
+    found = jax.jit(jax.vmap(at))(edge * np.array([1 - 1e-6, 1 + 1e-6]))
     assert list(found.stable) == [False, True]
     # The boundary is near the limit of fast drives from the averaged equations.
     assert abs((SHAKEN["A"] * edge) ** 2 / (2 * SHAKEN["g"] * SHAKEN["l"]) - 1) < 0.01
 
 
 @pytest.mark.exhaustive
-def test_kapitza_on_a_moving_constraint():
-    """In Cartesian coordinates, on a rod with a moving pivot, the two multipliers are the same."""
-    for Omega in (60.0, 100.0):
-        rod, angle = upright(Omega, kapitza_rod), upright(Omega)
-        np.testing.assert_allclose(np.sort_complex(rod.multipliers), np.sort_complex(angle.multipliers), rtol=1e-7)
-        assert bool(rod.stable) == (Omega == 100.0)
-
-
-def van_der_pol_lagrangian(t, q, v, p):
-    """A unit mass on a unit spring."""
-    return 0.5 * v**2 - 0.5 * q**2
-
-
-van_der_pol = lj.System(van_der_pol_lagrangian, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
-# To 16 digits in Andersen & Geer, SIAM J. Appl. Math. 42 (1982) 678; and Amore et al., 2018.
-PERIOD_AT_1 = 6.663286859323130
-
-
 def test_van_der_pol():
     """The cycle attracts; the multiplier is e^∮μ(1-q²)dt by SciPy; twin: under the other sign of μ it repels."""
     orbit = lj.periodic_orbit(van_der_pol, (2.0, 0.0), 6.5, {"mu": 1.0})
     found = lj.floquet(van_der_pol, 0.0, orbit.q, orbit.v, {"mu": 1.0}, orbit.period)
-    np.testing.assert_allclose(orbit.period, PERIOD_AT_1, rtol=1e-12)
+    np.testing.assert_allclose(orbit.period, VAN_DER_POL[1.0], rtol=1e-12)
 
     def rate(t, y):
         return [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]
 
-    end = integrate.solve_ivp(rate, [0, PERIOD_AT_1], [orbit.q, orbit.v, 0.0], rtol=1e-12, atol=1e-13).y[2, -1]
+    end = integrate.solve_ivp(rate, [0, VAN_DER_POL[1.0]], [orbit.q, orbit.v, 0.0], rtol=1e-12, atol=1e-13).y[2, -1]
     assert found.trivial.tolist() == [True, False] and bool(found.attracts)
     np.testing.assert_allclose(found.multipliers[1], np.exp(end), rtol=1e-8)
     np.testing.assert_allclose(found.product, found.liouville, rtol=1e-7)
@@ -165,26 +137,7 @@ def test_derivatives():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(largest))(1.0), exact, rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_sweep_of_stability():
-    """A map of the tongues by `lj.sweep`: at each point the verdict is that of Mathieu's characteristic values."""
-
-    def run(point):
-        found = lj.floquet(mathieu, 0.0, 0.0, 0.0, point, jnp.pi)
-        return {"stable": found.stable, "growth": jnp.max(found.exponents.real)}
-
-    a, q = np.linspace(-1.0, 9.0, 41), np.linspace(0.05, 4.0, 21)
-    swept = lj.sweep(run, {"a": jnp.asarray(a), "q": jnp.asarray(q)}, progress=False)
-    stable = np.asarray(swept.values["stable"])
-    edges = [lambda q: special.mathieu_a(0, q)]
-    for order in range(1, 5):
-        edges += [lambda q, n=order: special.mathieu_b(n, q), lambda q, n=order: special.mathieu_a(n, q)]
-    above = sum((a[:, None] > np.array([edge(x) for x in q])[None]).astype(int) for edge in edges)
-    np.testing.assert_array_equal(stable, above % 2 == 1)
-    assert (np.asarray(swept.values["growth"])[~stable] > 0).all() and 0.2 < stable.mean() < 0.9
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_is_printed_and_drawn():
     """The summary has multipliers, verdict, Liouville's product and error; a flip and a pair are named."""
     found = lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)
@@ -194,6 +147,22 @@ def test_what_is_printed_and_drawn():
     assert "1 ± " not in words and "±" in repr(lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": 2.0, "q": 0.25}, jnp.pi))
     lanes = jax.vmap(lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi))(jnp.array([1.0, 2.0]))
     assert "2 lanes, 1 of them stable" in repr(lanes)
+
+
+def test_damped_and_driven():
+    """M is the exponential of the linear system's matrix, and its volume is Liouville's; twin: with half the damping.
+
+    The motion is q = Re(F exp(iωt)), F = pull / (k - m ω² + i c ω).
+    """
+    m, k, c, pull, rate = DRIVEN_PARAMS.values()
+    response, period = pull / (k - m * rate**2 + 1j * c * rate), 2 * np.pi / rate
+    found = lj.floquet(driven, 0.0, response.real, (1j * rate * response).real, DRIVEN_PARAMS, period)
+    exact = lambda c: linalg.expm(period * np.array([[0.0, 1.0], [-k / m, -c / m]]))
+    np.testing.assert_allclose(found.monodromy, exact(c), atol=1e-10)
+    np.testing.assert_allclose([found.product, found.liouville], np.exp(-c / m * period), rtol=1e-9)
+    np.testing.assert_allclose(np.abs(found.multipliers), np.exp(-c / m * period / 2), rtol=1e-9)
+    assert bool(found.attracts) and bool(found.stable) and not found.trivial.any()
+    assert np.max(np.abs(exact(c / 2) - exact(c))) > 0.1
 
 
 def test_refused_in_words():

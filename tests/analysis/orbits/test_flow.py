@@ -7,7 +7,7 @@ import lagjax as lj
 from tests.systems import PARAMS, pendulum, rod_pendulum
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_liouville_with_damping():
     """With and without a rod, R = ½ c v² gives the product e^(-cT) for each freedom; twin: 2R gives its square."""
     c, period = 0.375, 1.25

@@ -1,5 +1,7 @@
 """Lyapunov exponents against closed forms of linear systems, sums from damping, and SciPy for chaos."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,22 +19,41 @@ def hill_lagrangian(t, q, v, p):
     return 0.5 * v @ v + 0.5 * p["k"] @ jnp.stack([q[0] + q[1], q[0] - q[1]]) ** 2 / 2
 
 
+K = np.array([4.0, 0.5])
+hill = lj.System(hill_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v @ v)
+
+
+@cache
+def on_the_hills(c):
+    """The exponents at rest between the hills."""
+    params, ts = {"k": K, "c": c}, np.linspace(0.0, 60.0, 61)
+    return lj.lyapunov_exponents(hill, np.zeros(2), np.zeros(2), params, ts=ts, count=4)
+
+
 @pytest.mark.parametrize("c", [0.0, 0.375])
 def test_linear(c):
     """λ = -c/2 ± √(k + c²/4) for each k; they sum to -c for each freedom, and to zero without damping."""
-    k = np.array([4.0, 0.5])
-    hill = lj.System(hill_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v @ v)
-    start = np.zeros(2), np.zeros(2)
-    found = lj.lyapunov_exponents(hill, *start, {"k": k, "c": c}, ts=np.linspace(0.0, 60.0, 61), count=4)
-    exact = np.sort(np.concatenate([-c / 2 + s * np.sqrt(k + c**2 / 4) for s in (1, -1)]))[::-1]
+    found = jax.tree.map(np.asarray, on_the_hills(c))
+    exact = np.sort(np.concatenate([-c / 2 + s * np.sqrt(K + c**2 / 4) for s in (1, -1)]))[::-1]
     np.testing.assert_allclose(found.exponents, exact, atol=1e-7)
     np.testing.assert_array_less(np.abs(found.exponents - exact), found.uncertainty)
-    np.testing.assert_allclose(jnp.sum(found.exponents), -2 * c, atol=1e-8)
+    np.testing.assert_allclose(np.sum(found.exponents), -2 * c, atol=1e-8)
     np.testing.assert_allclose(found.liouville, -2 * c, atol=1e-9)
     assert bool(found.sensitive)
 
 
-@pytest.mark.slow
+def test_what_is_printed_drawn_and_refused():
+    """Printed: exponents, uncertainty, Liouville's sum; drawn: running means; refused: too few or unsorted times."""
+    found = on_the_hills(0.375)
+    assert "±" in repr(found) and "by Liouville's formula -0.75" in repr(found)
+    assert len(found.plot().axes[0].lines) == 4
+    np.testing.assert_allclose(found.running()[-1], np.sum(np.asarray(found.growth), axis=0) / 60.0, rtol=1e-12)
+    for ts, words in ((np.array([0.0, 100.0]), "at least 24 times"), (np.zeros(30), "must increase")):
+        with pytest.raises(ValueError, match=words):
+            lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=ts)
+
+
+@pytest.mark.exhaustive
 def test_on_a_constraint():
     """Neighbours of an inverted rod pendulum separate as e^(±√(g/l) t), two exponents; hanging, they do not."""
     l, ts = PARAMS["l"], np.linspace(0.0, 10.0, 41)
@@ -45,6 +66,7 @@ def test_on_a_constraint():
         lj.lyapunov_exponents(rod_pendulum, *at(l), PARAMS, ts=ts, count=3)
 
 
+@pytest.mark.slow
 def test_regular():
     """A pendulum's neighbours separate like t: zero within the uncertainty, which shrinks; twin: not within a fifth."""
     run = lambda end: lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, end, 401), count=2)
@@ -89,7 +111,7 @@ def by_scipy(start, times):
     return np.sum(grown[quarter:]) / (times[-1] - times[quarter])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_henon_heiles():
     """The motion is chaotic at E = 1/6 and regular at 1/12; SciPy's exponents agree within the uncertainty."""
     ts = np.linspace(0.0, 1500.0, 751)
@@ -124,14 +146,3 @@ def test_lanes_of_the_driven_duffing():
     assert list(lanes.sensitive) == [False, True] and "neighbours part in 1 of them" in repr(lanes)
     alone = run(0.1)
     np.testing.assert_allclose(lanes.exponents[0], alone.exponents, atol=1e-6)
-
-
-def test_what_is_printed_drawn_and_refused():
-    """Printed: exponents, uncertainty, Liouville's sum; drawn: running means; refused: too few or unsorted times."""
-    found = lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=np.linspace(0.0, 200.0, 401), count=2)
-    assert "±" in repr(found) and "by Liouville's formula 0" in repr(found)
-    assert len(found.plot().axes[0].lines) == 2
-    np.testing.assert_allclose(found.running()[-1], jnp.sum(found.growth, axis=0) / 200.0, rtol=1e-12)
-    for ts, words in ((np.array([0.0, 100.0]), "at least 24 times"), (np.zeros(30), "must increase")):
-        with pytest.raises(ValueError, match=words):
-            lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=ts)

@@ -1,28 +1,21 @@
 """The monodromy matrix on constraints and without, and the multipliers that are one for a known reason."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import special
 
 import lagjax as lj
+from tests.analysis.closed_forms import kepler, slope_of_swinging, swinging
+from tests.analysis.steady_systems import conical
 from tests.systems import PARAMS, pendulum
-
-
-def elliptic(amplitude, params):
-    """The pendulum's period, 4 √(l/g) K(sin²(amplitude/2))."""
-    return 4 * np.sqrt(params["l"] / params["g"]) * special.ellipk(np.sin(amplitude / 2) ** 2)
 
 
 def test_pendulum():
     """M = 1 + (dT/dE) f dEᵀ in closed form, and both multipliers are 1 for a known reason."""
     amplitude = 2.0
-    found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, elliptic(amplitude, PARAMS))
+    found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, swinging(amplitude))
     g_over_l = PARAMS["g"] / PARAMS["l"]
-    m = np.sin(amplitude / 2) ** 2
-    k, e = special.ellipk(m), special.ellipe(m)
-    slope = 4 / np.sqrt(g_over_l) * (e - (1 - m) * k) / (2 * m * (1 - m)) * np.sin(amplitude) / 2
+    slope = slope_of_swinging(amplitude)
     # With v = 0, f = (0, -g/l sin q). A start shifted by dq returns after T + T'dq, so after T it is off by -f T' dq.
     exact = np.array([[1.0, 0.0], [slope * g_over_l * np.sin(amplitude), 1.0]])
     np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
@@ -35,19 +28,12 @@ def test_pendulum():
     assert not rest.trivial.any()
 
 
-def kepler_lagrangian(t, q, v, p):
-    """A unit mass attracted by -μ/r."""
-    return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
-
-
 @pytest.mark.exhaustive
 def test_kepler():
     """All four multipliers are 1, two of them for known reasons, the others to 1e-5; and M is not the identity."""
     mu, speed = 1.25, 1.25
     period = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
-    found = lj.floquet(
-        lj.System(kepler_lagrangian), 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, speed]), {"mu": mu}, period
-    )
+    found = lj.floquet(kepler, 0.0, np.array([1.0, 0.0]), np.array([0.0, speed]), {"mu": mu}, period)
     np.testing.assert_allclose(found.multipliers, 1.0, atol=1e-5)
     assert found.trivial.sum() == 2 and bool(found.stable)
     # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
@@ -55,24 +41,19 @@ def test_kepler():
     assert np.abs(found.monodromy - np.eye(4)).max() > 1
 
 
-def on_a_sphere(t, q, v, p):
-    """A unit mass under gravity in three dimensions."""
-    return 0.5 * v @ v - p["g"] * q[2]
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_conical_pendulum():
     """Circling at an angle θ it swings about that √(1 + 3 cos² θ) times in a turn, with a constraint given twice.
 
     Landau & Lifshitz, *Mechanics*, §14, problem 1: by the effective potential. The rotation is a symmetry that the
     coordinates do not show, and here it is the motion itself.
     """
-    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
-    again = lj.Holonomic(lambda t, q, p: 1.0 - q @ q / p["l"] ** 2)
+    again = lj.Holonomic(lambda t, q, p: 1.0 - q["r"] @ q["r"] / p["l"] ** 2)
     theta, g, l = 1.0, 9.8125, 1.25
     rate = np.sqrt(g / (l * np.cos(theta)))
-    start = l * np.array([np.sin(theta), 0.0, -np.cos(theta)]), rate * l * np.array([0.0, np.sin(theta), 0.0])
-    system = lj.System(on_a_sphere, {"rod": rod, "again": again})
+    place, speed = np.array([np.sin(theta), 0.0, -np.cos(theta)]), np.array([0.0, np.sin(theta), 0.0])
+    start = {"r": l * place}, {"r": rate * l * speed}
+    system = lj.System(conical.lagrangian, {"rod": conical.constraints["rod"], "again": again})
     found = lj.floquet(system, 0.0, *start, {"g": g, "l": l}, 2 * np.pi / rate)
     phase = 2 * np.pi * np.sqrt(1 + 3 * np.cos(theta) ** 2)
     assert found.multipliers.shape == (4,) and found.trivial.tolist() == [True, True, False, False]
@@ -80,11 +61,6 @@ def test_conical_pendulum():
         found.multipliers[2:], np.cos(phase) + 1j * np.abs(np.sin(phase)) * np.array([1, -1]), atol=1e-9
     )
     assert bool(found.stable) and not bool(found.attracts)
+    held = lj.System(conical.lagrangian, dict.fromkeys(("one", "two", "three"), conical.constraints["rod"]))
     with pytest.raises(ValueError, match="nothing is left to move.*\n.*depend on each other"):
-        jax.jit(lambda g: lj.floquet(doubled(3), 0.0, *start, {"g": g, "l": l}, 1.0).multipliers)(g)
-
-
-def doubled(count):
-    """The same rod several times."""
-    rod = lj.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2)
-    return lj.System(on_a_sphere, {f"rod {i}": rod for i in range(count)})
+        jax.jit(lambda g: lj.floquet(held, 0.0, *start, {"g": g, "l": l}, 1.0).multipliers)(g)

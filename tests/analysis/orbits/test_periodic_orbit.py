@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, special
+from scipy import integrate
 
 import lagjax as lj
+from tests.analysis import closed_forms as known
 from tests.systems import PARAMS, double_pendulum, pendulum, rod_pendulum
 
 G_OVER_L = PARAMS["g"] / PARAMS["l"]
@@ -21,11 +22,6 @@ def closes(orbit, turned=0.0):
     return max(float(np.max(np.abs(x))) for x in jax.tree.leaves((moved, back)))
 
 
-def swinging(amplitude, params=PARAMS):
-    """The pendulum's period, 4 √(l/g) K(sin²(amplitude/2))."""
-    return 4 * np.sqrt(params["l"] / params["g"]) * special.ellipk(np.sin(amplitude / 2) ** 2)
-
-
 # The pendulum.
 
 
@@ -34,18 +30,18 @@ def swinging(amplitude, params=PARAMS):
 )
 def test_pendulum(hold):
     """The held quantity stays; period and amplitude are those of the elliptic integral; twin: the others change."""
-    guess = 0.9 * swinging(2.0) if hold != "period" else 1.02 * swinging(2.0)
+    guess = 0.9 * known.swinging(2.0) if hold != "period" else 1.02 * known.swinging(2.0)
     orbit = lj.periodic_orbit(pendulum, (2.0, 0.0), guess, PARAMS, hold=hold)
     assert bool(orbit.converged)
     amplitude = np.arccos(np.cos(orbit.q) - orbit.v**2 / (2 * G_OVER_L))
-    np.testing.assert_allclose(orbit.period, swinging(amplitude), rtol=1e-11)
+    np.testing.assert_allclose(orbit.period, known.swinging(amplitude), rtol=1e-11)
     if hold == "period":
         assert float(orbit.period) == guess and abs(amplitude - 2.0) > 1e-3
     else:
         np.testing.assert_allclose(amplitude, 2.0, rtol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pendulum_that_goes_around():
     """It turns once in T = ∫ dφ / √(2 (E + cos φ)), counted automatically; twin: without a turn there is no orbit."""
     rate = 2.5 * np.sqrt(G_OVER_L)
@@ -60,16 +56,16 @@ def test_pendulum_that_goes_around():
     assert not bool(none.converged) and "WARNING" in repr(none)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_pendulum_on_a_rod():
     """The same period with a constraint, which the orbit satisfies to round-off, from a start that violates it."""
     amplitude, l = 2.0, PARAMS["l"]
     start = {"x": l * np.sin(amplitude) + 0.01, "y": -l * np.cos(amplitude)}, {"x": 0.05, "y": 0.0}
-    orbit = lj.periodic_orbit(rod_pendulum, start, 0.8 * swinging(amplitude), PARAMS)
+    orbit = lj.periodic_orbit(rod_pendulum, start, 0.8 * known.swinging(amplitude), PARAMS)
     x, y, vx, vy = (float(z) for z in (orbit.q["x"], orbit.q["y"], orbit.v["x"], orbit.v["y"]))
     np.testing.assert_allclose([np.hypot(x, y), x * vx + y * vy], [l, 0.0], atol=1e-13)
     reached = np.arccos(-y / l - (vx**2 + vy**2) / (2 * PARAMS["g"] * l))
-    np.testing.assert_allclose(orbit.period, swinging(reached), rtol=1e-11)
+    np.testing.assert_allclose(orbit.period, known.swinging(reached), rtol=1e-11)
     found = lj.floquet(orbit)
     assert found.trivial.all() and found.multipliers.shape == (2,)
 
@@ -77,20 +73,12 @@ def test_pendulum_on_a_rod():
 # Other families.
 
 
-def kepler_lagrangian(t, q, v, p):
-    """A unit mass attracted by -μ/r."""
-    return 0.5 * v @ v + p["mu"] / jnp.sqrt(q @ q)
-
-
-kepler = lj.System(kepler_lagrangian)
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_kepler():
     """Every orbit of an energy has Kepler's period, found from a guess of two thirds of it: all multipliers are 1."""
     speed, mu = 1.25, 1.25
     exact = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
-    orbit = lj.periodic_orbit(kepler, (np.array([1.0, 0.0]), np.array([0.0, speed])), 0.65 * exact, {"mu": mu})
+    orbit = lj.periodic_orbit(known.kepler, (np.array([1.0, 0.0]), np.array([0.0, speed])), 0.65 * exact, {"mu": mu})
     np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
 
 
@@ -100,7 +88,7 @@ def polar_lagrangian(t, q, v, p):
     return 0.5 * (v["r"] ** 2 + (radius * v["phi"]) ** 2) - radius ** p["power"] / p["power"]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_relative_orbit():
     """In a central force r comes back and φ advances, both as by quadrature; twin: as a whole it does not close."""
     polar, power, speed = lj.System(polar_lagrangian), 1.0, 0.5
@@ -125,34 +113,24 @@ def test_relative_orbit():
     assert found.trivial.all() and "shift of phi" in repr(found) and "across momenta of phi" in repr(found)
 
 
-def duffing_lagrangian(t, q, v, p):
-    """A hardening spring with a driving force."""
-    return 0.5 * v**2 - 0.5 * q**2 - p["b"] * q**4 / 4 + p["f"] * q * jnp.cos(p["omega"] * t)
-
-
-duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
-DRIVEN = {"b": 0.75, "f": 0.3125, "omega": 1.25, "c": 0.125}
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_duffing():
     """The driven orbit attracts, and is SciPy's motion after its transients; twin: a rounded period is refused."""
-    period = 2 * np.pi / DRIVEN["omega"]
-    orbit = lj.periodic_orbit(duffing, (1.0, 0.0), period, DRIVEN)
+    period = 2 * np.pi / known.DUFFING["omega"]
+    orbit = lj.periodic_orbit(known.duffing, (1.0, 0.0), period, known.DUFFING)
     assert bool(orbit.converged) and float(orbit.period) == period
-    b, f, omega, c = DRIVEN.values()
-    rate = lambda t, y: [y[1], -y[0] - b * y[0] ** 3 - c * y[1] + f * np.cos(omega * t)]
-    settled = integrate.solve_ivp(rate, [0, 80 * period], [orbit.q + 0.01, orbit.v], rtol=1e-12, atol=1e-12).y[:, -1]
+    rate, near = known.duffing_rate(known.DUFFING), [orbit.q + 0.01, orbit.v]
+    settled = integrate.solve_ivp(rate, [0, 80 * period], near, rtol=1e-12, atol=1e-12).y[:, -1]
     np.testing.assert_allclose([orbit.q, orbit.v], settled, atol=1e-9)
     with pytest.raises(ValueError, match="the system is not the same after period = 6"):
-        lj.periodic_orbit(duffing, (1.0, 0.0), 6.0, DRIVEN)
+        lj.periodic_orbit(known.duffing, (1.0, 0.0), 6.0, known.DUFFING)
     found = lj.floquet(orbit)
     assert bool(found.attracts) and not found.trivial.any()
-    np.testing.assert_allclose(found.product, np.exp(-c * period), rtol=1e-9)
+    np.testing.assert_allclose(found.product, np.exp(-known.DUFFING["c"] * period), rtol=1e-9)
     assert abs(0.01 * np.abs(found.multipliers[0]) ** 80) < 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_knife_edge_on_a_slope():
     """A velocity constraint: the blade turns at ω and moves on a cycloid, sideways and not down the slope."""
 
@@ -206,17 +184,6 @@ def test_nonlinear_mode_of_the_double_pendulum():
 # Derivatives, lanes.
 
 
-def van_der_pol_orbit(mu):
-    """The limit cycle."""
-    system = lj.System(duffing_free, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
-    return lj.periodic_orbit(system, (2.0, 0.0), 6.5, {"mu": mu})
-
-
-def duffing_free(t, q, v, p):
-    """A unit mass on a unit spring."""
-    return 0.5 * v**2 - 0.5 * q**2
-
-
 @pytest.mark.exhaustive
 def test_derivatives():
     """Of the period by g and the amplitude, both modes, as of the elliptic integral; twin: of small swings one is 0."""
@@ -226,10 +193,7 @@ def test_derivatives():
         return orbit.period
 
     g, amplitude = PARAMS["g"], 2.0
-    m = np.sin(amplitude / 2) ** 2
-    k, e = special.ellipk(m), special.ellipe(m)
-    of_m = (e - (1 - m) * k) / (2 * m * (1 - m))
-    exact = [-swinging(amplitude) / (2 * g), 4 / np.sqrt(G_OVER_L) * of_m * np.sin(amplitude) / 2]
+    exact = [-known.swinging(amplitude) / (2 * g), known.slope_of_swinging(amplitude)]
     x = jnp.array([g, amplitude])
     for mode in (jax.jacfwd, jax.grad):
         np.testing.assert_allclose(jax.jit(mode(period))(x), exact, rtol=1e-8)
@@ -257,16 +221,15 @@ def test_derivative_of_a_shift():
 def test_lanes_and_sweeps():
     """A batch over μ agrees with a loop, and a sweep reports which points did not converge."""
     mu = jnp.array([0.5, 1.0, 2.0])
-    lanes = jax.jit(jax.vmap(van_der_pol_orbit))(mu)
-    # Andersen & Geer's and others' values.
-    np.testing.assert_allclose(lanes.period[1], 6.663286859323130, rtol=1e-11)
-    np.testing.assert_allclose(lanes.period[2], 7.629874479674862, rtol=1e-11)
+    find = lambda mu: lj.periodic_orbit(known.van_der_pol, (2.0, 0.0), 6.5, {"mu": mu})
+    lanes = jax.jit(jax.vmap(find))(mu)
+    np.testing.assert_allclose(lanes.period[1:], [known.VAN_DER_POL[1.0], known.VAN_DER_POL[2.0]], rtol=1e-11)
     assert "3 lanes, 3 converged" in repr(lanes)
-    alone = van_der_pol_orbit(0.5)
+    alone = find(0.5)
     np.testing.assert_allclose([lanes.q[0], lanes.period[0]], [alone.q, alone.period], rtol=1e-9)
 
     def run(point):
-        system = lj.System(duffing_free, force=lambda t, q, v, p: -p["mu"] * v)
+        system = lj.System(known.spring_lagrangian, force=lambda t, q, v, p: -p["mu"] * v)
         return lj.periodic_orbit(system, (1.0, 0.0), 6.0, {"mu": point["mu"]}, most=6).period
 
     damped = lj.sweep(run, {"mu": jnp.array([0.5, 0.75])}, progress=False)
@@ -288,7 +251,7 @@ REFUSED = {
     ),
     "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
     "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),
-    "damped": (duffing, {"hold": "energy"}, ValueError, "so the orbit has the period of the drive"),
+    "damped": (known.duffing, {"hold": "energy"}, ValueError, "so the orbit has the period of the drive"),
 }
 
 
@@ -297,5 +260,5 @@ def test_refused_in_words(system, given, error, words):
     """Bad arguments are refused, with a fix."""
     given = SIMPLE | given
     with pytest.raises(error, match=words) as raised:
-        lj.periodic_orbit(system, given.pop("start"), given.pop("period"), PARAMS | DRIVEN, **given)
+        lj.periodic_orbit(system, given.pop("start"), given.pop("period"), PARAMS | known.DUFFING, **given)
     assert "Fix:" in str(raised.value)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.orbits.test_periodic_orbit import swinging
+from tests.analysis.closed_forms import swinging
 from tests.systems import pendulum
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.orbits.test_periodic_orbit import duffing_free, van_der_pol_orbit
+from tests.analysis.closed_forms import VAN_DER_POL, van_der_pol
 from tests.systems import PARAMS, pendulum
 
 
@@ -14,7 +14,7 @@ def inverted_lagrangian(t, q, v, p):
     return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_unstable_orbit_by_parts():
     """A pushed pendulum stays up for two periods of the push, in which neighbours leave it e^(4π)-fold.
 
@@ -31,23 +31,19 @@ def test_unstable_orbit_by_parts():
     assert not bool(found.stable)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stiff_cycle():
-    """Van der Pol's at μ = 10: states fall onto the cycle; the other multiplier is almost 0, and reported as unknown.
-
-    The period of 19.07836957: Urabe, *IRE Trans. Circuit Theory* 7 (1960) 382.
-    """
-    system = lj.System(duffing_free, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)
-    orbit = lj.periodic_orbit(system, (2.0, 0.0), 18.0, {"mu": 10.0})
-    np.testing.assert_allclose(orbit.period, 19.07836957, atol=1e-8)
+    """Van der Pol's at μ = 10: states fall onto the cycle; the other multiplier is almost 0, and called unknown."""
+    orbit = lj.periodic_orbit(van_der_pol, (2.0, 0.0), 18.0, {"mu": 10.0})
+    np.testing.assert_allclose(orbit.period, VAN_DER_POL[10.0], atol=1e-8)
     found = lj.floquet(orbit)
     assert bool(found.attracts) and float(found.liouville) < 1e-100
     assert "1 of the multipliers is not known" in repr(found)
     # Twin: at μ = 1 the multiplier is 9e-4, and known.
-    assert "not known" not in repr(lj.floquet(van_der_pol_orbit(1.0)))
+    assert "not known" not in repr(lj.floquet(lj.periodic_orbit(van_der_pol, (2.0, 0.0), 6.5, {"mu": 1.0})))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_no_cycle_of_a_damped_pendulum():
     """There is only rest, which does not count as an orbit; the best candidate is returned, with a warning."""
     damped = lj.System(pendulum.lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)

@@ -42,7 +42,7 @@ def filtered_matrix(p):
     return np.array([[0, 0, 1], [1 / p["tau"], -1 / p["tau"], 0], [-1, p["k"], -p["c"]]])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_linear():
     """M = exp(A T) of 3 x 3 whatever v says of z, with three multipliers; the orbit is the resonance of A.
 

@@ -6,6 +6,7 @@ import lagjax as lj
 from tests.symmetric_systems import IN_SPACE, KEPLER, OF_KEPLER
 
 
+@pytest.mark.slow
 def test_float32_is_honest():
     """In float32 the same symmetries are found, with a smaller gap."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)

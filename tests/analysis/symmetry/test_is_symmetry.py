@@ -10,7 +10,7 @@ from lagjax.scenes import cross_rails, sliding_wedge
 from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_STONE, ON_PLANE, RADIUS, falling, rolling
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_forbid_and_allow():
     """The wedge allows p_X + p_x; the disk's constraints forbid a shift, although it leaves them unchanged."""
     start = sliding_wedge.start_on_incline(sliding_wedge.PARAMS, along=1.0, along_rate=0.25)

@@ -8,7 +8,7 @@ from lagjax.scenes import sliding_wedge
 from tests.symmetric_systems import OF_STONE, STONE
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_charges_of_a_trajectory_are_drawn():
     """`True` draws charges that the structure shows, a mapping the given ones. Twins: none known, not a function."""
     params = sliding_wedge.PARAMS

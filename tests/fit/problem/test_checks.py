@@ -21,7 +21,7 @@ from tests.fit.problem.test_initial_states import on_a_rod
         ({"q": {"z": np.zeros((1, 60))}}, "'z' was measured as q, but the motion has no such name: 'x' and 'y'"),
         ({"multipliers": {"rope": np.zeros((1, 60))}}, "'rope' was measured as multipliers(.|\n)*'rod'"),
         ({"q": np.zeros((1, 60))}, "but the motion has(.|\n)*in that structure"),
-        ({"q": {"x": np.zeros((1, 60, 1))}}, r"'x' was measured with the shape \(1,\) at each time, but the motion has"),
+        ({"q": {"x": np.zeros((1, 60, 1))}}, r"'x' was measured with the shape \(1,\) at each time, but"),
     ],
 )
 def test_what_the_motion_does_not_have(measured, words):

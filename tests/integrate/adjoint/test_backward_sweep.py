@@ -7,9 +7,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.adjoint import replay
-from tests.integrate.adjoint.test_replay import end
+from tests.integrate.adjoint.test_replay import end, modes_agree
 from tests.integrate.adjoint.test_replay import test_a_spring_by_parameters_state_and_times as agrees
-from tests.tiers import exhaustive_but
 
 pytestmark = pytest.mark.usefixtures("in_reverse")
 
@@ -41,7 +40,7 @@ def test_lanes_that_fail_have_no_part():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", exhaustive_but(((8, 3), (72, 1)), ((8, 3), (72, 1), (72, 3), (8, 1))))
+@pytest.mark.parametrize("kind", ((8, 3), (72, 1), (72, 3), (8, 1)))
 def test_networks_as_matrices(kind):
     """Stages in a loop and as copies; two coordinates of different masses; by the weights, the masses and the start."""
     hidden, lanes = kind
@@ -53,15 +52,10 @@ def test_networks_as_matrices(kind):
         return 0.5 * jnp.sum(m * v**2) - 0.5 * jnp.sum(q**2) - jnp.tanh(jnp.tanh(q @ w[0]) @ w[1]) @ w[2]
 
     system, q0 = lj.System(lagrangian), random.normal(size=(3, 2))
-    directions = jax.tree.map(lambda x: random.normal(size=np.shape(x)), (w, np.ones(2), q0))
 
     def total(x):
         *p, q = x
         of = lambda q: end(system, q, jnp.zeros(2), p)
         return jnp.sum(jax.vmap(of)(q)) if lanes == 3 else of(q[0])
 
-    at = (w, np.array([1.0, 3.0]), q0)
-    gradient = jax.jit(jax.grad(total))(at)
-    _, along = jax.jit(lambda x, d: jax.jvp(total, (x,), (d,)))(jax.tree.map(jnp.asarray, at), directions)
-    back = sum(jnp.sum(g * d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(directions)))
-    np.testing.assert_allclose(back, along, rtol=1e-10)
+    modes_agree(total, (w, np.array([1.0, 3.0]), q0), rtol=1e-10)

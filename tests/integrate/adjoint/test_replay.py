@@ -1,5 +1,7 @@
 """Reverse mode by replay: equal to forward mode on all kinds of motion, finite where it must be, in bounded memory."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,6 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.adjoint import step_record
-from tests.tiers import exhaustive_but
 
 TS = np.linspace(0.0, 2.0, 9)
 PARAMS = {"g": 9.81, "l": 2.0}
@@ -39,12 +40,17 @@ def end(system, q0, v0, params, ts=TS, **options):
     return sum(total(x) ** 2 for x in rows)
 
 
-def modes_agree(function, x, rtol=1e-8):
-    """Check that both modes agree; return the derivatives."""
-    reverse, forward = jax.jit(jax.grad(function))(x), jax.jit(jax.jacfwd(function))(x)
-    largest = max(float(jnp.max(jnp.abs(d))) for d in jax.tree.leaves(forward))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * largest), reverse, forward)
-    return reverse
+def modes_agree(function, x, direction=None, rtol=1e-8):
+    """Check that along a direction, a random one of all x or this, forward mode equals the product of the gradient with
+    it; return the gradient."""
+    random = np.random.default_rng(0)
+    x = jax.tree.map(lambda x: jnp.asarray(x, float), x)
+    direction = direction or jax.tree.map(lambda x: jnp.asarray(random.normal(size=np.shape(x))), x)
+    gradient, (value, along) = jax.jit(jax.grad(function))(x), jax.jit(partial(jax.jvp, function))((x,), (direction,))
+    terms = [np.sum(np.asarray(g) * d) for g, d in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True)]
+    assert np.isfinite(value)
+    np.testing.assert_allclose(sum(terms), along, rtol=rtol, atol=rtol * np.max(np.abs(terms)))
+    return gradient
 
 
 # q, v, two halves of the stiffness, and four times: a spring that swings, and one at rest.
@@ -129,7 +135,7 @@ def test_a_constraint_and_its_multiplier():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("method", exhaustive_but((None,), (None, diffrax.Kvaerno5())))
+@pytest.mark.parametrize("method", (None, diffrax.Kvaerno5()))
 def test_implicit_methods(method):
     """A stiff spring: derivatives by the implicit function theorem at each step."""
     system = lj.System(

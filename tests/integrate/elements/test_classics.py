@@ -78,7 +78,7 @@ def test_a_disk_on_a_slope():
         assert (abs(slides - rolls) > 1e-4 * rolls) and (share > 1) == (slides < rolls)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_hoop_with_friction():
     """The hoop rolls, slips, leaves and lands where the closed forms say, from two elements. Twin: a smaller friction
     slips earlier and leaves later."""
@@ -268,7 +268,7 @@ def on_a_belt(coefficient) -> lj.System:
     return lj.System(spring, elements={"belt": belt})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stick_slip_on_a_belt():
     """The period of the cycle of sticking and slipping, static friction 1 and kinetic 0.4: closed form to 1e-10.
     Twin: without the difference it slips once, and touches the speed of the belt no more than within round-off."""

@@ -57,7 +57,7 @@ def row(impacts: str, count: int) -> lj.System:
     return lj.System(lambda t, q, v, d: 0.5 * jnp.sum(v**2), elements=lj.Elements({"balls": gaps}, impacts=impacts))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("impacts", "after"), [("sequential", [0.0, 0.0, 1.0]), ("simultaneous", [-1 / 3, 2 / 3, 2 / 3])]
 )
@@ -83,25 +83,7 @@ def test_a_row_of_balls(impacts, after):
         run([-1.0, 0.1, 0.15], [1.0, 0.0, 0.0])
 
 
-@pytest.mark.slow
-def test_a_thrown_block():
-    """A block falls on a rough floor, loses μ of its impulse there, slides, stops. Twin: a smaller μ goes farther."""
-    floor = lj.Contact(lambda t, q, mu: q[1], friction=lambda mu: mu, sliding=lambda t, q, v, mu: v[0])
-    block = lj.System(lambda t, q, v, mu: 0.5 * jnp.sum(v**2) - G * q[1], elements={"floor": floor})
-
-    def stops(mu):
-        ts = jnp.array([0.0, 0.5, 3.0])
-        return moved(block, np.array([0.0, 0.2]), np.array([3.0, 0.0]), mu, ts=ts)
-
-    traj, fall = stops(MU), np.sqrt(0.4 / G)
-    speed = 3.0 - MU * G * fall
-    np.testing.assert_allclose(traj.q[-1], [3.0 * fall + speed**2 / (2 * MU * G), 0.0], atol=1e-10)
-    np.testing.assert_allclose(traj.switches.t[:2], [fall, fall + speed / (MU * G)], rtol=1e-10)
-    assert np.asarray(traj.modes).tolist() == [[0, 0], [1, 1], [1, 2]]
-    assert stops(0.9 * MU).q[-1, 0] > traj.q[-1, 0] + 0.1
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lets_go_and_touches_again():
     """A body leaves a shaken table at a² = g and lands, from one element: as by a hybrid of two phases."""
     table = lj.Contact(lambda t, q, p: over(t, q, p))

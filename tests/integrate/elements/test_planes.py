@@ -8,9 +8,11 @@ from scipy.integrate import quad, solve_ivp
 
 import lagjax as lj
 from lagjax.integrate.elements.complementarity import ContactProblem, solved
+from tests.integrate.elements.test_motions import moved
 
 G, M, R = 9.81, 1.3, 0.4
 INERTIA = 0.4 * M * R**2
+V0, TS = [2.0, 1.5], np.array([0.0, 3.0])
 
 
 def random_problems(count: int, lanes: int):
@@ -77,13 +79,11 @@ def stops_after(v0, mu, tan):
     return (mu * np.hypot(*v0) - tan * v0[1]) / ((mu**2 - tan**2) * G)
 
 
-def thrown(v0, mu, tan, system=on_a_tilt(), rtol=1e-11) -> lj.HybridTrajectory:
+def thrown(v0, mu, tan, dtype=float, **options) -> lj.HybridTrajectory:
     """The block thrown at the origin."""
-    given = {"mu": mu, "tan": jnp.asarray(tan)}
-    ts = jnp.array([0.0, 3.0])
-    traj = lj.integrate(system, jnp.zeros(2), jnp.array(v0), given, ts=ts, rtol=rtol, estimate_error=False)
-    assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
-    return traj
+    like = lambda x: jnp.asarray(x, dtype)
+    given = {"mu": like(mu), "tan": like(tan)}
+    return moved(on_a_tilt(), np.zeros(2, dtype), like(v0), given, ts=np.asarray(TS, dtype), **options)
 
 
 @pytest.mark.slow
@@ -91,19 +91,18 @@ def test_thrown_obliquely_on_a_tilted_plane():
     """Stops, or turns downhill and slides on, as by SciPy; or slides down from rest. Its stop is as precise as the
     steps. Twins: with another μ it rests somewhere else; with longer steps it stops earlier."""
     found = {}
-    for v0, mu, tan in (([2.0, 1.5], 0.4, 0.2), ([2.0, 1.5], 0.41, 0.2), ([2.0, 1.5], 0.2, 0.4)):
-        traj = found[mu] = thrown(v0, jnp.asarray(mu), tan)
-        np.testing.assert_allclose(traj.q[-1], by_scipy(v0, mu, tan, 3.0), atol=1e-10)
+    for mu, tan in ((0.4, 0.2), (0.41, 0.2), (0.2, 0.4)):
+        traj = found[mu] = thrown(V0, mu, tan, rtol=1e-11)
+        np.testing.assert_allclose(traj.q[-1], by_scipy(V0, mu, tan, 3.0), atol=1e-10)
         if mu > tan:
-            np.testing.assert_allclose(traj.switches.t[0], stops_after(v0, mu, tan), atol=1e-10)
-            assert thrown(v0, jnp.asarray(mu), tan, rtol=1e-7).switches.t[0] < stops_after(v0, mu, tan) - 1e-7
+            np.testing.assert_allclose(traj.switches.t[0], stops_after(V0, mu, tan), atol=1e-10)
+            assert thrown(V0, mu, tan, rtol=1e-7).switches.t[0] < stops_after(V0, mu, tan) - 1e-7
     assert [np.asarray(traj.modes)[-1].tolist() for traj in found.values()] == [[2, 2], [2, 2], [1, 1]]
     assert np.linalg.norm(found[0.41].q[-1] - found[0.4].q[-1]) > 1e-3
-    slid = thrown([0.0, 0.0], jnp.asarray(0.3), 0.4)
-    np.testing.assert_allclose(slid.q[-1], [0.0, -0.5 * 0.1 * G * 9.0], atol=1e-8)
+    np.testing.assert_allclose(thrown([0.0, 0.0], 0.3, 0.4, rtol=1e-11).q[-1], [0.0, -0.5 * 0.1 * G * 9.0], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_blocks_in_planes():
     """Each of two blocks, (k, 2) velocities with k normal forces, slides straight with μ N and stops after |v|/(μ N).
     Twin: with the other's normal force."""
@@ -111,8 +110,8 @@ def test_two_blocks_in_planes():
     floor = lj.Friction(lambda t, q, v, p: v, mu, normal=normal)
     blocks = lj.System(lambda t, q, v, p: jnp.sum(v**2) / 2, elements={"floor": floor})
     ts = np.linspace(0.0, 20.0, 5)
-    traj = lj.integrate(blocks, np.zeros((2, 2)), throw, None, ts=ts, rtol=1e-10, estimate_error=False)
-    assert isinstance(traj, lj.HybridTrajectory) and traj.multipliers["floor"].shape == (5, 2, 2)
+    traj = moved(blocks, np.zeros((2, 2)), throw, None, ts=ts, rtol=1e-10)
+    assert traj.multipliers["floor"].shape == (5, 2, 2)
     speed = np.linalg.norm(throw, axis=1)
     np.testing.assert_allclose(traj.switches.t[:2], np.sort(speed / (mu * normal)), rtol=1e-8)
 
@@ -127,8 +126,8 @@ def test_two_blocks_in_planes():
 @pytest.mark.exhaustive
 def test_derivatives_of_a_place_of_rest():
     """The derivative of the place of rest by μ, in both modes, against differences of SciPy's."""
-    last = lambda mu: thrown([2.0, 1.5], mu, 0.2).q[-1]
-    near = [by_scipy([2.0, 1.5], m, 0.2, 3.0) for m in (0.4 - 1e-5, 0.4 + 1e-5)]
+    last = lambda mu: thrown(V0, mu, 0.2, rtol=1e-11).q[-1]
+    near = [by_scipy(V0, m, 0.2, 3.0) for m in (0.4 - 1e-5, 0.4 + 1e-5)]
     slope = (near[1] - near[0]) / 2e-5
     np.testing.assert_allclose(jax.jvp(last, (jnp.asarray(0.4),), (jnp.asarray(1.0),))[1], slope, atol=1e-6)
     np.testing.assert_allclose(jax.jacrev(last)(jnp.asarray(0.4)), slope, atol=1e-6)
@@ -150,7 +149,7 @@ def sphere():
     return lj.System(lagrangian, elements={"table": table})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_sphere_with_spin():
     """Thrown sliding, it rolls from 2 |s| / (7 μ g) on with v - 2 s/7, and until then moves on a parabola. Dropped, it
     loses μ of the normal impulse in an impact, or 2 s/7 where that stops the sliding. Twin: another spin, another way.
@@ -159,8 +158,7 @@ def test_a_sphere_with_spin():
 
     def rolled(height, spin, mu):
         q, v = {"x": jnp.array([0.0, 0.0, R + height]), "spin": jnp.zeros(3)}, {"x": jnp.array(v0), "spin": spin}
-        traj = lj.integrate(system, q, v, {"mu": jnp.asarray(mu)}, ts=ts, estimate_error=False)
-        assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
+        traj = moved(system, q, v, {"mu": mu}, ts=ts)
         return traj.q["x"], traj.v["x"], traj.switches.t[0], traj.switches.v_after["x"][0], traj.modes
 
     v0, w0, mu = np.array([2.0, 0.5, 0.0]), np.array([3.0, -4.0, 1.0]), 0.2
@@ -181,15 +179,6 @@ def test_a_sphere_with_spin():
     assert np.linalg.norm(v[3, 2] - v[0, 2]) > 0.5
 
 
-def slid(system, speed, mu) -> lj.HybridTrajectory:
-    """A body that moves at the origin, from t = 0 to 3."""
-    ts = jnp.array([0.0, 3.0])
-    at = jnp.zeros(speed.size)
-    traj = lj.integrate(system, at, speed, mu, ts=ts, rtol=1e-11, estimate_error=False)
-    assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
-    return traj
-
-
 @pytest.mark.exhaustive
 def test_stribeck_in_a_plane():
     """With μ that falls with the speed it stops where quadrature says, v dv/μ(v) g. Twin: another μ, another place."""
@@ -197,7 +186,7 @@ def test_stribeck_in_a_plane():
     floor = lj.Friction(lambda t, q, v, mu: v, falls, normal=G)
     system = lj.System(lambda t, q, v, mu: 0.5 * jnp.sum(v**2), elements={"floor": floor})
     way, _ = quad(lambda u: u / (0.4 * (0.6 + 0.4 * np.exp(-u)) * G), 0, 2.5, epsabs=1e-13)
-    found = [slid(system, jnp.array([2.0, 1.5]), jnp.asarray(mu)).q[-1] for mu in (0.4, 0.41)]
+    found = [moved(system, np.zeros(2), np.array(V0), mu, ts=TS, rtol=1e-11).q[-1] for mu in (0.4, 0.41)]
     np.testing.assert_allclose(found[0], way * np.array([0.8, 0.6]), atol=1e-11)
     assert np.linalg.norm(found[1] - found[0]) > 1e-3
 
@@ -208,7 +197,7 @@ def test_static_friction_in_a_plane():
     tilt = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - G * p * q[1]
     floor = lj.Friction(lambda t, q, v, p: v, 0.4, normal=G, static=0.5)
     system = lj.System(tilt, elements={"floor": floor})
-    stays, goes = (slid(system, jnp.zeros(2), jnp.asarray(tan)) for tan in (0.45, 0.55))
+    stays, goes = (moved(system, np.zeros(2), np.zeros(2), tan, ts=TS, rtol=1e-11) for tan in (0.45, 0.55))
     assert not np.any(stays.q[-1])
     np.testing.assert_allclose(goes.q[-1], [0.0, -0.5 * 0.15 * G * 9.0], atol=1e-7)
 
@@ -216,13 +205,7 @@ def test_static_friction_in_a_plane():
 @pytest.mark.exhaustive
 def test_float32_in_a_plane():
     """In float32 it stops where it does in float64, within that precision. Twin: another μ, another place."""
-    place = by_scipy([2.0, 1.5], 0.4, 0.2, 3.0)
-    half = lambda x: jnp.asarray(x, jnp.float32)
-    system, start, ts = on_a_tilt(), (half([0.0, 0.0]), half([2.0, 1.5])), half([0.0, 3.0])
-    found = [
-        lj.integrate(system, *start, {"mu": half(mu), "tan": half(0.2)}, ts=ts, estimate_error=False)
-        for mu in (0.4, 0.41)
-    ]
+    found = [thrown(V0, mu, 0.2, np.float32) for mu in (0.4, 0.41)]
     assert all(traj.q.dtype == np.float32 for traj in found)
-    np.testing.assert_allclose(found[0].q[-1], place, atol=2e-5)
+    np.testing.assert_allclose(found[0].q[-1], by_scipy(V0, 0.4, 0.2, 3.0), atol=2e-5)
     assert np.linalg.norm(found[1].q[-1] - found[0].q[-1]) > 1e-3

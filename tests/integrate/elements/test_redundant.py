@@ -100,7 +100,7 @@ def swung(p) -> lj.HybridTrajectory:
     return moved(rod(), 0.5, 0.0, p, ts=jnp.array([0.0, 1.0, 4.0, 4.4]))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_modes_of_an_arm_at_rest():
     """Two forces for one freedom: the shortest have the friction tan 30° N, which sticks, or is at its bound where that
     is above μ N. Twin: both coefficients."""

@@ -93,7 +93,7 @@ def against_a_stop(gain, ts):
     return np.array([found[t] for t in ts])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_motor_against_a_stop():
     """It drives a mass to a stop, presses, and draws it back at the instant at which its force turns."""
     motor = lj.SampledControl(lambda t, q, v, gain: gain * jnp.cos(2.0 * t), every=0.25)

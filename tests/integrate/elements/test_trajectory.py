@@ -1,6 +1,7 @@
 """What is done with a motion with elements: a block that bounces, slides and stops, in closed form."""
 
 import functools
+from importlib import import_module
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.elements.meeting import Met
 
+# The package hands out a function of this name.
+explain = import_module("lagjax.analysis.explain")
 PARAMS = {"g": 9.81, "mu": 0.1}
 G, MU, E, THROWN = 9.81, 0.1, 0.5, 4.0
 FALL = np.sqrt(2 / G)
@@ -46,6 +50,11 @@ def test_between_outputs():
     height = u * (0.7 - FALL) - G / 2 * (0.7 - FALL) ** 2
     np.testing.assert_allclose(found.q[:, 1], [1 - G / 2 * 0.3**2, height, 0.0, 0.0], atol=1e-8)
     np.testing.assert_allclose(found.multipliers["floor"], [0.0, 0.0, G, G], rtol=1e-9)
+    lost = MU * (1 + E) * G * FALL
+    way = THROWN * FALL + sum((THROWN - lost * (1 - E**n) / (1 - E)) * 2 * FALL * E**n for n in range(1, 60))
+    np.testing.assert_allclose(traj.q[-1], [way + SPEED**2 / (2 * MU * G), 0.0], atol=1e-5)
+    np.testing.assert_allclose(traj.switches.t[0], FALL, rtol=1e-10)
+    assert np.asarray(traj.modes).tolist() == [[0, 0], [0, 0], [1, 2]] and thrown(0.9 * MU).q[-1, 0] > way
     assert np.all(1 - G / 2 * t[1:] ** 2 < found.q[1:, 1] - 1.0)
     assert float(traj.residual()) < 1e-14 and abs(float(traj.switches.t[len(traj.switches) - 1]) - STOPS) < 1e-6
     assert "at the end: floor closed, floor friction sticks" in repr(traj)
@@ -113,28 +122,48 @@ def test_energy_of_what_moves():
     assert np.asarray(traj.modes)[:, 0].tolist() == [-1, 2]
 
 
-def test_explained():
+AT_STATES = (
+    ([0.0, 1.0], [0.0, 0.0], ("open", "free"), 2),
+    ([0.0, 0.0], [1.0, 0.0], ("closed", "slides"), 1),
+    ([0.0, 0.0], [0.0, 0.0], ("closed", "sticks"), 0),
+)
+NUMBERS = {"open": 0, "free": 0, "closed": 1, "slides": 1, "sticks": 2}
+
+
+def in_modes(monkeypatch, v, modes, found=True):
+    """Let these be the modes that fit a state."""
+    met = Met(np.array(v), np.array(modes), np.zeros(len(modes)), np.array(found))
+    monkeypatch.setattr(explain, "modes_at", lambda assembly, start: met)
+
+
+def test_explained(monkeypatch):
     """The modes at a state, and how free it is in them, in words and as a dict."""
     rows = []
-    for q, v, modes, free in (
-        ([0.0, 1.0], [0.0, 0.0], ("open", "free"), 2),
-        ([0.0, 0.0], [1.0, 0.0], ("closed", "slides"), 1),
-        ([0.0, 0.0], [0.0, 0.0], ("closed", "sticks"), 0),
-    ):
+    for q, v, modes, free in AT_STATES:
+        in_modes(monkeypatch, v, [NUMBERS[mode] for mode in modes])
         found = lj.explain(block, 0.0, np.array(q), np.array(v), PARAMS)
         assert dict(found.modes) == dict(zip(("floor", "floor friction"), modes))
         rows.append(dict(found.rows))
         assert rows[-1]["in these modes"].startswith(f"{free} degree")
-    assert (
-        "2 (gap: 1, sliding velocity: 1); here floor open (gap 1), floor friction free" in rows[0]["modes"]
-        and "up to 2 forces" in rows[0]["solved together"]
-    )
-    assert all("forces" not in row for row in rows)
+        assert "forces" not in rows[-1] and not found.problem
+    assert "2 (gap: 1, sliding velocity: 1); here floor open (gap 1), floor friction free" in rows[0]["modes"]
+    assert "up to 2 forces" in rows[0]["solved together"]
+    in_modes(monkeypatch, [0.0, 0.0], [0, 0])
+    inside = lj.explain(block, 0.0, np.array([0.0, -0.1]), np.zeros(2), PARAMS)
+    assert "the gap 'floor' is below zero" in str(inside.problem)
+    in_modes(monkeypatch, [0.0, 0.0], [1, 1], found=False)
     walls = lj.Contact(lambda t, q, params: jnp.stack([q[0], -q[0]]))
     between = lj.explain(lj.System(block.lagrangian, elements={"walls": walls}), 0.0, np.zeros(2), np.zeros(2), PARAMS)
     assert "not unique: 2 hold, 1 of them independent" in dict(between.rows)["forces"]
-    inside = lj.explain(block, 0.0, np.array([0.0, -0.1]), np.zeros(2), PARAMS)
-    assert "the gap 'floor' is below zero" in str(inside.problem)
+    assert "Painlevé" in str(between.problem)
+
+
+@pytest.mark.slow
+def test_modes_at_states():
+    """The modes that are found at states are those that fit."""
+    for q, v, modes, _ in AT_STATES:
+        found = lj.explain(block, 0.0, np.array(q), np.array(v), PARAMS)
+        assert dict(found.modes) == dict(zip(("floor", "floor friction"), modes))
 
 
 @pytest.mark.slow

@@ -14,9 +14,8 @@ from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
 from lagjax.numerics import tableau
 from lagjax.system import prepare
-
-TURN = 2 * np.pi
-kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + params / jnp.sqrt(jnp.sum(q**2)))
+from tests.integrate.equal_steps.test_equal_steps import TURN, ellipse, kepler, on_ellipse
+from tests.integrate.equal_steps.test_equal_steps import run as of_any
 
 
 def pace(t, q, params):
@@ -24,25 +23,9 @@ def pace(t, q, params):
     return jnp.sum(q**2) ** 0.75
 
 
-def ellipse(e):
-    """The pericentre of an orbit with the period 2π."""
-    return np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
-
-
-def on_ellipse(e, ts):
-    """Positions by Kepler's equation, M = E - e sin E, solved by halving: E lies within e of M."""
-    M = np.mod(ts + np.pi, TURN) - np.pi
-    E, low, high = M, M - e, M + e
-    for _ in range(60):
-        E = (low + high) / 2
-        late = E - e * np.sin(E) > M
-        low, high = np.where(late, low, E), np.where(late, E, high)
-    return np.stack([np.cos(E) - e, np.sqrt(1 - e**2) * np.sin(E)], axis=-1)
-
-
-def run(method, ts, e=0.99, **options):
+def run(method, ts, e=0.99, dt0=0.06):
     """An ellipse, with about 160 steps in a turn where the pace is as above."""
-    return lj.integrate(kepler, *ellipse(e), 1.0, ts=ts, method=method, estimate_error=False, **{"dt0": 0.06} | options)
+    return of_any(kepler, ellipse(e), 1.0, ts, method, dt0)
 
 
 @pytest.mark.slow
@@ -129,24 +112,6 @@ def test_there_and_back(kind):
     np.testing.assert_allclose(home, x, atol=1e-11)
     np.testing.assert_allclose(velocity, u, atol=1e-10)
     assert jnp.linalg.norm(back(steps.first(s.t, x, u), 0.0)[1] - x) > 1e-6
-
-
-@pytest.mark.exhaustive
-def test_derivatives_in_both_modes():
-    """d(end)/d(GM), forward and in reverse, and by scaling."""
-
-    def end(gm, ts, method=lj.Splitting(4, pace=lambda t, q, params: pace(t, q, params) / jnp.sqrt(params))):
-        q0, v0 = ellipse(0.6)
-        return lj.integrate(kepler, q0, v0 * jnp.sqrt(gm), gm, ts=ts, method=method, dt0=0.02, estimate_error=False)
-
-    ts = np.array([0.0, 8.0])
-    x = lambda gm: end(gm, ts).q[-1, 0]
-    forward, reverse = jax.jit(lambda gm: (jax.jvp(x, (gm,), (1.0,))[1], jax.grad(x)(gm)))(1.0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-    # Where the start scales along, the place depends on √GM t alone.
-    h = 1e-3
-    places = on_ellipse(0.6, ts[-1] * np.sqrt(1 + h * np.array([-2.0, -1.0, 1.0, 2.0])))[:, 0]
-    np.testing.assert_allclose(forward, places @ np.array([1.0, -8.0, 8.0, -1.0]) / (12 * h), rtol=1e-5)
 
 
 def test_what_a_pace_refuses():

@@ -1,23 +1,19 @@
 """Long motions are watched, saved and gone on from."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.integrate.equal_steps.test_equal_steps import TURN, ellipse, kepler, run
 
-TURN = 2 * np.pi
-kepler = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + params / jnp.sqrt(jnp.sum(q**2)))
-START = np.array([0.4, 0.0]), np.array([0.0, 2.0])
+START = ellipse(0.6)
 
 
 def turns(q0, v0, first, last, **options):
     """The ellipse of e = 0.6 at each of so many turns."""
     ts = TURN * np.arange(first, last + 1.0)
-    return lj.integrate(
-        kepler, q0, v0, 1.0, ts=ts, method=lj.Splitting(6), dt0=TURN / 200, estimate_error=False, **options
-    )
+    return run(kepler, (q0, v0), 1.0, ts, lj.Splitting(6), TURN / 200, **options)
 
 
 @pytest.mark.slow
@@ -34,7 +30,7 @@ def test_a_meter_that_moves(capfd):
     assert int(watched.stats["num_steps"]) == 400
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_saved_motion_goes_on(tmp_path):
     """A motion that is saved and gone on from is the uninterrupted one, but for what compensated summation carries
     there, a round-off of the state. Twin: a state kept to single precision."""

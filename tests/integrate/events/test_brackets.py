@@ -29,7 +29,7 @@ def test_levels_just_below_the_extremum(rtol):
     assert len(times(swing(0.0, 1.0, 1.001 + 100 * rtol, [0.0, 3.0, 6.0], rtol=rtol))) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_guard_that_is_left_without_speed(monkeypatch):
     """A guard that leaves zero as t³ costs no extra steps. Twin: without the rule for it, bisection does."""
 

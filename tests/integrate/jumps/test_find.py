@@ -40,8 +40,8 @@ JUMPING = {
 def jumps_of(force, params=0.3, lagrangian=free):
     """The system and its jumps."""
     system = lj.System(lagrangian, force=force)
-    number = jnp.asarray(0.1)
-    state = State(number, number, number, jnp.asarray(params))
+    number = np.array(0.1)
+    state = State(number, number, number, np.array(params))
     return system, found(model_of(system, *state), state)
 
 
@@ -79,12 +79,10 @@ def test_what_is_not_followed_is_said():
 
 
 def times_of(force, params, last=10.0):
-    """The times at which a force jumps because of t, increasing."""
+    """The times at which a force jumps because of t, increasing, as a function of the parameters."""
     system, jumps = jumps_of(force, params)
-    zero = jnp.asarray(0.0)
-    ts = jnp.array([0.0, last])
-    at = lambda params: with_jumps_in_time(jumps, None, system, zero, zero, jnp.asarray(params), ts)[0]
-    return jax.jit(lambda params: jnp.sort(at(params)))
+    zero, ts = np.array(0.0), np.array([0.0, last])
+    return lambda params: jnp.sort(with_jumps_in_time(jumps, None, system, zero, zero, params, jnp.asarray(ts))[0])
 
 
 def test_times_of_jumps():
@@ -92,19 +90,25 @@ def test_times_of_jumps():
 
     Twin: for the relay these are not zero.
     """
-    pulse = lambda t, q, v, p: jnp.where((t > p) & (t < p + 0.05), 1.0, 0.0)
-    np.testing.assert_array_equal(times_of(pulse, 4.0)(4.0), [4.0, 4.05])
+    pulse = times_of(lambda t, q, v, p: jnp.where((t > p) & (t < p + 0.05), 1.0, 0.0), 4.0)
     relay = times_of(lambda t, q, v, p: jnp.sign(jnp.sin(p * t)), 5.0)
-    right = np.arange(1, 16) * np.pi / 5.0
-    np.testing.assert_allclose(relay(5.0)[1:16], right, rtol=1e-15)
-    np.testing.assert_allclose(jax.jacfwd(relay)(5.0)[1:16], -right / 5.0, rtol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(relay))(5.0)[1:16], 2 * right / 25.0, rtol=1e-9)
     wave = times_of(lambda t, q, v, p: jnp.where(t % p < 0.3, 1.0, 0.0), 1.0, last=2.5)
-    found = np.unique(np.round(wave(1.0), 14))
-    np.testing.assert_allclose(found, [0.3, 1.0, 1.3, 2.0, 2.3, 2.5], rtol=1e-13)
     table = times_of(lambda t, q, v, p: jnp.interp(t, p * KNOTS, HEIGHTS), 2.0)
+
+    @jax.jit
+    def all_times(p):
+        of_relay = [relay, jax.jacfwd(relay), jax.jacfwd(jax.jacfwd(relay))]
+        return pulse(p[0]), [f(p[1]) for f in of_relay], wave(p[2]), table(p[3])
+
+    at, of_relay, of_wave, of_table = jax.tree.map(np.asarray, all_times(np.array([4.0, 5.0, 1.0, 2.0])))
+    np.testing.assert_array_equal(at, [4.0, 4.05])
+    right = np.arange(1, 16) * np.pi / 5.0
+    np.testing.assert_allclose(of_relay[0][1:16], right, rtol=1e-15)
+    np.testing.assert_allclose(of_relay[1][1:16], -right / 5.0, rtol=1e-12)
+    np.testing.assert_allclose(of_relay[2][1:16], 2 * right / 25.0, rtol=1e-9)
+    np.testing.assert_allclose(np.unique(of_wave.round(14)), [0.3, 1.0, 1.3, 2.0, 2.3, 2.5], rtol=1e-13)
     # The first knot lies before the motion; unused places hold its end.
-    assert {1.0, 4.0} <= set(np.round(np.asarray(table(2.0)), 12)) <= {-2.0, 0.0, 1.0, 4.0, 10.0}
+    assert {1.0, 4.0} <= set(of_table.round(12)) <= {-2.0, 0.0, 1.0, 4.0, 10.0}
 
 
 @pytest.mark.parametrize("marked", [True, False])
@@ -122,6 +126,6 @@ def test_a_solver_of_ours_is_no_jump(marked, monkeypatch):
         return -100 * jnp.sqrt(slow) - 0.3 * jnp.maximum(q["r"] - 2.0, 0.0)
 
     radial, params = lj.routhian(lj.System(lagrangian), "angle"), {"params": None, "momenta": {"angle": 1.2}}
-    state = State(jnp.asarray(0.0), {"r": jnp.asarray(1.0)}, {"r": jnp.asarray(0.0)}, params)
+    state = State(np.array(0.0), {"r": np.array(1.0)}, {"r": np.array(0.0)}, params)
     jumps = found(model_of(radial, *state), state)
     assert jumps is not None and (len(jumps.slots) + len(jumps.missed) == 1) == marked

@@ -46,7 +46,7 @@ def test_dry_friction():
     assert abs(crept - right) > 0.05 * abs(right)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_friction_in_other_words(monkeypatch):
     """Nested `where`, and |v| in Rayleigh's function; twin: a motion that may not slide is not followed to its rest."""
     size = 0.3 * MASS * GRAVITY
@@ -75,7 +75,7 @@ def test_a_relay_that_slides():
     assert abs(lj.integrate(relay, 1.0, 0.0, 1.0, ts=ts).q[1] - right[0]) > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_blocks_at_once():
     """Two blocks that slide and rest together, from one array of signs, in lanes of different friction."""
     blocks = lj.System(
@@ -89,7 +89,7 @@ def test_two_blocks_at_once():
     np.testing.assert_allclose(found, right, rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_push_sets_a_block_free():
     """A block rests until a push in time is stronger than friction; derivatives by the push's ends and strength.
 

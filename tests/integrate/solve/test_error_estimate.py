@@ -88,10 +88,8 @@ def test_estimated_as_they_are(rtol):
     check_estimates(np.concatenate(found))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name == "default" else pytest.mark.exhaustive) for name in CASES],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", CASES)
 def test_estimated_as_they_are_on_an_orbit(name):
     """Estimates are about the true errors, by each method and wherever the steps come from."""
     ts, settings = CASES[name]
@@ -140,14 +138,6 @@ def test_times_of_crossings():
     """The difference of both runs and round-off; infinite for what the second does not find."""
     first, second = np.array([1.0, 2.0, 4.0, np.nan]), np.array([1.0 + 1e-9, np.nan, 4.0, np.nan])
     np.testing.assert_allclose(_of_times(np, first, second, 1e-12), [1.001e-9, np.inf, 4e-12, np.nan], rtol=1e-6)
-
-
-@pytest.mark.exhaustive
-def test_steps_of_another_controller():
-    """It is unknown how to shorten another controller's steps: there is no estimate, even if one is requested."""
-    given = dict(stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9), estimate_error=True)
-    found = orbit(np.array([0.0, 10.0]), **given)
-    assert bool(found.error.result == lj.RESULTS.not_estimated) and np.isnan(found.error.q["x"]).all()
 
 
 @pytest.mark.exhaustive

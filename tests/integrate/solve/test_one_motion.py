@@ -13,7 +13,7 @@ from lagjax.system import coordinates, model_of
 from tests.systems import HORIZONTAL, PARAMS, pendulum, rod_pendulum
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_event_is_located_by_the_method():
     """The rod pendulum passes the vertical at its quarter period, 1e-9 from the elliptic integral, and NaN follows."""
     special = pytest.importorskip("scipy.special")
@@ -79,24 +79,3 @@ def test_lanes_with_and_without_an_event():
     assert abs(float(batch.end.q[0])) < 1e-12
     assert float(batch.end.t[1]) == 0.25
     assert float(batch.end.t[3]) == pytest.approx(1.5, abs=1e-12)
-
-
-@pytest.mark.exhaustive
-def test_event_time_gradient():
-    """d(quarter period)/dl = T/(2 l), forward and reverse, through the event."""
-    event = diffrax.Event(lambda t, y, params, **kwargs: y[0])
-    time_of = lambda l: (
-        lj.integrate(
-            pendulum,
-            np.pi / 2,
-            0.0,
-            {"g": 9.8125, "l": l},
-            ts=np.array([0.0, 2.0]),
-            rtol=1e-11,
-            atol=1e-11,
-            event=event,
-        ).end.t
-    )
-    expected = float(time_of(1.25)) / 2.5
-    np.testing.assert_allclose(jax.jacfwd(time_of)(1.25), expected, rtol=1e-7)
-    np.testing.assert_allclose(jax.grad(time_of)(1.25), expected, rtol=1e-7)

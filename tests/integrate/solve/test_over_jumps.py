@@ -58,69 +58,74 @@ def test_at_rest_until_a_force_sets_in(rest):
     np.testing.assert_allclose(np.asarray(traj.q)[-1] - rest, 10 * (1 - np.cos(0.75)), rtol=1e-7)
 
 
-@pytest.mark.exhaustive
-def test_derivatives_of_a_brake():
-    """By the velocity, the edge and the strength, in both modes.
+def after_a_wall(v0, **options):
+    """The velocity after a spring with a damper that pushes only, which is linear in that before."""
+    m, k, c = 0.5, 800.0, 8.0
+    force = lambda t, q, v, p: jnp.where(q > 0, -jnp.maximum(k * q + c * v, 0.0), 0.0)
+    wall = lj.System(lambda t, q, v, p: 0.5 * m * v**2, force=force)
+    return lj.integrate(wall, -0.5, v0, ts=ONE, **options).v[-1]
 
-    Twin: with the jump ignored the derivative by v0 is one, and that by the edge zero.
-    """
-    right = lambda v0, edge, by: v0 - by * (1 - edge / v0)
-    at = (2.0, 1.0, 3.0)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        found = derivative(braked, argnums=(0, 1, 2))(*at)
-        np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1, 2))(*at), rtol=1e-9)
-    ignored = partial(braked, jumps="ignored")
-    assert abs(jax.jacfwd(ignored)(2.0) - 1.0) < 1e-6 and jax.grad(ignored, argnums=1)(*at) == 0.0
+
+def after_a_push(lo, hi, **options):
+    """Where a push between two times, shorter than a step, has moved a mass."""
+    return push([0.0, 10.0], 1.0, lo, hi, **options).q[-1]
+
+
+def flown(off, **options):
+    """Where a rocket is that is switched off."""
+    rocket = lj.System(lambda t, q, v, p: v**2, force=lambda t, q, v, p: jnp.where(t < p, 3.0, 0.0))
+    return lj.integrate(rocket, 0.0, 0.0, off, ts=FLIGHT, **options).q
+
+
+FLIGHT = np.array([0.0, 0.5, 0.98, 1.5, 2.0])
+velocity = lambda v0, edge, by: v0 - by * (1 - edge / v0)
+pushed_by = lambda lo, hi: (hi - lo) * (10.0 - (lo + hi) / 2)
+# Functions over a jump, their inputs, and the derivatives by these; and those where jumps are ignored.
+SLOPES = {
+    "brake": (braked, (2.0, 1.0, 3.0), jax.grad(velocity, argnums=(0, 1, 2)), (1.0, 0.0, None)),
+    "wall": (after_a_wall, (2.0,), lambda v0: (after_a_wall(v0) / v0,), (None,)),
+    "push": (after_a_push, (4.0, 4.05), jax.grad(pushed_by, argnums=(0, 1)), (0.0, 0.0)),
+    "rocket": (flown, (0.98,), lambda off: (1.5 * np.maximum(FLIGHT - 0.98, 0.0),), (0.0,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        pytest.param("brake", jax.jacfwd, marks=pytest.mark.slow),
+        *(pytest.param(name, jax.jacfwd, marks=pytest.mark.exhaustive) for name in SLOPES if name != "brake"),
+        *(pytest.param(name, jax.jacrev, marks=pytest.mark.exhaustive) for name in SLOPES),
+    ],
+)
+def test_derivatives_over_jumps(name, mode):
+    """Derivatives by all numbers agree with the closed form, in both modes."""
+    function, at, right, _ = SLOPES[name]
+    for found, expected in zip(mode(function, argnums=tuple(range(len(at))))(*at), right(*at)):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", SLOPES)
+def test_derivatives_where_jumps_are_ignored(name):
+    """Failing twin: by the start it is one, by an edge or a time zero, and behind a wall far off."""
+    function, at, right, wrong = SLOPES[name]
+    found = jax.jacfwd(partial(function, jumps="ignored"), argnums=tuple(range(len(at))))(*at)
+    for of, expected, known in zip(found, right(*at), wrong):
+        if known is not None:
+            np.testing.assert_allclose(of, known, atol=1e-6)
+        elif name == "wall":
+            assert abs(of - expected) > 0.1
 
 
 @pytest.mark.exhaustive
 def test_more_derivatives_of_a_brake():
     """In lanes, and the second ones; twin: the first one in another lane."""
-    right = lambda v0, edge, by: v0 - by * (1 - edge / v0)
     lanes = jnp.array([1.8, 2.0, 2.3])
     found = jax.jit(jax.vmap(jax.grad(braked)))(lanes)
-    np.testing.assert_allclose(found, jax.vmap(jax.grad(lambda v: right(v, 1.0, 3.0)))(lanes), rtol=1e-9)
+    np.testing.assert_allclose(found, jax.vmap(jax.grad(lambda v: velocity(v, 1.0, 3.0)))(lanes), rtol=1e-9)
     assert abs(found[0] - found[1]) > 0.1
     # 2 by edge/v0³
     np.testing.assert_allclose(jax.grad(jax.grad(braked))(2.0), 0.75, rtol=1e-6)
-
-
-@pytest.mark.exhaustive
-def test_a_wall_that_does_not_pull():
-    """A spring with a damper that pushes only: the velocity afterwards is linear in that before.
-
-    Twin: without the jumps' part the derivative is far off.
-    """
-    m, k, c = 0.5, 800.0, 8.0
-    force = lambda t, q, v, p: jnp.where(q > 0, -jnp.maximum(k * q + c * v, 0.0), 0.0)
-    wall = lj.System(lambda t, q, v, p: 0.5 * m * v**2, force=force)
-    after = lambda v0, **options: lj.integrate(wall, -0.5, v0, ts=ONE, **options).v[-1]
-    value = after(2.0)
-    np.testing.assert_allclose(jax.grad(after)(2.0), value / 2.0, rtol=1e-9)
-    assert abs(jax.grad(partial(after, jumps="ignored"))(2.0) - value / 2.0) > 0.1
-
-
-@pytest.mark.exhaustive
-def test_a_pulse_between_two_steps():
-    """A push shorter than a step, with its derivatives by its two ends; twin: ignored, it is missed."""
-    pushed = lj.System(kinetic, force=lambda t, q, v, p: jnp.where((t > p[0]) & (t < p[1]), 1.0, 0.0))
-    end = lambda lo, hi, **options: lj.integrate(pushed, 0.0, 0.0, (lo, hi), ts=[0.0, 10.0], **options).q[-1]
-    right = lambda lo, hi: (hi - lo) * (10.0 - (lo + hi) / 2)
-    np.testing.assert_allclose(end(4.0, 4.05), right(4.0, 4.05), rtol=1e-12)
-    found = jax.grad(end, argnums=(0, 1))(4.0, 4.05)
-    np.testing.assert_allclose(found, jax.grad(right, argnums=(0, 1))(4.0, 4.05), rtol=1e-11)
-    assert end(4.0, 4.05, jumps="ignored") == 0.0
-
-
-@pytest.mark.exhaustive
-def test_a_rocket_switched_off():
-    """Derivatives of all outputs by the time of the switch: F (t - off)/m; twin: zero where it is ignored."""
-    rocket = lj.System(lambda t, q, v, p: v**2, force=lambda t, q, v, p: jnp.where(t < p, 3.0, 0.0))
-    ts = jnp.array([0.0, 0.5, 0.98, 1.5, 2.0])
-    places = lambda off, **options: lj.integrate(rocket, 0.0, 0.0, off, ts=ts, **options).q
-    right = 1.5 * jnp.maximum(ts - 0.98, 0.0)
-    np.testing.assert_allclose(jax.jacfwd(places)(0.98), right, rtol=1e-11, atol=1e-13)
-    assert jnp.all(jax.jacfwd(partial(places, jumps="ignored"))(0.98) == 0)
 
 
 MASS, SPRING, GRAVITY = 1.0, 100.0, 9.81

@@ -18,7 +18,7 @@ def test_constraints_hold_at_every_output():
         assert float(replace(traj, **{name: of | {"x": of["x"] + 1e-7}}).residual()) > 1e-8
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_drift_without_projection():
     """At the same tolerance, without projection, they are off."""
     assert float(lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=5 * TS, rtol=1e-6, drift="none").residual()) > 1e-8

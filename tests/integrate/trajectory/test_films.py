@@ -71,6 +71,13 @@ def test_frames_follow_the_motion(traj):
     np.testing.assert_allclose(ends[:, 1, 0], PARAMS["l"] * np.sin(swing(film.t, 1.0, RATE)[0]), atol=1e-4)
 
 
+def test_a_backward_motion_is_drawn(traj):
+    """The film of a backward motion is the film of the forward motion, reversed."""
+    back = by_hand(pendulum, DENSE[::-1], traj.q[::-1], traj.v[::-1], PARAMS)
+    films = [motion.animate(bob).points["rod"] for motion in (back, traj)]
+    np.testing.assert_allclose(films[0], films[1][::-1], atol=1e-14)
+
+
 def ended(at, result):
     """The motion until some time, with NaN after it."""
     (q, v), end = swing(DENSE, 1.0, RATE), lj.Snapshot(np.asarray(at), *map(np.asarray, swing(at, 1.0, RATE)), {})

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.collections import PathCollection
 
 import lagjax as lj
 from lagjax.display import Anchor, InSpace, Shape
@@ -148,6 +147,8 @@ def test_points_in_the_plane_and_in_space(tmp_path):
 
 def test_the_view_is_from_where_it_is_asked():
     """From above, what lies along y is higher in the figure. Twin: from the side it is not."""
+    from matplotlib.collections import PathCollection
+
     q = {"crank": lj.Pose.at((0.0, 0.0, 0.0)), "rod": lj.Pose.at((0.0, 5.0, 0.0))}
     heights = []
     for view in ((-90.0, 90.0), (-90.0, 0.0)):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 import pytest
 
@@ -13,8 +12,6 @@ from lagjax.mechanics.structure import what_changes_jacobi_integral
 from lagjax.system.model import model_of
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, TS, motion, pendulum
-
-matplotlib.use("agg")
 
 
 @pytest.fixture(scope="module")

@@ -120,6 +120,7 @@ def of_a_motion(name, dtype=np.float64, **how):
     return jax.eval_shape(run, q, v)
 
 
+@pytest.mark.slow
 def test_of_a_motion():
     """At a loose tolerance a network's outputs are interpolated, and the motion is continued by the same method."""
     found = of_a_motion("matrices", rtol=1e-6)
