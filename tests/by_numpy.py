@@ -31,7 +31,7 @@ def numbers(*args):
 
 
 def by_numpy(function):
-    """The same function of trees of numbers, one operation of NumPy's after the other; traced once for all of a shape."""
+    """The same function of trees of numbers, one operation of NumPy's after the other; traced once for each shape."""
     programs = {}
 
     def evaluated(*args):
@@ -56,7 +56,6 @@ def run(closed, *args):
         elif name in (others := WITH_PARAMETERS | MORE_WITH_PARAMETERS | {"scan": _loop}):
             found = others[name](*operands, **params)
         else:
-            print("XLA", name)
             found = applied(closed.jaxpr, equation, operands)
         found = found if isinstance(found, list) else [found]
         return [np.asarray(x, like.aval.dtype) for x, like in zip(found, equation.outvars)]

@@ -23,51 +23,18 @@ LAYER = {"object": {"module": "equinox.nn", "name": "Lambda"}, "fields": {"fn": 
 ATOMS = [None, True, 0, -1, 7, 1.5, 10**12, -(10**30), "x", "", [], {}, [1], [[]], {"array": "t"}, {"given": "x"}]
 ATOMS += [CODE, MODULE, PROGRAM, PARTIAL, OPENER, LAYER, {"float": "nan"}, {"complex": [1]}, {"dict": [[[], 1]]}]
 ATOMS += [{"list": 3}, {"tuple": {"a": 1}}, {"key": "t", "impl": "os"}, {"dict": [["a", 1], ["a", 2]]}]
-NAMES = ["os", "posix.system", "antigravity", "numpy.f2py.__main__", "../../elsewhere/x", "/tmp/elsewhere/x", "t"]
-NAMES += [
-    "",
-    "..",
-    "a/../../../x",
-    "C:\\x",
-    "\x1b[2J\x1b]0;title\x07",
-    "</script><script>alert(1)</script>",
-    "\u202e",
-    "x" * 9999,
-]
-NAMES += [
-    "__class__",
-    "__init__",
-    "zarr.json",
-    "lagjax",
-    "object",
-    "O",
-    "|O",
-    ">f8",
-    "float64[1000000000000]",
-    "values\x00",
-]
+NAMES = [
+    "os", "posix.system", "antigravity", "numpy.f2py.__main__", "../../elsewhere/x", "/tmp/elsewhere/x", "t", "", "..",
+    "a/../../../x", "C:\\x", "\x1b[2J\x1b]0;title\x07", "</script><script>alert(1)</script>", "\u202e", "x" * 9999,
+    "__class__", "__init__", "zarr.json", "lagjax", "object", "O", "|O", ">f8", "float64[1000000000000]", "values\x00",
+]  # fmt: skip
 TEXTS = [
-    b"[1]",
-    b"null",
-    b'"format"',
-    b"3",
-    b"{}",
-    b"",
-    b"\xff\xfe",
-    b"[" * 100_000,
-    b'{"a":' * 50_000,
-    b"nan",
-    b"1" * 9999,
-]
-TEXTS += [
-    b'{"format": "1"}',
-    b'{"format": 1}',
-    b'{"format": 1, "kind": []}',
-    b'{"format": true, "kind": "fit"}',
-    b"{" * 900,
-]
-TEXTS += [b'{"format": 1, "kind": "%s", "%s": ' + b"[" * 800 + b"]" * 800 + b"}", b'{"format": 99}', b'{"format": 0}']
-TEXTS += [b'{"format": 1, "kind": "trajectory", "trajectory": [1]}', b'{"format": 1, "kind": "fit", "fit": null}']
+    b"[1]", b"null", b'"format"', b"3", b"{}", b"", b"\xff\xfe", b"[" * 100_000, b'{"a":' * 50_000, b"nan",
+    b"1" * 9999, b'{"format": "1"}', b'{"format": 1}', b'{"format": 1, "kind": []}',
+    b'{"format": true, "kind": "fit"}', b"{" * 900,
+    b'{"format": 1, "kind": "%s", "%s": ' + b"[" * 800 + b"]" * 800 + b"}", b'{"format": 99}', b'{"format": 0}',
+    b'{"format": 1, "kind": "trajectory", "trajectory": [1]}', b'{"format": 1, "kind": "fit", "fit": null}',
+]  # fmt: skip
 HEADERS = [  # of npy
     "{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,), }",
     "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }",
@@ -183,10 +150,8 @@ def mutated_file(good: Path, to: Path, rng: np.random.Generator) -> str:
         # A thousandth of its size: an array of zeros, or a description of spaces.
         compression, n = zipfile.ZIP_DEFLATED, 3_000_000
         if rng.integers(2):
-            contents[i] = (
-                contents[i][0],
-                npy(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n},), }}", bytes(8 * n)),
-            )
+            header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({n},), }}"
+            contents[i] = contents[i][0], npy(header, bytes(8 * n))
         else:
             contents[0] = "lagjax.json", b" " * 8 * n + contents[0][1]
     buffer = io.BytesIO()
@@ -221,10 +186,8 @@ def mark(store: Path, name: str, block: int) -> None:
     """Mark a block's file as what it is now, as an attacker would."""
     values = json.loads((store / "lagjax/zarr.json").read_text())["attributes"]["lagjax"]["places"]
     names = [*values["values"].values(), *values["status"].values()]
-    file, of = (
-        store / f"lagjax/marks/c/{block}/0/0",
-        list((store / name / "c" / str(block)).rglob("*"))[-1].read_bytes(),
-    )
+    file = store / f"lagjax/marks/c/{block}/0/0"
+    of = list((store / name / "c" / str(block)).rglob("*"))[-1].read_bytes()
     marks = np.frombuffer(file.read_bytes()[:-4], "<u8").reshape(-1, 2).copy()
     marks[names.index(name)] = len(of), int.from_bytes(of[-4:], "little")
     file.write_bytes(marks.tobytes() + crc32c(marks.tobytes()).to_bytes(4, "little"))

@@ -3,44 +3,21 @@
 import pytest
 
 # Examples of docstrings that compile programs of their own, for 2 to 10 s.
-SLOW_EXAMPLES = {
-    "lagjax.analysis.continuation.equilibria.continue_equilibria",
-    "lagjax.analysis.continuation.orbits.continue_orbits",
-    "lagjax.analysis.energy.energy_ledger",
-    "lagjax.analysis.explain.explain",
-    "lagjax.analysis.formulations.action.action",
-    "lagjax.analysis.equilibria.equilibria.equilibria",
-    "lagjax.analysis.orbits.floquet.floquet",
-    "lagjax.analysis.orbits.lyapunov.lyapunov_exponents",
-    "lagjax.analysis.orbits.periodic_orbit.periodic_orbit",
-    "lagjax.analysis.poincare.poincare",
-    "lagjax.analysis.poincare.turning_points",
-    "lagjax.exchange.standalone_programs.export",
-    "lagjax.fit.fit.fit",
-    "lagjax.fit.identifiability.identifiability",
-    "lagjax.fit.load.load_fit",
-    "lagjax.fit.loss.fit_loss",
-    "lagjax.fit.loss.fit_residuals",
-    "lagjax.integrate.adjoint.replay.Replay",
-    "lagjax.integrate.contacts.contacts.touches",
-    "lagjax.integrate.events.event.Crossing",
-    "lagjax.numerics.methods.gauss.Gauss",
-    "lagjax.numerics.methods.nystrom.Nystrom8",
-    "lagjax.numerics.methods.radau.Radau5",
-    "lagjax.numerics.methods.splitting.Splitting",
-    "lagjax.sweep.sweep.sweep",
-    "lagjax.system.elements.CompliantContact",
-    "lagjax.system.elements.SampledControl",
-    "lagjax.system.hybrid.Hybrid",
-    "lagjax.two_points.connect.connect",
-    "lagjax.two_points.geodesic.exponential_map",
-    "lagjax.two_points.geodesic.geodesic",
-    "lagjax.two_points.optimal_control.steer",
-    "lagjax.two_points.steering.Steering",
-    "lagjax.two_points.tracking.TrackingLQR",
-    "lagjax.work_precision.over_horizons.horizons",
-    "lagjax.work_precision.work_precision.work_precision",
-}
+NAMES = """
+    analysis.continuation.equilibria.continue_equilibria analysis.continuation.orbits.continue_orbits
+    analysis.energy.energy_ledger analysis.equilibria.equilibria.equilibria analysis.explain.explain
+    analysis.formulations.action.action analysis.orbits.floquet.floquet analysis.orbits.lyapunov.lyapunov_exponents
+    analysis.orbits.periodic_orbit.periodic_orbit analysis.poincare.poincare analysis.poincare.turning_points
+    exchange.standalone_programs.export fit.fit.fit fit.identifiability.identifiability fit.load.load_fit
+    fit.loss.fit_loss fit.loss.fit_residuals integrate.adjoint.replay.Replay integrate.contacts.contacts.touches
+    integrate.events.event.Crossing numerics.methods.gauss.Gauss numerics.methods.nystrom.Nystrom8
+    numerics.methods.radau.Radau5 numerics.methods.splitting.Splitting sweep.sweep.sweep
+    system.elements.CompliantContact system.elements.SampledControl system.hybrid.Hybrid two_points.connect.connect
+    two_points.geodesic.exponential_map two_points.geodesic.geodesic two_points.optimal_control.steer
+    two_points.steering.Steering two_points.tracking.TrackingLQR work_precision.over_horizons.horizons
+    work_precision.work_precision.work_precision
+"""
+SLOW_EXAMPLES = {f"lagjax.{name}" for name in NAMES.split()}
 
 
 def exhaustive_but(kept, cases):

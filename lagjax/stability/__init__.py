@@ -4,6 +4,8 @@
 ends of their ranges, each compared with a closed form or an independent value.
 """
 
+from dataclasses import replace
+
 from lagjax.report import FULL, MAIN, QUICK
 from lagjax.stability.amplifying import amplifying
 from lagjax.stability.constraints import redundant
@@ -20,4 +22,5 @@ FAMILIES = (wedge, bead, separatrix, long, stiff, stable_steps, geodesics, ampli
 
 def trials(tier=FULL):
     """The rows of the QUICK, MAIN or FULL tier."""
-    return [row for family in FAMILIES for row in family() if row.tier <= tier]
+    rows = [row for family in FAMILIES for row in family() if row.tier <= tier]
+    return [replace(row, along=None) if isinstance(row, Trial) and row.derived_in > tier else row for row in rows]

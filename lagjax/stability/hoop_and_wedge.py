@@ -69,19 +69,20 @@ def bead():
     critical = float(np.sqrt(9.8125 / 0.75))
     tiers = {0.0: QUICK, 1e6: QUICK}
     rows = [
-        swing(f"omega = {omega:g}", {"omega": omega}, 1.0, 3.7, tier=tiers.get(omega, FULL))
+        swing(f"omega = {omega:g}", {"omega": omega}, 1.0, 3.7, tier=tiers.get(omega, FULL), derived_in=MAIN)
         for omega in (0.0, 1.0, 1e3, 1e6)
     ]
     for psi in (1.0, 2.0**-10):
         for side in (-1e-9, 1e-9):
             name, omega = f"omega = critical (1 {side:+.0e}), psi = {psi:.3g}", critical * (1 + side)
-            rows.append(swing(name, {"omega": omega}, psi, 3.7, tier=MAIN if side > 0 else FULL))
+            tier = MAIN if side > 0 else FULL
+            rows.append(swing(name, {"omega": omega}, psi, 3.7, tier=tier, derived_in=MAIN))
     return by_both(rows)
 
 
 def by_both(rows):
     """The rows by the default method, `Nystrom12` for the bead, and by the default method of constrained systems."""
-    return [*rows, *(replace(row, method=Dopri8()) for row in rows)]
+    return [*rows, *(replace(row, method=Dopri8(), tier=FULL) for row in rows)]
 
 
 def separatrix():

@@ -110,6 +110,7 @@ class Trial:
     - `method`: None for the default. `along`: (dq0, dv0, dparams), the direction of the derivative; None for no check
       of the derivative and of lanes.
     - `tolerance`: the requested one; `options`: further options of `integrate`, such as an atol per coordinate.
+    - `derived_in`: the least tier that looks at the derivative and lanes, which compile for three times as long.
     - `periods`: the length of the motion; `amplification`: the factor by which it magnifies an error of its start.
     """
 
@@ -130,6 +131,7 @@ class Trial:
     amplification: float = 1.0
     expected: str | None = ACCURATE
     tier: int = FULL
+    derived_in: int = FULL
 
     @property
     def allowed(self) -> float:

@@ -36,34 +36,9 @@ def spherical_lagrangian(t, q, v, params):
     return kinetic + g * length * jnp.cos(q["theta"])
 
 
-def top_lagrangian(t, q, v, params):
-    """A symmetric top on its tip, by two tilts and its spin: regular in the upright position."""
-    spin = v["spin"] + v["alpha"] * jnp.sin(q["beta"])
-    tilting = (v["alpha"] * jnp.cos(q["beta"])) ** 2 + v["beta"] ** 2
-    height = jnp.cos(q["alpha"]) * jnp.cos(q["beta"])
-    return 0.5 * params["I1"] * tilting + 0.5 * params["I3"] * spin**2 - params["Mgl"] * height
-
-
 def charge_lagrangian(t, q, v, params):
     """A unit charge in a homogeneous magnetic field."""
     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) + params["B"] * q["x"] * v["y"]
-
-
-def disk_lagrangian(t, q, v, params):
-    """A disk on its edge, by its contact (x, y), yaw, lean and spin; n is its axle, level to the left when upright."""
-    m, r, A, C, g = (params[name] for name in ("m", "r", "A", "C", "g"))
-    sin, cos, s, c = jnp.sin(q["lean"]), jnp.cos(q["lean"]), jnp.sin(q["yaw"]), jnp.cos(q["yaw"])
-    x = v["x"] + r * (v["lean"] * cos * s + sin * c * v["yaw"])
-    y = v["y"] - r * (v["lean"] * cos * c - sin * s * v["yaw"])
-    z = -r * sin * v["lean"]
-    turning = A * (v["lean"] ** 2 + (v["yaw"] * cos) ** 2) + C * (v["spin"] + v["yaw"] * sin) ** 2
-    return 0.5 * m * (x**2 + y**2 + z**2) + 0.5 * turning - m * g * r * cos
-
-
-def rolling(t, q, v, params):
-    """The contact moves along the heading as far as the rim rolls."""
-    r = params["r"]
-    return jnp.stack([v["x"] - r * v["spin"] * jnp.cos(q["yaw"]), v["y"] - r * v["spin"] * jnp.sin(q["yaw"])])
 
 
 def plane_lagrangian(t, q, v, params):
@@ -81,9 +56,7 @@ chain = lj.System(chain_lagrangian)
 free_chain = lj.System(free_chain_lagrangian)
 foucault = lj.System(foucault_lagrangian)
 spherical = lj.System(spherical_lagrangian)
-top = lj.System(top_lagrangian)
 charge = lj.System(charge_lagrangian)
-disk = lj.System(disk_lagrangian, {"rolling": lj.Nonholonomic(rolling)})
 circulating = lj.System(
     plane_lagrangian,
     force=follower,

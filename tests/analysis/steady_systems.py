@@ -6,21 +6,6 @@ import numpy as np
 import lagjax as lj
 
 
-def truss_lagrangian(t, q, v, params):
-    """Von Mises' truss: two elastic bars from (±a, 0) to the apex (0, q), loaded there by P downward."""
-    rest = jnp.sqrt(params["a"] ** 2 + params["h"] ** 2)
-    stretch = jnp.sqrt(params["a"] ** 2 + q**2) - rest
-    return 0.5 * v**2 - params["k"] * stretch**2 - params["P"] * q
-
-
-def snap_through(params):
-    """The snap-through load: P = 2 k (l0/l - 1) q is largest at l³ = l0 a²."""
-    a, h, k = params["a"], params["h"], params["k"]
-    rest = jnp.sqrt(a**2 + h**2)
-    length = jnp.cbrt(rest * a**2)
-    return 2 * k * (rest / length - 1) * jnp.sqrt(length**2 - a**2)
-
-
 def column_lagrangian(t, q, v, params):
     """Two links with springs at their joints, compressed by P; q are their angles from the vertical."""
     bending = 0.5 * params["c"] * (q[0] ** 2 + (q[1] - q[0]) ** 2)
@@ -104,7 +89,6 @@ def rail_pendulum_lagrangian(t, q, v, params):
     return 0.5 * (u @ u + fall**2) + params["g"] * depth
 
 
-truss = lj.System(truss_lagrangian)
 column = lj.System(column_lagrangian)
 forms = lj.System(forms_lagrangian)
 top = lj.System(top_lagrangian)
@@ -113,7 +97,6 @@ damped_ziegler = lj.System(ziegler_lagrangian, force=follower_force, dissipation
 conical = lj.System(conical_lagrangian, {"rod": lj.Holonomic(rod_3d)})
 turning_pendulum = lj.System(rail_pendulum_lagrangian)
 
-TRUSS = {"a": 1.0, "h": 0.5, "k": 100.0, "P": -6.0}
 COLUMN = {"c": 3.0, "l": 2.0, "P": 0.1}
 # At μ = c/a: ±√((a μ - c)/h) branch off from 0, and (a μ - c)/d crosses it.
 FORMS = {"mu": -1.0} | dict.fromkeys("abcdehs", 0.0)

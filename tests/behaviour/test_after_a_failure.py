@@ -36,7 +36,7 @@ def finite_after(traj, t):
 
 
 def test_bounces_that_accumulate():
-    """From 5 apart, at a relative acceleration of 10, infinitely many impacts until t = 3; from there nothing is finite.
+    """From 5 apart, at an acceleration of 10, infinitely many impacts until t = 3; from there on nothing is finite.
 
     Twin: at speeds at which they are elastic, they hit three times until 3.5, and are known throughout.
     """

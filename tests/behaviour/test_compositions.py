@@ -107,7 +107,7 @@ def pushed(function, composition):
 
 @pytest.mark.slow
 def test_a_curvature_in_closed_form():
-    """Of q² of an oscillator whose stiffness is p·k: u·H·w is its second derivative by the stiffness, (u·k)(w·k)-fold."""
+    """Of an oscillator of stiffness p·k: u·H·w is the second derivative by the stiffness, times (u·k)(w·k)."""
     k = np.linspace(0.5, 1.5, P.size)
     oscillator = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p @ k) * q**2)
     loss = lambda p: jnp.sum(lj.integrate(oscillator, 0.5, 0.0, p, ts=TS, rtol=1e-10, estimate_error=False).q ** 2)

@@ -65,7 +65,7 @@ CASES = {
 }  # fmt: skip
 
 
-GEOMETRIC = 0.5 ** np.arange(20.0)
+GEOMETRIC = 0.5 ** np.arange(10.0)
 
 
 def stepped(h, rejected=0, left=100.0):

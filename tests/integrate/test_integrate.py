@@ -243,17 +243,3 @@ def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
         np.testing.assert_allclose(mine, theirs, rtol=1e-8, atol=1e-8)
     assert f"{name} (diffrax's, in lagjax's form), rtol" in repr(found)
     assert "form)" not in repr(expected) + jax.eval_shape(by_method(ours), g).static.method
-
-
-@pytest.mark.exhaustive
-def test_methods_with_options_stay():
-    """Other methods, those with an option set, and those that a condition evaluates are not replaced by ours."""
-    looped = diffrax.Dopri8(scan_kind="lax")
-    method_by = lambda method, **options: (
-        jax.eval_shape(by_method(method, **options), jnp.asarray(PARAMS["g"])).static.method
-    )
-    assert method_by(looped) == "Dopri8" and method_by(diffrax.Heun()) == "Heun"
-    event = diffrax.Event(lambda t, y, args, *, solver, **kwargs: y[0]["x"] < 0)
-    assert method_by(diffrax.Dopri8(), event=event) == "Dopri8"
-    for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.DirectAdjoint()):
-        assert "in lagjax's form" in method_by(diffrax.Dopri8(), adjoint=adjoint)

@@ -50,6 +50,7 @@ NOT_LINEAR = {
     "stop_gradient": lambda n, v: -0.3 * jax.lax.stop_gradient(n) * E,
     "almost abs": lambda n, v: -0.3 * jnp.sqrt(n**2 + 1e-6) * E,
     "tanh": lambda n, v: -0.3 * jnp.tanh(n) * E,
+    "a quotient": lambda n, v: -0.3 * n / (1.0 + n**2) * E,
     "clip far out": lambda n, v: -0.3 * jnp.clip(n, -100.0, 100.0) * E,
 }
 

@@ -44,6 +44,7 @@ FUNCTIONS = {
     "stacks": lambda x: jnp.stack([x, 2 * x], axis=1) @ jnp.array([1.0, -1.0]),
     "sums": lambda x: jnp.cumsum(x) + jnp.sum(MATRIX * x[None], axis=0) + jnp.mean(x),
     "choices": lambda x: jnp.where(x > 0, x, jnp.sin(x)) * jnp.clip(x, -1, 1) + jnp.maximum(x, 0.5) ** 3,
+    "cosines": lambda x: jnp.cos(x) * jnp.sin(x[0]),
     "indices": lambda x: x[jnp.array([3, 0, 2])] + x[1] * x[-1] + jnp.take(x, 2),
     "order": lambda x: jnp.sort(x) + jnp.argmax(x) + jnp.max(x),
     "loops": lambda x: lax.scan(lambda c, y: (c + y, c * y), 0.0, x)[1] + lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),

@@ -20,9 +20,7 @@ from tests.tiers import exhaustive_but
 HELIX_POINTS = ((1.5, 0.75, 2.0), (0.5, 0.75, 2.0), (1.25, 3.0, 0.5), (0.75, 1.0, 8.0))
 # For s > a the reference used K_n instead of K_n' (mpmath's besselk ignores derivative=1): checked below.
 WRONG = {"s4g.dPhi/ds(s=1.5,chi=0.75,h=2)": (1.5, 0.75, 2.0), "s4g.dPhi/ds(s=1.25,chi=3,h=0.5)": (1.25, 3.0, 0.5)}
-FIELDS = {
-    name: by_numpy(jax.value_and_grad(f)) for name, f in {**scene.POTENTIALS, "strip": potentials.strip}.items()
-}
+FIELDS = {name: by_numpy(jax.value_and_grad(f)) for name, f in {**scene.POTENTIALS, "strip": potentials.strip}.items()}
 
 
 def in_field(name, x, y, z, **change):

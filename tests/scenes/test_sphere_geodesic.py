@@ -126,7 +126,9 @@ def test_over_the_azimuth():
     )
     (psi, slope), (rate, second) = moving(A, B, 1.25)
     assert float(rate) == pytest.approx(float(slope), rel=1e-13)
-    assert float(second) == pytest.approx(float(equations(geodesic.over_azimuth, 1.25, psi, slope, PARAMS).a), rel=1e-11)
+    assert float(second) == pytest.approx(
+        float(equations(geodesic.over_azimuth, 1.25, psi, slope, PARAMS).a), rel=1e-11
+    )
     assert np.sin(psi) ** 2 / np.hypot(np.sin(psi), slope) == pytest.approx(reference("s1.generic.clairaut_cos_i"))
     np.testing.assert_allclose(over_azimuth(A, B, np.array([theta1, theta2]))[0], [psi1, psi2], rtol=1e-13)
     assert not np.allclose(over_azimuth(A, -B, theta2)[0], psi2, rtol=1e-2)
@@ -138,7 +140,9 @@ def test_embedded_path_and_multiplier():
     np.testing.assert_allclose(q0, [R * np.sin(0.5), 0.0, R * np.cos(0.5)], atol=1e-15)
     np.testing.assert_allclose(v0, [-np.cos(0.5), 0.0, np.sin(0.5)], atol=1e-15)
     path = lambda s: geodesic.exact_embedded(q0, v0, s)
-    (q, v), (rate, second) = by_numpy(lambda s: jax.jvp(path, (s,), (jnp.ones_like(s),)))(np.array([0.0, 0.75, 3.0]) * R)
+    (q, v), (rate, second) = by_numpy(lambda s: jax.jvp(path, (s,), (jnp.ones_like(s),)))(
+        np.array([0.0, 0.75, 3.0]) * R
+    )
     np.testing.assert_allclose([q[0], v[0], q[1]], [q0, v0, [R * np.sin(-0.25), 0, R * np.cos(0.25)]], atol=1e-14)
     np.testing.assert_allclose(rate, v, atol=1e-15)
     assert np.ptp(np.sum(q**2, 1)) < 1e-14 and np.ptp(np.sum(v**2, 1)) < 1e-14

@@ -344,7 +344,7 @@ def forget():
         kept.clear()
 
 
-@pytest.mark.parametrize("histories", [2 * len(HOLDERS), pytest.param(10 * len(HOLDERS), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("histories", [2 * len(HOLDERS), pytest.param(320, marks=pytest.mark.exhaustive)])
 def test_answers_of_random_histories(histories):
     """In random histories of changes every answer is that of a fresh process."""
     wrong, asked = wrong_answers(np.random.default_rng(0), histories)
@@ -491,15 +491,12 @@ def test_constraints_and_guards_are_read_again():
 
 @pytest.mark.slow
 def test_events_are_read_again():
-    """The time of an event at q = level, after that has changed; and a motion, after the weight has."""
-    held = [1.0]
-    free, heavy = (lj.System(lambda t, q, v, p, k=k: 0.5 * v**2 - k * held[0] * q) for k in (0.0, 1.0))
+    """The time of an event at q = level, after that has changed."""
+    held, free = [1.0], lj.System(lambda t, q, v, p: 0.5 * v**2)
     at_level = {"level": lj.Crossing(lambda t, q, v, p: q - held[0])}
     for held[0] in (1.0, 2.0):
         motion = lj.integrate(free, 0.0, 2.0, ts=np.array([0.0, 9.0]), events=at_level)
         np.testing.assert_allclose(motion.end.t, held[0] / 2, rtol=1e-12)
-        fallen = lj.integrate(heavy, 1.0, 0.0, ts=np.array([0.0, 1.0])).q[-1]
-        np.testing.assert_allclose(fallen, 1.0 - held[0] / 2, atol=1e-12)
 
 
 @pytest.mark.slow

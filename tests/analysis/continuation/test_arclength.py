@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from tests.analysis.continuation.test_equilibria import branches, check
-from tests.analysis.steady_systems import ENDS, FOLDS, FORMS, TRUSS, forms, snap_through, truss  # fmt: skip
+from tests.analysis.steady_systems import ENDS, FOLDS, FORMS, forms  # fmt: skip
 
 
 def test_folds():
@@ -20,24 +20,6 @@ def test_folds():
     off = np.abs(np.abs(branch.q) - edge) > 1e-6
     np.testing.assert_array_equal(branch.stable[off], np.abs(branch.q[off]) > edge)
     np.testing.assert_allclose(branch.parameter, (c * branch.q + h * branch.q**3 - e) / b, rtol=1e-11, atol=1e-11)
-    assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
-
-
-@pytest.mark.exhaustive
-def test_truss():
-    """It snaps through at folds in both directions, at the load of the closed form; between them it is unstable."""
-    found = lj.continue_equilibria(truss, TRUSS, 0.6, along="P", to=6.0)
-    assert [c.kind for c in found.critical] == ["fold", "fold"] and len(found) == 1
-    lower, upper = sorted(found.critical, key=lambda c: c.parameter)
-    check(upper, snap_through, TRUSS, "P")
-    check(lower, lambda p: -snap_through(p), TRUSS, "P")
-    branch = found[0]
-    between = (branch.q < float(upper.q) - 1e-6) & (branch.q > float(lower.q) + 1e-6)
-    outside = (branch.q > float(upper.q) + 1e-6) | (branch.q < float(lower.q) - 1e-6)
-    assert not branch.stable[between].any() and branch.stable[outside].all()
-    rest = np.hypot(TRUSS["a"], TRUSS["h"])
-    load = -2 * TRUSS["k"] * (1 - rest / np.hypot(TRUSS["a"], branch.q)) * branch.q
-    np.testing.assert_allclose(branch.parameter, load, rtol=1e-11, atol=1e-11)
     assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
 
 
@@ -69,6 +51,7 @@ def test_folds_of_random_curves():
     assert counted > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [1e-3, pytest.param(1e-6, marks=pytest.mark.exhaustive)])
 def test_nearly_a_pitchfork(e):
     """With a small push there is no crossing, steps do not jump to the other branch, and the branch stays stable."""

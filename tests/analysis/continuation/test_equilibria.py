@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.scenes import bead_on_hoop, cross_rails
+from lagjax.scenes import cross_rails
 from tests.analysis.steady_systems import BUCKLING, COLUMN, EXCHANGE, FOLDS, PITCHFORK, column, forms  # fmt: skip
 from tests.by_numpy import by_numpy
 
-BEAD = bead_on_hoop.PARAMS
 CRITICAL = 1e-10
 SLOPE = 1e-8
 
@@ -26,11 +25,6 @@ def branches(kind, to=0.75):
         "earlier": (PITCHFORK | {"c": 0.5 - 1e-3}, 0.0),
     }[kind]  # fmt: skip
     return lj.continue_equilibria(forms, params, start, along="mu", to=-1.0 if kind == "from the side" else to)
-
-
-def bead(first, start, last):
-    """Branches along the speed of the hoop."""
-    return lj.continue_equilibria(bead_on_hoop.system, BEAD | {"omega": first}, start, along="omega", to=last)
 
 
 def check(critical, exact, params, along, names=None):
@@ -83,24 +77,6 @@ def test_exchange_of_stability():
     np.testing.assert_allclose(other.q, (a * other.parameter - c) / d, atol=1e-13)
     off = np.abs(other.parameter - c / a) > 1e-6
     np.testing.assert_array_equal(other.stable[off], other.parameter[off] > c / a)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("from_the_side", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
-def test_bead(from_the_side):
-    """ω_c = √(g/a), dω_c/da = -½ √(g/a³), along the bottom, or the tilt, whose eigenvalue only touches zero."""
-    found = bead(8.0, 1.3, 1.0) if from_the_side else bead(1.0, 0.0, 8.0)
-    (critical,) = found.critical
-    assert critical.kind == "pitchfork" and critical.branches == (0, 1) and len(found) == 2
-    check(critical, lambda p: jnp.sqrt(p["g"] / p["a"]), BEAD, "omega")
-    np.testing.assert_allclose(critical.derivative["a"], -0.5 * np.sqrt(BEAD["g"] / BEAD["a"] ** 3), rtol=1e-10)
-    side, bottom = (found[0], found[1]) if from_the_side else (found[1], found[0])
-    below = bottom.parameter < float(critical.parameter) * (1 - 1e-9)
-    above = bottom.parameter > float(critical.parameter) * (1 + 1e-9)
-    assert bottom.stable[below].all() and not bottom.stable[above].any() and side.stable.all()
-    tilt = np.arccos(np.minimum(1.0, BEAD["g"] / (BEAD["a"] * side.parameter**2)))
-    np.testing.assert_allclose(np.abs(side.q), tilt, atol=1e-7)
-    assert side.q.min() < -1 and side.q.max() > 1 and np.min(np.abs(side.q)) < 1e-9
 
 
 # Several coordinates.

@@ -6,7 +6,9 @@ import pytest
 
 import lagjax as lj
 from lagjax.scenes import bead_on_hoop
-from tests.analysis.continuation.test_equilibria import BEAD, check
+from tests.analysis.continuation.test_equilibria import check
+
+BEAD = bead_on_hoop.PARAMS
 
 
 @pytest.mark.exhaustive

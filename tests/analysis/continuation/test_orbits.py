@@ -173,7 +173,8 @@ def test_a_cycle_that_shrinks_and_one_that_folds():
 def test_torus_of_a_driven_van_der_pol():
     """With less drive entrainment is lost: a pair passes the unit circle, as SciPy's multipliers do."""
     lagrangian = lambda t, q, v, p: known.spring_lagrangian(t, q, v, p) + p["f"] * q * jnp.cos(2 * t)
-    orbit = lj.periodic_orbit(lj.System(lagrangian, force=known.van_der_pol.force), (-2.0, 0.0), np.pi, {"f": 6.0, "mu": 0.5})
+    system = lj.System(lagrangian, force=known.van_der_pol.force)
+    orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0, "mu": 0.5})
     branch = lj.continue_orbits(orbit, along="f", to=0.5)
     (torus,) = branch.critical
     assert torus.kind == "torus" and branch.stable[0] and not branch.stable[-1]

@@ -13,11 +13,6 @@ import lagjax as lj
 TIGHT = 1e-11
 
 
-def refused_in(kind, coordinate):
-    """Expect an error that names the coordinate in which M is singular, and a remedy."""
-    return pytest.raises(kind, match=f"(?s)singular in coordinate '{coordinate}'.*Fix:")
-
-
 # A massless crank: M is singular, but definite on the motions that the rod allows, except at its dead centres.
 
 
@@ -67,36 +62,6 @@ def test_massless_crank_reaches_its_dead_centre():
     where = rf"stopped at t = {dead_centre:.6f}\d*,(?s:.*)crank = \S+, x = 1\.5"
     with pytest.raises(RuntimeError, match=where):
         lj.integrate(crank, *crank_state(0.5, speed), CRANK, ts=CRANK_TS, rtol=TIGHT, atol=TIGHT)
-
-
-@pytest.mark.slow
-def test_massless_crank_at_its_dead_centre():
-    """At the dead centre the accelerations are refused by name."""
-    q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
-    with refused_in(ValueError, "crank"):
-        lj.accelerations(crank, 0.0, q0, v0, CRANK)
-
-
-@pytest.mark.exhaustive
-def test_massless_crank_does_not_start_at_its_dead_centre():
-    """A motion that starts at the dead centre is refused by name."""
-    q0, v0 = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
-    with refused_in(ValueError, "crank"):
-        lj.integrate(crank, q0, v0, CRANK, ts=CRANK_TS, rtol=TIGHT, atol=TIGHT)
-
-
-@pytest.mark.slow
-def test_massless_crank_without_its_rod():
-    """Without the constraint nothing replaces the missing mass: the accelerations are refused by name."""
-    with refused_in(ValueError, "crank"):
-        lj.accelerations(lj.System(crank_lagrangian), 0.0, *crank_state(0.5, 1.0), CRANK)
-
-
-@pytest.mark.exhaustive
-def test_massless_crank_without_its_rod_does_not_start():
-    """Without its rod the crank is not integrated either."""
-    with refused_in(ValueError, "crank"):
-        lj.integrate(lj.System(crank_lagrangian), *crank_state(0.5, 1.0), CRANK, ts=CRANK_TS)
 
 
 # A charge in its proper time: M = m diag(-1, 1, 1) is indefinite. E along x, B along z, and a scalar field f x.
@@ -286,22 +251,6 @@ paced = lj.System(proper_time)
 PACED = ({"t": 0.0, "x": 0.0, "y": 0.0}, {"t": 1.25, "x": 0.5, "y": 0.25})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("k", [0.0, 0.5])
-def test_accelerations_of_an_arbitrary_parameter_are_refused(k):
-    """The parametrisation is not determined, as M is singular along v: the accelerations are refused by name."""
-    with refused_in(ValueError, "[txy]"):
-        lj.accelerations(paced, 0.0, *PACED, {"k": k})
-
-
-@pytest.mark.exhaustive
-def test_an_arbitrary_parameter_is_not_integrated():
-    """It is not integrated either, with a force (k) or without: the error names a coordinate of the singular M."""
-    for k in (0.0, 0.5):
-        with refused_in((ValueError, RuntimeError), "[txy]"):
-            lj.integrate(paced, *PACED, {"k": k}, ts=np.array([0.0, 1.0]), max_steps=256)
-
-
 # The azimuth is singular at the poles of a sphere; great circles are not.
 
 polar = lj.System(lambda t, q, v, params: 0.5 * (v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2))
@@ -326,12 +275,6 @@ def polar_state(miss, s):
     return q, {"psi": np.cos(miss) * sine / distance, "theta": np.sin(miss) / distance**2}
 
 
-def test_a_start_at_the_pole_is_refused():
-    """At the pole nothing determines the azimuth: it is refused by name, with Cartesian coordinates as the remedy."""
-    with pytest.raises(ValueError, match="(?s)singular in coordinate 'theta'.*azimuth at the pole.*Cartesian"):
-        lj.accelerations(polar, 0.0, {"psi": 0.0, "theta": 0.25}, {"psi": 1.0, "theta": 0.0}, None)
-
-
 def distance_to_great_circle(traj, miss):
     """The largest distance, at the outputs, between a path in ψ and θ and its great circle."""
     psi, theta = np.asarray(traj.q["psi"]), np.asarray(traj.q["theta"])
@@ -342,30 +285,23 @@ def distance_to_great_circle(traj, miss):
 @pytest.mark.exhaustive
 def test_through_the_pole_or_not_at_all():
     """A path into the pole continues on its great circle, to the tolerance, or ends at the pole; nothing else."""
-    outcomes = []
+    outcomes, ts = [], np.array([-1.0, -0.25, 0.5, 1.25])
     for miss, tol, first in itertools.product(NEAR_MISSES, (1e-6, 1e-9, 1e-12), (-1.0, -0.77, -1.31)):
-        ts = np.array([first, -0.25, 0.5, 1.25])
-        traj = lj.integrate(polar, *polar_state(miss, first), ts=ts, rtol=tol, atol=tol, throw=False)
+        settings = {"rtol": tol, "atol": tol, "throw": False}
+        traj = lj.integrate(polar, *polar_state(miss, first), ts=np.array([first, *ts[1:]]), **settings)
         through = bool(traj.result == lj.RESULTS.successful)
         outcomes.append(through)
         if through:
             assert distance_to_great_circle(traj, miss) < 20 * tol, (miss, tol, first)
         else:
             assert abs(float(traj.end.t)) < 1e-12 and abs(float(traj.end.q["psi"])) < 1e-12, (miss, tol, first)
+    # Twin: fixed steps that are too long for the passage leave the great circle.
+    fixed = {"dt0": 0.125, "stepsize_controller": diffrax.ConstantStepSize()}
+    assert distance_to_great_circle(lj.integrate(polar, *polar_state(0.05, -1.0), ts=ts, **fixed), 0.05) > 1e-3
     # Both outcomes occur, and the error says where.
     assert set(outcomes) == {True, False}
     with pytest.raises(RuntimeError, match=r"stopped at t = -?\d\.\d+e-14,(?s:.*)psi = \d\.\d+e-14, theta ="):
-        lj.integrate(polar, *polar_state(1e-15, -1.0), ts=np.array([-1.0, -0.25, 0.5, 1.25]), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.exhaustive
-def test_past_the_pole_with_fixed_steps_would_show():
-    """Twin: fixed steps that are too long for the passage leave the great circle."""
-    ts = np.array([-1.0, -0.25, 0.5, 1.25])
-    traj = lj.integrate(
-        polar, *polar_state(0.05, -1.0), ts=ts, dt0=0.125, stepsize_controller=diffrax.ConstantStepSize()
-    )
-    assert distance_to_great_circle(traj, 0.05) > 1e-3
+        lj.integrate(polar, *polar_state(1e-15, -1.0), ts=ts, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.exhaustive
@@ -378,3 +314,35 @@ def test_the_same_great_circle_in_cartesian_coordinates():
         np.testing.assert_allclose(traj.q, great_circle(miss, ts), atol=1e-10)
         np.testing.assert_allclose(traj.multipliers["sphere"], -0.5, atol=1e-11)
         assert float(traj.residual()) < 1e-14
+
+
+# What is refused: the system, a state where M is singular, the coordinate that is named, and a remedy.
+
+DEAD_CENTRE = {"crank": 0.0, "x": CRANK["l"]}, {"crank": 0.25, "x": 0.0}
+POLE = {"psi": 0.0, "theta": 0.25}, {"psi": 1.0, "theta": 0.0}
+SINGULAR = {
+    "the pole": (polar, POLE, None, "theta", "azimuth at the pole.*Cartesian"),
+    "the dead centre": (crank, DEAD_CENTRE, CRANK, "crank", "Fix:"),
+    "without a rod": (lj.System(crank_lagrangian), crank_state(0.5, 1.0), CRANK, "crank", "Fix:"),
+    "an arbitrary parameter": (paced, PACED, {"k": 0.0}, "[txy]", "Fix:"),
+    "the same with a force": (paced, PACED, {"k": 0.5}, "[txy]", "Fix:"),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["the pole", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SINGULAR)[1:])]
+)
+def test_accelerations_are_refused(name):
+    """Where M is singular along a motion that is allowed, the coordinate is named, with a remedy."""
+    system, state, params, coordinate, remedy = SINGULAR[name]
+    with pytest.raises(ValueError, match=f"(?s)singular in coordinate '{coordinate}'.*{remedy}"):
+        lj.accelerations(system, 0.0, *state, params)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", SINGULAR)
+def test_motions_are_refused(name):
+    """Nor is such a system integrated."""
+    system, state, params, coordinate, remedy = SINGULAR[name]
+    with pytest.raises((ValueError, RuntimeError), match=f"(?s)singular in coordinate '{coordinate}'.*{remedy}"):
+        lj.integrate(system, *state, params, ts=np.array([0.0, 1.0]), max_steps=256)

@@ -114,9 +114,7 @@ def test_textbook_equations():
 
 
 def test_others():
-    """Also for a double pendulum in an array, velocity constraints with dissipation, and a scalar with a root."""
-    found = lj.latex(double_pendulum, np.array([0.25, 0.5]), np.array([0.5, 0.25]), DOUBLE_PARAMS)
-    assert r"l_{1} l_{2} m_{2} \ddot{q}_{1} \cos{\left(q_{0} - q_{1} \right)}" in found.lines[0]
+    """Also for velocity constraints with dissipation, and a scalar with a root."""
     rolling = lj.Nonholonomic(lambda t, q, v, p: v["x"] - p["R"] * v["phi"])
     wheel = lj.System(
         lambda t, q, v, p: 0.5 * v["x"] ** 2 + 0.25 * v["phi"] ** 2,
@@ -132,6 +130,13 @@ def test_others():
     fast = lj.System(lambda t, q, v, p: -p["m"] * jnp.sqrt(1 - v**2) - 0.5 * p["k"] * q**2)
     relativistic = r"\frac{m \ddot{q}}{\left(1 - \dot{q}^{2}\right)^{\frac{3}{2}}} = - k q"
     assert lj.latex(fast, 0.25, 0.5, {"m": 1.5, "k": 2.0}).lines == (relativistic,)
+
+
+@pytest.mark.slow
+def test_arrays():
+    """Also for a double pendulum in an array, and a sum of sums."""
+    found = lj.latex(double_pendulum, np.array([0.25, 0.5]), np.array([0.5, 0.25]), DOUBLE_PARAMS)
+    assert r"l_{1} l_{2} m_{2} \ddot{q}_{1} \cos{\left(q_{0} - q_{1} \right)}" in found.lines[0]
     chain = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(jnp.cumsum(v) ** 2) - q @ q)
     assert lj.latex(chain, np.ones(2), np.ones(2)).lines[1] == r"\ddot{q}_{0} + \ddot{q}_{1} = - 2 q_{1}"
 

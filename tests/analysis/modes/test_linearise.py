@@ -31,6 +31,7 @@ def test_what_is_free():
     assert modes.verdict == "stable" and "any q and any speed" in repr(modes)
 
 
+@pytest.mark.slow
 def test_the_conical_pendulum():
     """It oscillates with Ω √(1 + 3 cos²θ) at any azimuth; twin: at another speed it is not steady."""
     theta, params = 0.7, {"l": 1.25, "g": 9.8125}

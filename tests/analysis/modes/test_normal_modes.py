@@ -10,6 +10,7 @@ import pytest
 import lagjax as lj
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
+from tests.analysis.steady_systems import DISK, TOP, UPRIGHT, UPRIGHT_DISK, disk, straight_on, top
 
 BEAD = {"a": 1.25, "g": 9.8125, "omega": 2.0}
 STILL = {"x": 0.0, "y": 0.0}
@@ -192,41 +193,32 @@ def test_foucault_and_a_charge():
 @pytest.mark.slow
 def test_a_sleeping_top():
     """(I₃ω ± √(I₃²ω² - 4 M g l I₁)) / 2 I₁: stable above ω_c = 2 √(M g l I₁) / I₃, flutter below."""
-    params = {"I1": 2.0, "I3": 1.5, "Mgl": 3.0}
-    critical = 2 * np.sqrt(params["Mgl"] * params["I1"]) / params["I3"]
-    upright = {"alpha": 0.0, "beta": 0.0, "spin": 0.0}
-    asleep = lambda omega: lj.normal_modes(small.top, 0.0, upright, upright | {"spin": omega}, params)
+    I1, I3, Mgl = TOP.values()
+    critical = 2 * np.sqrt(Mgl * I1) / I3
+    asleep = lambda omega: lj.normal_modes(top, 0.0, UPRIGHT, UPRIGHT | {"spin": omega}, TOP)
     verdicts = [asleep(x * critical).verdict for x in (0.999, 1.0, 1.001)]
     assert verdicts == ["flutter", "undecided", "gyroscopically stabilised"]
-    spin, root = 1.5 * 1.1 * critical, np.sqrt((1.5 * 1.1 * critical) ** 2 - 24.0)
-    np.testing.assert_allclose(asleep(1.1 * critical).frequency[1:], [(spin - root) / 4, (spin + root) / 4], **EQUAL)
-
-
-def disk_critical(params):
-    """The critical spin: C (C + m r²) Ω² = A m g r, from λ² (A + m r²) = m g r - C (C + m r²) Ω² / A."""
-    A, C, m, g, r = (params[name] for name in ("A", "C", "m", "g", "r"))
-    return np.sqrt(A * m * g * r / (C * (C + m * r**2)))
+    spin = I3 * 1.1 * critical
+    root = np.sqrt(spin**2 - 4 * Mgl * I1)
+    frequency = asleep(1.1 * critical).frequency[1:]
+    np.testing.assert_allclose(frequency, [(spin - root) / (2 * I1), (spin + root) / (2 * I1)], **EQUAL)
 
 
 @pytest.mark.slow
 def test_a_rolling_disk():
-    """The lean mode has this root at each speed; above Ω² = g/(3r) a thin disk stays upright."""
-    m, r, g = 1.5, 0.4, 9.81
-    params = {"m": m, "r": r, "g": g, "A": 0.25 * m * r**2, "C": 0.5 * m * r**2}
-    critical = disk_critical(params)
-    np.testing.assert_allclose(critical**2, g / (3 * r))
-    still = dict.fromkeys(("x", "y", "yaw", "lean", "spin"), 0.0)
-    rolls = lambda omega: lj.normal_modes(small.disk, 0.0, still, still | {"x": r * omega, "spin": omega}, params)
-    slow, fast = rolls(0.999 * critical), rolls(1.001 * critical)
-    assert slow.verdict == "divergence" and bool(fast.stable)
-    A, C = params["A"], params["C"]
-    for modes, omega in ((slow, 0.999 * critical), (fast, 1.001 * critical)):
+    """λ² (A + m r²) = m g r - C (C + m r²) Ω² / A of its lean; above Ω² = g/(3r) a thin disk stays upright."""
+    m, r, g = DISK.values()
+    A, C, critical = 0.25 * m * r**2, 0.5 * m * r**2, np.sqrt(g / (3 * r))
+    for omega, stable in ((0.999 * critical, False), (1.001 * critical, True)):
+        velocity = {name: omega * rate for name, rate in straight_on(UPRIGHT_DISK, DISK).items()}
+        modes = lj.normal_modes(disk, 0.0, UPRIGHT_DISK, velocity, DISK)
         squared = (m * g * r - C * (C + m * r**2) * omega**2 / A) / (A + m * r**2)
-        got = max(modes.growth) ** 2 if squared > 0 else -(max(modes.frequency) ** 2)
+        got = -(max(modes.frequency) ** 2) if stable else max(modes.growth) ** 2
         np.testing.assert_allclose(got, squared, rtol=1e-10)
-    assert fast.linearisation.shifts == ("spin", "x", "y")
-    words = repr(fast)
-    assert "other speeds in" in words and "shift of yaw, which the velocity constraints leave free" in words
+        assert bool(modes.stable) == stable and (stable or modes.verdict == "divergence")
+    assert modes.linearisation.shifts == ("spin", "x", "y")
+    words = repr(modes)
+    assert "other speeds in" in words and "shift of heading, which the velocity constraints leave free" in words
 
 
 def test_it_draws_itself():

@@ -1,7 +1,5 @@
 """Lyapunov exponents against closed forms of linear systems, sums from damping, and SciPy for chaos."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +7,8 @@ import pytest
 from scipy import integrate
 
 import lagjax as lj
+from lagjax.analysis.orbits.lyapunov import _estimates
+from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, pendulum, rod_pendulum
 
 G_OVER_L = PARAMS["g"] / PARAMS["l"]
@@ -23,17 +23,13 @@ K = np.array([4.0, 0.5])
 hill = lj.System(hill_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v @ v)
 
 
-@cache
-def on_the_hills(c):
-    """The exponents at rest between the hills."""
-    params, ts = {"k": K, "c": c}, np.linspace(0.0, 60.0, 61)
-    return lj.lyapunov_exponents(hill, np.zeros(2), np.zeros(2), params, ts=ts, count=4)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("c", [0.0, 0.375])
 def test_linear(c):
     """λ = -c/2 ± √(k + c²/4) for each k; they sum to -c for each freedom, and to zero without damping."""
-    found = jax.tree.map(np.asarray, on_the_hills(c))
+    params, ts = {"k": K, "c": c}, np.linspace(0.0, 60.0, 61)
+    found = lj.lyapunov_exponents(hill, np.zeros(2), np.zeros(2), params, ts=ts, count=4)
+    found = jax.tree.map(np.asarray, found)
     exact = np.sort(np.concatenate([-c / 2 + s * np.sqrt(K + c**2 / 4) for s in (1, -1)]))[::-1]
     np.testing.assert_allclose(found.exponents, exact, atol=1e-7)
     np.testing.assert_array_less(np.abs(found.exponents - exact), found.uncertainty)
@@ -42,15 +38,39 @@ def test_linear(c):
     assert bool(found.sensitive)
 
 
-def test_what_is_printed_drawn_and_refused():
-    """Printed: exponents, uncertainty, Liouville's sum; drawn: running means; refused: too few or unsorted times."""
-    found = on_the_hills(0.375)
-    assert "±" in repr(found) and "by Liouville's formula -0.75" in repr(found)
-    assert len(found.plot().axes[0].lines) == 4
-    np.testing.assert_allclose(found.running()[-1], np.sum(np.asarray(found.growth), axis=0) / 60.0, rtol=1e-12)
-    for ts, words in ((np.array([0.0, 100.0]), "at least 24 times"), (np.zeros(30), "must increase")):
-        with pytest.raises(ValueError, match=words):
-            lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=ts)
+def by_hand(ts, growth, volume):
+    """The exponents of given growth from time to time."""
+    exponents, uncertainty = by_numpy(_estimates)(ts, growth)
+    return lj.LyapunovExponents(exponents, uncertainty, ts, growth, volume, ts[len(ts) // 4], np.asarray(True), True)
+
+
+def test_what_growth_says():
+    """Means from a quarter of the times on, with an uncertainty that covers their spread; -inf where a tangent is lost.
+
+    Printed: exponents, uncertainty, Liouville's sum; drawn: running means. Twin: the mean from the start is another.
+    """
+    ts, rng = np.linspace(0.0, 60.0, 61), np.random.default_rng(0)
+    growth = np.array([2.0, -2.5]) + 0.5 * rng.normal(size=(60, 2))
+    growth[:15] += 10.0
+    found = by_hand(ts, growth, np.full(60, -0.5))
+    np.testing.assert_allclose(found.exponents, growth[15:].mean(axis=0), rtol=1e-12)
+    assert np.all(np.abs(found.exponents - growth.mean(axis=0)) > 1.0)
+    error = 0.5 / np.sqrt(45)
+    assert np.all(found.uncertainty > error) and np.all(found.uncertainty < 10 * error)
+    assert "±" in repr(found) and "by Liouville's formula -0.5" in repr(found) and bool(found.sensitive)
+    assert len(found.plot().axes[0].lines) == 2
+    np.testing.assert_allclose(found.running()[-1], growth.sum(axis=0) / 60.0, rtol=1e-12)
+    assert "no exponential parting" in repr(by_hand(ts, 0 * growth + 1 / 60, np.zeros(60)))
+    growth[40, 1] = -np.inf
+    lost = by_hand(ts, growth, np.full(60, np.nan))
+    assert lost.exponents[1] == -np.inf and lost.uncertainty[1] == 0 and "neighbours meet" in repr(lost)
+
+
+@pytest.mark.parametrize("ts, words", [(np.array([0.0, 100.0]), "at least 24 times"), (np.zeros(30), "must increase")])
+def test_bad_times(ts, words):
+    """Refused: too few or unsorted times."""
+    with pytest.raises(ValueError, match=words):
+        lj.lyapunov_exponents(pendulum, 2.0, 0.0, PARAMS, ts=ts)
 
 
 @pytest.mark.exhaustive

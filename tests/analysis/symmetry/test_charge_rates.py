@@ -1,6 +1,7 @@
 """Rates of charges in units of what breaks them: in single precision, and under weak disturbances."""
 
 import numpy as np
+import pytest
 
 import lagjax as lj
 from tests.symmetric_systems import IN_SPACE, KEPLER, OF_KEPLER

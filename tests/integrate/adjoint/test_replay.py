@@ -89,7 +89,7 @@ def test_a_spring_by_parameters_state_and_times(monkeypatch):
         np.testing.assert_allclose(found, slopes_expected(x), rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_pendulum_by_parameters_state_and_times():
     """The modes agree on derivatives by g, l, the first state and all output times."""
     system = pendulum()

@@ -62,7 +62,7 @@ def forces_of(matrix, free, mu, slides):
 LANES = 40
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [3, pytest.param(1, marks=pytest.mark.slow)])
 def test_against_all_cases(count):
     """Forces of random contacts with friction are one of the solutions that exist. Twin: with less friction, not."""
     matrix, free, mu = random_problems(count, LANES, 0.3)
@@ -91,8 +91,10 @@ def test_dependent_contacts():
 
 
 def test_no_solution():
-    """Friction that pushes a contact together harder than it pushes apart: no forces are found (Painlevé)."""
-    lanes = lambda *x: np.tile(np.array(x), (LANES, 1))
-    mu = np.where(np.arange(LANES) == 0, 1.0, 0.3)[:, None]
-    matrix = np.tile([[1.0, -2.0], [-2.0, 5.0]], (LANES, 1, 1))
-    assert np.asarray(forces_of(matrix, lanes(-1.0, 0.0), mu, lanes(-1.0))[1]).tolist() == [False] + 39 * [True]
+    """Friction that pushes a contact together harder than it pushes apart: no forces are found (Painlevé), beside two
+    contacts that are open. Twin: less friction."""
+    matrix, free = np.tile(np.eye(6), (LANES, 1, 1)), np.tile([-1.0, 1.0, 1.0, 0.0, 0.0, 0.0], (LANES, 1))
+    matrix[:, [0, 0, 3, 3], [0, 3, 0, 3]] = [1.0, -2.0, -2.0, 5.0]
+    mu, slides = np.tile([1.0, 0.0, 0.0], (LANES, 1)), np.tile([-1.0, 0.0, 0.0], (LANES, 1))
+    mu[1:, 0] = 0.3
+    assert np.asarray(forces_of(matrix, free, mu, slides)[1]).tolist() == [False] + 39 * [True]
