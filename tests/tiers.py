@@ -12,10 +12,10 @@ NAMES = """
     fit.loss.fit_loss fit.loss.fit_residuals integrate.adjoint.replay.Replay integrate.contacts.contacts.touches
     integrate.events.event.Crossing numerics.methods.gauss.Gauss numerics.methods.nystrom.Nystrom8
     numerics.methods.radau.Radau5 numerics.methods.splitting.Splitting sweep.sweep.sweep
-    system.elements.CompliantContact system.elements.SampledControl system.hybrid.Hybrid two_points.connect.connect
-    two_points.geodesic.exponential_map two_points.geodesic.geodesic two_points.optimal_control.steer
-    two_points.steering.Steering two_points.tracking.TrackingLQR work_precision.over_horizons.horizons
-    work_precision.work_precision.work_precision
+    system.elements.CompliantContact system.elements.Contact system.elements.SampledControl system.hybrid.Hybrid
+    two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
+    two_points.optimal_control.steer two_points.steering.Steering two_points.tracking.TrackingLQR
+    work_precision.over_horizons.horizons work_precision.work_precision.work_precision
 """
 SLOW_EXAMPLES = {f"lagjax.{name}" for name in NAMES.split()}
 
