@@ -16,8 +16,11 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.compile(r"```python\n(.*?)```", re.DOTALL)
 WITHOUT_CODE = set("CHANGELOG CONTRIBUTING architecture derivatives gallery how-to index known-gaps look-up".split())
-# Their code trains, fits or compiles for half a minute.
-LONG = ("fitting", "learned", "switch-phases", "what-a-system-is-like")
+# Their code trains, fits, or compiles for 8 to 30 s.
+LONG = """
+    bodies choose-a-method connect-two-points contacts fitting forces-that-jump learned long-runs steer switch-phases
+    what-a-system-is-like
+""".split()
 CODE = {
     page.stem: "\n".join(BLOCKS.findall(page.read_text()))
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

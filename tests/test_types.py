@@ -44,7 +44,7 @@ def test_no_type_errors():
     """Every file of the package and of its tests is read, and none has an error."""
     count, errors = checked(ROOT)
     assert errors == [], "\n".join(errors)
-    assert count == sum(len(list((ROOT / folder).rglob("*.py"))) for folder in CHECKED)
+    assert count == sum(len(list((ROOT / folder).rglob(kind))) for folder in CHECKED for kind in ("*.py", "*.pyi"))
 
 
 def test_the_type_check_can_fail(tmp_path):

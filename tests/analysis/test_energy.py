@@ -43,9 +43,7 @@ def negative(function):
 
 def flipped(system):
     """The system with forces and dissipation of the opposite sign, and constraints that push the other way."""
-    other = lambda c: (
-        lj.Holonomic(negative(c.g)) if isinstance(c, lj.Holonomic) else lj.Nonholonomic(negative(c.phi))
-    )
+    other = lambda c: (lj.Holonomic(negative(c.g)) if isinstance(c, lj.Holonomic) else lj.Nonholonomic(negative(c.phi)))
     constraints = {name: other(constraint) for name, constraint in system.constraints.items()}
     return lj.System(system.lagrangian, constraints, negative(system.force), negative(system.dissipation))
 

@@ -125,42 +125,63 @@ def test_derivatives_in_forward_mode_and_lanes():
     assert jnp.max(jnp.abs(together - sum(each))) < 1e-9 * jnp.max(jnp.abs(together))
 
 
+def on_the_rod(p):
+    """The same motion on a rod."""
+    start = np.array([np.sin(1.2), -np.cos(1.2)])
+    return lj.integrate(rod, start, np.zeros(2), p, ts=MANY, rtol=1e-4, throw=False, **between)
+
+
 @pytest.mark.slow
 def test_on_the_constraints():
-    """Outputs satisfy them to round-off, with the multiplier there; and the slope by gravity, in reverse, is right."""
-    start = jnp.array([np.sin(1.2), -np.cos(1.2)])
-    of = lambda p, **how: lj.integrate(rod, start, jnp.zeros(2), p, ts=MANY, rtol=1e-4, throw=False, **how)
-    traj = of(SHARES, **between)
+    """Outputs satisfy them to round-off, with the multiplier there."""
+    traj = on_the_rod(SHARES)
     assert np.max(np.abs(np.sum(traj.q**2, 1) - 1)) < 1e-13 and np.max(np.abs(np.sum(traj.q * traj.v, 1))) < 1e-13
     angle, rate = exact(MANY)
     assert np.max(np.abs(traj.q[:, 0] - np.sin(angle))) < 2e-3
     # 2 λ = -(cos(angle) + rate²) pulls the mass inwards; g = 1.
     assert np.max(np.abs(2 * traj.multipliers["rod"] + np.cos(angle) + rate**2)) < 1e-2
 
+
+@pytest.mark.exhaustive
+def test_derivatives_on_the_constraints():
+    """The slope by gravity, in reverse, is right."""
+
     def loss(p):
-        traj = of(p, **between)
+        traj = on_the_rod(p)
         return jnp.sum(traj.q[:, 0]) + jnp.sum(traj.multipliers["rod"])
+
+    angle, rate = exact(MANY)
 
     # At another gravity g the motion is as fast as √g, and the multiplier g times as large.
     by_g = 0.5 * MANY * rate * np.cos(angle) - 0.5 * (np.cos(angle) + rate**2) + 0.75 * MANY * rate * np.sin(angle)
     np.testing.assert_allclose(jax.grad(loss)(SHARES), np.sum(by_g) * np.ones(40), rtol=2e-3)
 
 
+DOWN = {"down": lj.Crossing(lambda t, q, v, m, p: q, terminal=True)}
+QUARTER = special.ellipk(HALF**2)
+
+
+def until_down(p):
+    """The same motion up to the lowest point."""
+    return lj.integrate(shared, 1.2, 0.0, p, ts=MANY, rtol=1e-6, events=DOWN, throw=False, **between)
+
+
 @pytest.mark.slow
 def test_beside_events_and_in_float32():
-    """An event is found where it is, and ends the outputs; float32 stays float32; a gradient with an event is right."""
-    down = {"down": lj.Crossing(lambda t, q, v, m, p: q, terminal=True)}
-    quarter = special.ellipk(HALF**2)
-    of = lambda p, **how: lj.integrate(shared, 1.2, 0.0, p, ts=MANY, rtol=1e-6, events=down, throw=False, **how)
-    traj = of(SHARES, **between)
-    assert traj.events["down"].t[0] == pytest.approx(quarter, abs=1e-5)
-    assert np.array_equal(np.isnan(traj.q), MANY > quarter)
+    """An event is found where it is, and ends the outputs; float32 stays float32."""
+    traj = until_down(SHARES)
+    assert traj.events["down"].t[0] == pytest.approx(QUARTER, abs=1e-5)
+    assert np.array_equal(np.isnan(traj.q), MANY > QUARTER)
     assert np.nanmax(np.abs(traj.q - exact(MANY)[0])) < 2e-5
-    # The period is proportional to 1/√(sum of p).
-    slope = jax.grad(lambda p: of(p, **between).events["down"].t[0])(SHARES)
-    assert slope == pytest.approx(np.full(40, -quarter / 2), rel=1e-4)
     single = lj.integrate(pendulum, np.float32(1.2), np.float32(0.0), PARAMS, ts=MANY.astype(np.float32), **between)
     assert single.q.dtype == np.float32 and max(worst(single)) < 3e-4
+
+
+@pytest.mark.exhaustive
+def test_derivative_of_an_event():
+    """The period is proportional to 1/√(sum of p)."""
+    slope = jax.grad(lambda p: until_down(p).events["down"].t[0])(SHARES)
+    assert slope == pytest.approx(np.full(40, -QUARTER / 2), rel=1e-4)
 
 
 def test_refused():
@@ -171,7 +192,7 @@ def test_refused():
         lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="interpolated", method=lj.Dopri8())
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_networks_in_lanes_of_float32():
     """A mass matrix that is a network: the default, at loose tolerance in lanes, has finite and right gradients."""
     random = np.random.default_rng(0)

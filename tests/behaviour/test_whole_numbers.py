@@ -41,7 +41,7 @@ QUICK = {
     "accelerations": by_name("accelerations"),
     "constraint_residual": by_name("constraint_residual", rod),
     "noether_charge": lambda q, v: lj.noether_charge(system, turning)(0, q, v, PARAMS),
-    "integrate": lambda q, v: lj.integrate(rod_pendulum, q, v, {"g": 3, "l": 1}, ts=FOUR).q,
+    "integrate": lambda q, v: lj.integrate(rod_pendulum, q, v, {"g": 3.0, "l": 1.0}, ts=FOUR).q,
     "in a program": lambda q, v: jax.jit(lambda q, v: lj.momentum(system, 0, q, v, PARAMS))(q, v),
 }
 LONG = {

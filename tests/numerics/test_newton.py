@@ -24,9 +24,7 @@ def test_loops():
     atan = partial(newton, jnp.arctan, lambda y, r, i: r * (1 + y**2), jnp.array([3.0]), 12)
     double = partial(newton, lambda y: y**2, lambda y, r, i: r / (2 * y), jnp.array([1.0]), 40)
     slow = np.array([[2.0], [4.0]])
-    levels = partial(
-        newton, lambda y: y**2, lambda y, r, i: r / (slow * y), jnp.ones((2, 1)), 40, enough=1e-3
-    )
+    levels = partial(newton, lambda y: y**2, lambda y, r, i: r / (slow * y), jnp.ones((2, 1)), 40, enough=1e-3)
     found = jax.jit(lambda: [
         atan(fractions=0.5 ** np.arange(6)), atan(), double(), double(falls=0.2), double(enough=1e-3),
         levels(size=lambda r: r[:, 0])[1], levels(size=lambda r: r[:1, 0].repeat(2))[0],

@@ -163,6 +163,9 @@ def test_torque_is_the_multiplier():
         assert [rate.L_z, rate.E] == pytest.approx([torque, omega * torque], rel=1e-11)
         assert abs(rate.E + omega * torque) > 0.1 * abs(rate.E)
         assert abs(rate.h) < 1e-12
+        # The hoop is where its motor wants it, and stays there.
+        turned = jax.jvp(lambda t, q: scene.motor(t, q, params), (0.5, q), (1.0, v))
+        assert turned == pytest.approx((0.0, 0.0), abs=1e-15)
         # L_z of the hoop at the angle θ is the momentum of θ; E - ω L_z is the Jacobi integral of ψ alone.
         assert of_systems(q, v, params) == pytest.approx((float(state.L_z), float(state.h)))
 

@@ -89,7 +89,9 @@ def test_multipliers_from_the_lagrangian():
         params = PARAMS | {"beta": beta}
         for theta in (1.2, 0.6, -0.4):
             rate = hoop.exact_rate(params, theta, 1.25)
-            a, got = accelerations(hoop.system, 0.0, *hoop.start(params, theta, rate), params)
+            q, v = hoop.start(params, theta, rate)
+            assert (hoop.contact(0.0, q, params), abs(hoop.rolling(0.0, q, v, params)) < 1e-14) == (0.0, True)
+            a, got = accelerations(hoop.system, 0.0, q, v, params)
             exact = hoop.exact_multipliers(params, theta, 1.25)
             assert float(got["contact"]) == pytest.approx(float(exact.contact), rel=1e-12)
             assert float(got["rolling"]) == pytest.approx(float(exact.rolling), rel=1e-12, abs=1e-14)

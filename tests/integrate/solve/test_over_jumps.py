@@ -89,14 +89,9 @@ SLOPES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "mode"),
-    [
-        pytest.param("brake", jax.jacfwd, marks=pytest.mark.slow),
-        *(pytest.param(name, jax.jacfwd, marks=pytest.mark.exhaustive) for name in SLOPES if name != "brake"),
-        *(pytest.param(name, jax.jacrev, marks=pytest.mark.exhaustive) for name in SLOPES),
-    ],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("name", SLOPES)
 def test_derivatives_over_jumps(name, mode):
     """Derivatives by all numbers agree with the closed form, in both modes."""
     function, at, right, _ = SLOPES[name]

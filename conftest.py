@@ -35,6 +35,7 @@ from jax._src import compiler  # noqa: E402
 from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
 from lagjax.jaxtools.compiled import are_known  # noqa: E402
 from tests import counting  # noqa: E402
+from tests.tiers import SLOW_EXAMPLES  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -92,6 +93,9 @@ def pytest_collection_modifyitems(config, items):
 
     The optimised tests come last: few programs compile twice.
     """
+    for item in items:
+        if item.name in SLOW_EXAMPLES:
+            item.add_marker("slow")
     exhaustive = [item for item in items if item.get_closest_marker("exhaustive")]
     for item in exhaustive:
         item.add_marker("slow")
