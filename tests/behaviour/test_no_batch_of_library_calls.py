@@ -85,6 +85,9 @@ SLOW = {
 }
 
 
+KEPT = "second derivatives", "modes, derivatives", "motion, large", "motion, reverse"
+
+
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_no_batches(name):
     """Inside the user's own `jit` and `vmap`: there are calls of LAPACK, each for one matrix."""
@@ -93,7 +96,7 @@ def test_no_batches(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", exhaustive_but(("second derivatives", "modes, derivatives", "motion, large", "motion, reverse"), SLOW))
+@pytest.mark.parametrize("name", exhaustive_but(KEPT, SLOW))
 def test_no_batches_in_motions(name):
     """The same for motions that take longer to lower."""
     text = text_of(SLOW[name], STIFFNESS)
