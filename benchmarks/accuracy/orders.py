@@ -8,7 +8,7 @@ Hénon and Heiles, judged at their ends: the order of a single orbit scatters by
 slope of the logarithm of the error (its mean over the orbits) over that of the step, against SciPy's DOP853 at a
 tolerance of 2.5e-14. The target is the claimed order within 0.35, or within 1 for Nyström methods, whose steps are a
 large part of a period. The slow tests measure the same with misprinted tableaus as twins:
-`tests/behaviour/test_orders.py`, `tests/numerics/methods/test_nystrom.py`, `tests/numerics/methods/test_radau.py`.
+`tests/behaviour/test_orders.py`, `tests/numerics/methods/test_explicit.py`, `tests/numerics/methods/test_radau.py`.
 
 Source: Hairer, Nørsett & Wanner, *Solving ODEs I*, §II.3-II.5, II.14; Hénon & Heiles, *Astron. J.* 69 (1964) 73.
 """

@@ -24,7 +24,7 @@ ORDERS = """# Orders, as measured
 
 The order of each method with constant steps, on outputs between its steps, from `benchmarks/results/orders.json`. The
 slow tests assert the same, and must fail for tableaus with misprints: `tests/behaviour/test_orders.py`, and
-`test_nystrom.py`, `test_radau.py` and `test_runge_kutta.py` in `tests/numerics/methods`.
+`test_explicit.py` and `test_radau.py` in `tests/numerics/methods`.
 
 | method | motion | claimed | measured | least error |
 |---|---|---|---|---|
