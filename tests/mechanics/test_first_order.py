@@ -71,7 +71,7 @@ def test_its_acceleration_at_one_state():
     np.testing.assert_allclose(velocities(costly, [7.0, 0.5], [100.0, 3.0], None), [9.0, 3.0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_backward_and_in_steps():
     """The same cost backward in time, between outputs, and by steps of a fixed length."""
     backward = lj.integrate(costly, *SWING, ts=np.array([3.0, 0.0]))
@@ -82,7 +82,7 @@ def test_backward_and_in_steps():
     np.testing.assert_allclose(v["c"], v["x"] ** 2, rtol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_in_lanes_and_in_float32():
     """Lanes of different starts, and single precision in and out."""
     ts = np.linspace(0.0, 3.0, 4)
@@ -138,7 +138,7 @@ def test_a_thermostat():
     assert np.max(np.abs(other.q["x"] - right[0])) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_a_thermostat():
     """By T, in forty numbers, and Q in reverse: as differences of SciPy's solution."""
     start = {"x": 1.0, "z": 0.2}, {"x": 0.0}
