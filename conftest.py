@@ -4,8 +4,8 @@ At its end pytest prints what was compiled and how much memory a worker had; the
 (`tests/counting.py`). Two tiers of tests, and an option; `.ci/run` runs the scenes and both tiers:
 
     python -m lagjax    the scenes: error against exact motions by method and tolerance, stiff and extreme cases,
-                        pictures; a part of the stability report; `--full`, before a release, all. The exit status is 1 if anything is missed, which
-                        `test_job.py` and `test_stability.py` check.
+                        pictures; a part of the stability report; `--full`, before a release, all. The exit status is 1
+                        if anything is missed, which `test_job.py` and `test_stability.py` check.
     pytest              every module on programs that compile in seconds; messages; docstring examples; architecture.
     pytest -m slow
                         tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,

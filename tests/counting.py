@@ -1,7 +1,8 @@
 """Count what JAX compiles: the programs and the single operations of each test, and what they cost.
 
-A *program* has hundreds of operations and takes a second or more to trace, lower and compile. A *kernel* is small: mostly
-one operation of `jax.numpy` outside of any `jit`, such as `x[0]`, `jnp.stack` or `.round()` on a result, for 30 ms.
+A *program* has hundreds of operations and takes a second or more to trace, lower and compile. A *kernel* is small:
+mostly one operation of `jax.numpy` outside of any `jit`, such as `x[0]`, `jnp.stack` or `.round()` on a result, for 30
+ms.
 """
 
 import resource
@@ -70,7 +71,7 @@ def compiles():
 
 
 class Cost(NamedTuple):
-    """What a test, or several together, took: processor seconds, and the seconds of XLA and the number of both kinds."""
+    """What a test, or several together, took: processor seconds, and of both kinds the number and seconds of XLA."""
 
     seconds: float = 0.0
     programs: int = 0
@@ -119,7 +120,8 @@ def told(costs: dict[str, Cost], processes: Sequence[tuple[float, float]]) -> st
     """What all tests cost together, and the processes in which they ran."""
     total = sum(costs.values(), Cost())
     return (
-        f"{total.programs} programs ({total.of_programs:.0f} s of XLA), {total.kernels} kernels ({total.of_kernels:.0f} s); "
+        f"{total.programs} programs ({total.of_programs:.0f} s of XLA), "
+        f"{total.kernels} kernels ({total.of_kernels:.0f} s); "
         f"{total.seconds:.0f} processor s in tests, {max((x[0] for x in processes), default=0.0):.0f} s in each of "
         f"{len(processes)} processes to collect them, at most {max((x[1] for x in processes), default=0.0):.1f} GB"
     )

@@ -1,8 +1,8 @@
 """The reference systems: a fast test integrates only these, so that a worker compiles a program of each once.
 
 lagjax shares a program between calls of the same meaning: the same equations, structure and shapes of `q`, `v` and
-`params`, number of `ts`, method, names of options. Numbers (starts, parameters, times, tolerances) are its arguments. So
-a test takes one of these systems with its own numbers and as many times as `TS`, or a motion that is here already.
+`params`, number of `ts`, method, names of options. Numbers (starts, parameters, times, tolerances) are its arguments.
+So a test takes one of these systems with its own numbers and as many times as `TS`, or a motion that is here already.
 """
 
 from functools import cache

@@ -32,7 +32,11 @@ from pathlib import Path
 from queue import Queue
 from typing import NamedTuple
 
+# Whatever lagjax imports is imported here, once, and no backend of JAX: copies of this process run the tests.
+import diffrax  # noqa: F401
+import optimistix  # noqa: F401
 import pytest
+import scipy.optimize  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
 CALLED: set[str] = set()
@@ -83,7 +87,7 @@ def mutants_of(path: str, source: str) -> list[Mutant]:
             swapped = between.translate({ord("+"): "-", ord("-"): "+"})
             add("sign", function, node, left_end, right, swapped)
             add("dropped term", function, node, start, end, raw[start:left_end].decode() + ")" * between.count(")"))
-        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.expr):
             add("sign", function, node, *span(node), raw[slice(*span(node.operand))].decode())
         elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
             new = node.value + 1 if isinstance(node.value, int) else 1.5 * node.value + (node.value == 0)
@@ -92,7 +96,7 @@ def mutants_of(path: str, source: str) -> list[Mutant]:
             (_, start), (end, _) = span(node.left), span(node.comparators[0])
             old, new = SWAPPED[type(node.ops[0])]
             add("comparison", function, node, start, end, raw[start:end].decode().replace(old, new, 1))
-        elif isinstance(node, ast.Call) and len(node.args) > 1 and not any(isinstance(x, ast.Starred) for x in node.args):
+        elif isinstance(node, ast.Call) and len(node.args) > 1 and ast.Starred not in map(type, node.args):
             (start, a), (b, end) = span(node.args[0]), span(node.args[1])
             one, other = raw[start:a].decode(), raw[b:end].decode()
             if one != other:
@@ -264,6 +268,16 @@ def run_tests(folder: Path, tests: list[str], said: Path):
     os._exit(int(pytest.main(["-x", "-n", "0", "--tb=line", *tests])))
 
 
+def in_words(mutant: Mutant) -> str:
+    """Where it is, and what is changed."""
+    return f"{mutant.path}:{mutant.lineno}  {mutant.old!r} -> {mutant.new!r}"
+
+
+def identity(row: dict) -> tuple:
+    """By what a mutant is known in another result."""
+    return tuple(row[name] for name in ("path", "function", "line", "kind", "old", "new"))
+
+
 def tried(mutant: Mutant, folder: Path, rows: list[dict], seconds: float) -> dict:
     """The verdict on a mutant, and the test that caught it."""
     tests, started = tests_for(mutant, rows), time.perf_counter()
@@ -286,15 +300,12 @@ def tried(mutant: Mutant, folder: Path, rows: list[dict], seconds: float) -> dic
     finally:
         target.write_text(whole)
     took = time.perf_counter() - started
-    print(f"{verdict:12} {took:5.0f} s  {mutant.kind:13} {mutant.path}:{mutant.lineno}  {mutant.old!r} -> {mutant.new!r}", flush=True)
+    print(f"{verdict:12} {took:5.0f} s  {mutant.kind:13} {in_words(mutant)}", flush=True)
     return {**mutant._asdict(), "verdict": verdict, "by": by, "tests": len(tests), "seconds": round(took, 1)}
 
 
 def try_all(mutants: list[Mutant], rows: list[dict], seconds: float, at_once: int, written: Path | None) -> list[dict]:
     """All verdicts, each written at once; each worker has a copy of the tree."""
-    # Whatever lagjax imports is imported once, and no backend of JAX: a copy of this process runs the tests.
-    import diffrax, jax, optimistix, scipy.optimize  # noqa: E401, F401
-
     with tempfile.TemporaryDirectory() as home:
         free: Queue = Queue()
         for i in range(at_once):
@@ -319,6 +330,7 @@ def try_all(mutants: list[Mutant], rows: list[dict], seconds: float, at_once: in
 
 
 def main():
+    """Map, or try."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=("map", "try"))
     parser.add_argument("where", type=Path)
@@ -343,11 +355,10 @@ def main():
     found = try_all(mutants, rows, options.seconds, options.at_once, options.json)
     print(Counter(row["verdict"] for row in found))
     if options.same:
-        before = {(row["path"], row["function"], row["line"], row["kind"], row["new"]): row["verdict"] for row in earlier}
+        before = {identity(row): row["verdict"] for row in earlier}
         for row in found:
-            was = before[row["path"], row["function"], row["line"], row["kind"], row["new"]]
-            if was != row["verdict"]:
-                print(f"{was} before, {row['verdict']} now: {row['path']}:{row['lineno']}  {row['old']!r} -> {row['new']!r}")
+            if (was := before[identity(row)]) != row["verdict"]:
+                print(f"{was} before, {row['verdict']} now: {in_words(Mutant(*list(row.values())[:9]))}")
 
 
 if __name__ == "__main__":
