@@ -18,8 +18,8 @@ BLOCKS = re.compile(r"```python\n(.*?)```", re.DOTALL)
 WITHOUT_CODE = set("CHANGELOG CONTRIBUTING architecture derivatives gallery how-to index known-gaps look-up".split())
 # Their code trains, fits, or compiles for 8 to 30 s.
 LONG = """
-    bodies choose-a-method connect-two-points contacts fitting forces-that-jump learned long-runs steer switch-phases
-    what-a-system-is-like
+    bodies choose-a-method coming-from connect-two-points contacts debug fitting forces-that-jump learned long-runs
+    states steer switch-phases taking-a-solve-elsewhere what-a-system-is-like
 """.split()
 CODE = {
     page.stem: "\n".join(BLOCKS.findall(page.read_text()))

@@ -90,7 +90,7 @@ def test_verdicts_and_names():
     assert modes_at(5.0).linearisation.shifts == ("front", "rear", "x", "y")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_weave_and_capsize_speeds():
     """The speed at which the growth is zero, by the secant method to 1e-12."""
 

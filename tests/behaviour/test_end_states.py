@@ -95,7 +95,10 @@ def test_end_state_depends_on_the_parameters(name, parameter):
 
 @pytest.mark.parametrize(
     ("module", "sign", "names", "digits"),
-    [(andrews, -1.0, ("loops",), 1e-6), (car_axis, 1.0, ("upright", "axle"), 1e-8)],
+    [
+        pytest.param(andrews, -1.0, ("loops",), 1e-6, marks=pytest.mark.exhaustive),
+        (car_axis, 1.0, ("upright", "axle"), 1e-8),
+    ],
 )
 def test_multipliers_of_the_source(module, sign, names, digits):
     """λ at the end is the source's: for Andrews (six digits) with the sign reversed, for the car axis unchanged."""

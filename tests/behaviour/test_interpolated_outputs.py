@@ -92,7 +92,7 @@ def loss(p, q0, ts, **how):
     return jnp.sum(traj.q**2) + jnp.sum(jnp.sin(traj.v))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives():
     """The gradient by parameters, start and times, which replays the steps, is right."""
     point = SHARES, jnp.asarray(1.2), jnp.asarray(MANY)

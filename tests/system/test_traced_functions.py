@@ -489,7 +489,7 @@ def test_constraints_and_guards_are_read_again():
         np.testing.assert_array_equal([residual, guard], 3.0 - held["length"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_events_are_read_again():
     """The time of an event at q = level, after that has changed."""
     held, free = [1.0], lj.System(lambda t, q, v, p: 0.5 * v**2)
@@ -499,7 +499,7 @@ def test_events_are_read_again():
         np.testing.assert_allclose(motion.end.t, held[0] / 2, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_fit_reads_again():
     """The stiffness of x'' = -k s x with k s = 3 is fitted as 3/s, also after s, which L reads, has changed."""
     held, t = [1.0], np.linspace(0.0, 2.0, 21)
