@@ -40,7 +40,9 @@ import scipy.optimize  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
 CALLED: set[str] = set()
-CAUGHT, SURVIVED, OUT_OF_TIME, GONE = "caught", "survived", "out of time", "its line is gone"
+CAUGHT, SURVIVED, OUT_OF_TIME, NO_VERDICT = "caught", "survived", "out of time", "no verdict"
+# By pytest's exit status: all passed, some failed, an error on the way to the tests, such as of an import.
+VERDICTS = {0: SURVIVED, 1: CAUGHT, 2: CAUGHT, 3: CAUGHT}
 SWAPPED = {
     ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
     ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="),
@@ -265,7 +267,9 @@ def run_tests(folder: Path, tests: list[str], said: Path):
     os.environ.update(PYTHONDONTWRITEBYTECODE="1", OPENBLAS_NUM_THREADS="1")
     sys.path[:0] = [str(folder)]
     sys.modules.pop("benchmarks", None)
-    os._exit(int(pytest.main(["-x", "-n", "0", "--tb=line", *tests])))
+    # Some of what was imported above is a plugin too.
+    quiet = "-W", "ignore::pytest.PytestAssertRewriteWarning"
+    os._exit(int(pytest.main(["-x", "-n", "0", "--tb=line", *quiet, *tests])))
 
 
 def in_words(mutant: Mutant) -> str:
@@ -290,13 +294,14 @@ def tried(mutant: Mutant, folder: Path, rows: list[dict], seconds: float) -> dic
             child = multiprocessing.get_context("fork").Process(target=run_tests, args=(folder, tests[:400], said))
             child.start()
             child.join(seconds)
-            verdict = OUT_OF_TIME if child.is_alive() else SURVIVED if child.exitcode == 0 else CAUGHT
+            verdict = OUT_OF_TIME if child.is_alive() else VERDICTS.get(child.exitcode, NO_VERDICT)
             if child.is_alive():
                 os.killpg(child.pid, signal.SIGKILL)
                 child.join()
-            if verdict == CAUGHT:
+            if verdict in (CAUGHT, NO_VERDICT):
                 failed = [line for line in said.read_text().splitlines() if line.startswith(("FAILED", "ERROR"))]
                 by = failed[0][:200] if failed else said.read_text()[-200:]
+                verdict = CAUGHT if failed else NO_VERDICT
     finally:
         target.write_text(whole)
     took = time.perf_counter() - started

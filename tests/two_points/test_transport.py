@@ -36,7 +36,7 @@ def test_round_a_latitude():
         assert abs(mode(lambda psi: carried(psi)["psi"])(1.1) - exact) < 1e-11
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_in_space():
     """On |r| = 1 the same turn; along a geodesic the angle with it is kept, and the vector stays tangent."""
     psi = 1.1

@@ -86,7 +86,7 @@ def thrown(v0, mu, tan, dtype=float, **options) -> lj.HybridTrajectory:
     return moved(on_a_tilt(), np.zeros(2, dtype), like(v0), given, ts=np.asarray(TS, dtype), **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_thrown_obliquely_on_a_tilted_plane():
     """Stops, or turns downhill and slides on, as by SciPy; or slides down from rest. Its stop is as precise as the
     steps. Twins: with another μ it rests somewhere else; with longer steps it stops earlier."""
