@@ -1,5 +1,8 @@
 """The map: public names in the order of the physics, each with the room that hands it out; read at run time too."""
 
+__version__: str
+__all__: list[str]
+
 # isort: split
 # A system: its Lagrangian and its constraints.
 from .mechanics import (

@@ -180,10 +180,10 @@ def first_answer(rows: Sequence[Row]) -> str:
 
 def judged(rows: Sequence[Row]) -> tuple[str, str, str]:
     """Of the run that came nearest to missing its error: that error and what is allowed, its ms, its first answer."""
-    asked = [row for row in rows if row.required is not None]
-    if not asked:
+    shares = {np.nan_to_num(row.error / row.required, nan=np.inf): row for row in rows if row.required is not None}
+    if not shares:
         return "-", "-", "-"
-    row = max(asked, key=lambda row: np.nan_to_num(row.error / row.required, nan=np.inf))
+    row = shares[max(shares)]
     return f"{row.error:.0e} (<= {row.required:.0e})", in_ms(row.seconds), f"{row.compile_seconds or 0.0:.1f}"
 
 

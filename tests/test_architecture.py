@@ -110,7 +110,7 @@ def nested(name, source):
     functions = of_kind(source, ast.FunctionDef, ast.AsyncFunctionDef)
     found = []
     for node in of_kind(source, ast.Import, ast.ImportFrom):
-        if any(function.lineno <= node.lineno <= function.end_lineno for function in functions):
+        if any(function.lineno <= node.lineno <= (function.end_lineno or 0) for function in functions):
             found += [name for name in imports(node) if name.split(".")[0] not in OPTIONAL]
     return found
 
@@ -298,7 +298,7 @@ def test_exports():
         assert doc and len(doc.splitlines()) > 0, name
     parts = {">>>", "**Returns:**", "**Raises:**", "Source:"}
     for name in "momentum mass_matrix accelerations jacobi_integral integrate consistent_state explain".split():
-        assert {part for part in parts if part not in inspect.getdoc(getattr(lagjax, name))} == set(), name
+        assert {part for part in parts if part not in (inspect.getdoc(getattr(lagjax, name)) or "")} == set(), name
 
 
 def written_examples(source):

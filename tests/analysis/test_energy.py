@@ -1,5 +1,6 @@
 """The energy ledger: works in closed form, the balance of every scene, and changes that must break it."""
 
+import inspect
 from dataclasses import replace
 from functools import wraps
 
@@ -81,7 +82,7 @@ def test_drag_takes_what_the_closed_form_says():
     ts = [0.0, 0.5, 0.6, 9.0]
     known = Known(ts, end=0.75)
     ledger, work = energy._ledger(known), energy._ledger(known).works["dissipation"]
-    assert len(ledger.t) == 4 and ledger.t[-1] == 0.75
+    assert len(ledger.t) == 4 and ledger.t[-1] == 0.75 and ledger.kinetic is not None
     np.testing.assert_allclose(work.total, taken(ledger.t), atol=1e-12)
     np.testing.assert_allclose(work.power, -(known.states(ledger.t)[1] ** 2), rtol=1e-12)
     np.testing.assert_allclose(ledger.potential, 10.0 * known.states(ledger.t)[0], rtol=1e-12)
@@ -137,10 +138,10 @@ def test_powers_are_the_rate_of_h(sign):
     t, q, v, p = state
     moved, accounted = equations(SLEDGE, *state), SLEDGE if sign == 1 else flipped(SLEDGE)
     lanes = jax.tree.map(lambda x: np.asarray(x)[None], (t, q, v, moved.multipliers))
-    found = by_numpy(lambda *lanes: works._powers.__wrapped__(model_of(accounted, *state), *lanes, None))(*lanes)
+    found = by_numpy(lambda *lanes: inspect.unwrap(works._powers)(model_of(accounted, *state), *lanes, None))(*lanes)
 
     def h(t, q, v):
-        at = works._energies.__wrapped__(model_of(SLEDGE, *state), *jax.tree.map(lambda x: x[None], (t, q, v)))
+        at = inspect.unwrap(works._energies)(model_of(SLEDGE, *state), *jax.tree.map(lambda x: x[None], (t, q, v)))
         return at[0][0]
 
     start = jax.tree.map(np.asarray, (t, q, v))

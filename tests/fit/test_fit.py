@@ -1,6 +1,7 @@
 """What a fit finds, and what it says about what it cannot find."""
 
 from importlib import import_module
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -57,7 +58,7 @@ def test_prints_and_plots(swinging, monkeypatch):
     assert len(found.plot().axes) == 2
     # Its motion starts where the fit does, at the record's times.
     monkeypatch.setattr(import_module("lagjax.fit.result.result"), "integrate", lambda *state, ts, throw: (*state, ts))
-    system, q0, v0, params, ts = found.motion()
+    system, q0, v0, params, ts = cast(tuple, found.motion())
     assert (system, q0, v0) == (pendulum, found.q0[0], found.v0[0]) and params == found.params
     np.testing.assert_array_equal(ts, TS)
 

@@ -96,11 +96,11 @@ def test_how_many_steps_are_missing():
 def test_a_singularity_by_its_numbers():
     """A velocity that grows while steps shrink, toward the limit of their series; twins: steady, or long steps."""
     to_two = along(lambda t: 1 / (2 - t))
-    cause, fix = _singularity(to_two, stepped(GEOMETRIC), None)
+    cause, fix = _singularity(to_two, stepped(GEOMETRIC), None) or ("", "")
     assert "the velocity of 'r' grows without bound as t -> 2;" in cause and "ts that end before 2" in fix
     assert _singularity(along(lambda t: 1.0), stepped(GEOMETRIC), None) is None
     assert _singularity(along(lambda t: np.exp(t)), stepped(np.full(20, 0.1)), None) is None
-    cause, _ = _singularity(along(lambda t: 1e5 * t), stepped(np.full(100, 0.01)), None)
+    cause, _ = _singularity(along(lambda t: 1e5 * t), stepped(np.full(100, 0.01)), None) or ("", "")
     assert "it is 9.9e+04 already, where the start and the way so far have 1" in cause
 
 

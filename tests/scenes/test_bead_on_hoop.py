@@ -132,7 +132,7 @@ def test_exact_motion_obeys_equation_13():
     """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a missing term is detected."""
     both = by_numpy(lambda params, psi, t: jax.jvp(lambda t: scene.exact_motion(params, psi, t), (t,), (1.0,)))
     for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
-        off = []
+        off, angle, rate, right = [], 0.0, 0.0, 0.0
         for t in np.linspace(0.1, 2.0, 5):
             (angle, rate), (slope, bend) = both(params, psi, t)
             np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)

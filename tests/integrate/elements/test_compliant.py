@@ -231,6 +231,7 @@ def test_a_block_that_stops_in_a_long_motion(sliding, v0, ends, steps):
             traj = lj.integrate(system, np.zeros(3), np.array(v0), mu, ts=ts, rtol=1e-11)
             assert int(traj.stats["num_steps"]) < steps
             np.testing.assert_allclose(traj.q[1:], 2 * [speed / (2 * mu * G) * np.array(v0)], rtol=1e-10, atol=1e-11)
+            assert isinstance(traj, lj.HybridTrajectory)
             assert len(traj.switches) == 1 or np.size(traj.modes[0]) > 2
             places[mu] = traj.q[-1]
     assert np.linalg.norm(places[0.31] - places[0.3]) > 1e-5

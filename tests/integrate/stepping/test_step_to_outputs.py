@@ -61,7 +61,7 @@ def test_a_rejected_step_is_not_tried_again(first):
     """Steps between one and two least steps that are rejected shrink until the least step ends the motion."""
     controller, choose = stepping([0.0, 5.0], dtmin=1e-3, force_dtmin=False)
     begin = jax.jit(lambda dt0: controller.init(None, jnp.zeros(()), 5.0, ONE, dt0, None, lambda *a: 0.0, 5))
-    t1, state = begin(first)
+    (t1, state), result = begin(first), None
     for _ in range(20):
         keep, _, t1, _, state, result = choose(np.asarray(0.0), t1, np.asarray(2e-6 * 1.01), state)
         assert not keep

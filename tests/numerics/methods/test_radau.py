@@ -1,6 +1,7 @@
 """Radau IIA and its Newton iteration: order, stability, published stiff end states, derivatives, failures."""
 
 from functools import cache
+from typing import Any
 
 import diffrax
 import jax
@@ -315,7 +316,7 @@ def test_jacobian_is_renewed_where_it_fails():
 
 def test_tolerances_for_constant_steps():
     """A root finder without a controller gets the given tolerances; an implicit Euler step is then y/(1 + h k)."""
-    method = with_tolerances(diffrax.ImplicitEuler(root_finder=OF_CONTROLLER()), 1e-10, 1e-12)
+    method: Any = with_tolerances(diffrax.ImplicitEuler(root_finder=OF_CONTROLLER()), 1e-10, 1e-12)
     assert method.root_finder.rtol == 1e-10 and method.root_finder.atol == 1e-12
     term = diffrax.ODETerm(lambda t, y, k: -k * y)
     y1 = jax.jit(lambda y: method.step(term, 0.0, 0.25, y, 1e3, method.init(term, 0.0, 0.25, y, 1e3), False)[0])(1.0)
