@@ -38,9 +38,12 @@ SETTINGS = {
     MAIN: {"methods": None, "tolerances": (1e-4, 1e-6, 1e-8, 1e-10, 1e-12), "repeats": 15},
 }
 SETTINGS[FULL] = SETTINGS[MAIN]
-# Processor seconds of each part by tier, on the machine of `benchmarks/results`: what takes longest starts first, so
-# that no core waits for it, and a line says how long all will take.
-SECONDS = {}
+# Processor seconds of each part, `QUICK` and `MAIN`, as its summary prints them: what takes longest starts first, so
+# that no core waits for it, and a line says how long all will take. Of `FULL` nothing is said.
+SECONDS = {
+    "sphere_geodesic": (9, 23), "rolling_hoop": (13, 34), "slipping_hoop": (1, 35), "bead_on_hoop": (6, 30),
+    "mass_distributions": (13, 59), "sliding_wedge": (13, 21), "cross_rails": (12, 36), STABILITY: (6, 40),
+}  # fmt: skip
 
 
 class JobPart(NamedTuple):
@@ -111,14 +114,17 @@ def _at_a_time(options):
 
 
 def _seconds(name, tier):
-    """Processor seconds that a part takes."""
-    return dict(zip((QUICK, MAIN, FULL), SECONDS.get(name, (0, 0, 0))))[tier]
+    """Processor seconds that a part takes; 0 if nobody measured it."""
+    return dict(zip((QUICK, MAIN), SECONDS.get(name, ()))).get(tier, 0)
 
 
 def _part(name, tier, of_stability, folder) -> JobPart:
     # The job is an application: the library itself never sets JAX's options.
     jax.config.update("jax_enable_x64", True)
-    return _stability(of_stability) if name == STABILITY else _scene(SCENES[name], tier, folder)
+    started = time.process_time()
+    part = _stability(of_stability) if name == STABILITY else _scene(SCENES[name], tier, folder)
+    seconds = f"{time.process_time() - started:.0f}"
+    return part._replace(summary=(*part.summary[:-1], seconds, part.summary[-1]))
 
 
 def _parse(arguments):
@@ -234,7 +240,7 @@ def _write(folder, parts):
 
 def _summary(parts, folder):
     """A line for each part."""
-    header = "", "error at 1e-10", "ms", "first answer/s", "cases", "picture"
+    header = "", "error at 1e-10", "ms", "first answer/s", "cases", "processor s", "picture"
     rows = [
         (name, *part.summary[:-1], part.summary[-1] if part.summary[-1] == "-" else str(folder / part.summary[-1]))
         for name, part in parts.items()

@@ -45,7 +45,7 @@ def traces(call):
 
 
 def test_a_second_call_traces_nothing():
-    """Numbers of any type, times and tolerances compile nothing, and called again trace at most an L that reads a global.
+    """Numbers of any type, times and tolerances compile nothing; called again they trace at most an L with a global.
 
     Twin: after the global has changed, all is traced again.
     """
