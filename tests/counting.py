@@ -17,8 +17,9 @@ import jax.monitoring
 
 # Fewer operations make a kernel; where they cannot be counted, fewer seconds.
 OPERATIONS, SECONDS = 250, 0.25
-# Of the whole fast tier, a tenth above what it has: it falls when that does. The aim is 150 and 1,500.
-BUDGET = (175, "programs"), (2_050, "kernels"), (2.5, "GB in a worker")
+# Of the whole fast tier, a tenth and more above what it has, as that differs from run to run: it falls when that does.
+# The aim is 150 programs, 1,500 kernels and less than 2.5 GB.
+BUDGET = (175, "programs"), (2_050, "kernels"), (2.75, "GB in a worker")
 _COMPILED: list["Compiled"] = []
 # The number of operations of what is compiled next, where known.
 _NEXT: list[int] = []
