@@ -4,7 +4,7 @@ import pytest
 
 # Examples of docstrings that compile programs of their own, for 2 to 10 s.
 NAMES = """
-    analysis.continuation.equilibria.continue_equilibria analysis.continuation.orbits.continue_orbits
+    analysis.continuation.equilibria.continue_equilibria
     analysis.energy.energy_ledger analysis.equilibria.equilibria.equilibria analysis.explain.explain
     analysis.formulations.action.action analysis.orbits.floquet.floquet analysis.orbits.lyapunov.lyapunov_exponents
     analysis.orbits.periodic_orbit.periodic_orbit analysis.poincare.poincare analysis.poincare.turning_points
