@@ -162,9 +162,6 @@ def pytest_runtest_protocol(item, nextitem):
     yield
 
 
-
-
-
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item, call):
     """The last report of a test says what it cost."""
@@ -192,15 +189,20 @@ def pytest_sessionfinish(session):
         return
     if not session.config.getoption("numprocesses", None):
         PROCESSES.append(process)
-    whole = session.config.args_source.name == "TESTPATHS" and not session.config.getoption("keyword")
-    if whole and session.config.getoption("markexpr") == "not slow" and counting.over_budget(COSTS, PROCESSES):
+    if excess(session.config):
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+def excess(config) -> str:
+    """What the fast tier, run as a whole, has too much of; empty if nothing, or if these are other tests."""
+    whole = config.args_source.name == "TESTPATHS" and not config.getoption("keyword")
+    fast = config.getoption("markexpr") == "not slow"
+    return counting.over_budget(COSTS, PROCESSES) if whole and fast else ""
 
 
 def pytest_terminal_summary(terminalreporter, config):
     """What the tests cost; of a fast tier over its budget, the dearest."""
     if COSTS:
         terminalreporter.write_line(counting.told(COSTS, PROCESSES))
-    whole = config.args_source.name == "TESTPATHS" and not config.getoption("keyword")
-    if whole and config.getoption("markexpr") == "not slow" and (excess := counting.over_budget(COSTS, PROCESSES)):
-        terminalreporter.write_line(f"FAILED: {excess}\n{counting.dearest(COSTS)}", red=True)
+    if too_much := excess(config):
+        terminalreporter.write_line(f"FAILED: {too_much}\n{counting.dearest(COSTS)}", red=True)

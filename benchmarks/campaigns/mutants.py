@@ -89,7 +89,7 @@ def mutants_of(path: str, source: str) -> list[Mutant]:
             swapped = between.translate({ord("+"): "-", ord("-"): "+"})
             add("sign", function, node, left_end, right, swapped)
             add("dropped term", function, node, start, end, raw[start:left_end].decode() + ")" * between.count(")"))
-        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.expr):
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
             add("sign", function, node, *span(node), raw[slice(*span(node.operand))].decode())
         elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
             new = node.value + 1 if isinstance(node.value, int) else 1.5 * node.value + (node.value == 0)
@@ -146,18 +146,16 @@ def chosen(count: int, seed: int) -> list[Mutant]:
 
 
 def found_again(mutant: Mutant) -> Mutant | None:
-    """The same mutant in today's source; None where its line is not there, or more than once."""
+    """The same mutant in today's source, of several the nearest; None where its line is not there."""
     path = ROOT / mutant.path
     if not path.exists():
         return None
     wanted = mutant.kind, mutant.function, mutant.line, mutant.old, mutant.new
-    column = lambda m: m.start - m.lineno
     same = [
         other for other in mutants_of(mutant.path, path.read_text())
         if (other.kind, other.function, other.line, other.old, other.new) == wanted
     ]  # fmt: skip
-    same.sort(key=lambda other: abs(column(other) - column(mutant)))
-    return same[0] if same else None
+    return min(same, key=lambda other: abs(other.start - mutant.start), default=None)
 
 
 # Which tests call what: a plugin of pytest.
