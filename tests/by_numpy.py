@@ -5,24 +5,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from lagjax.jaxtools.jaxpr import applied, interpreted
 from lagjax.mechanics.lagrangian import mass_and_forcing
 from lagjax.system import constraints, coordinates
 from lagjax.system.model import model_of
-from tests.jaxtools.in_numpy import PLAIN, WITH_PARAMETERS
-
-# What is not in `tests.jaxtools.in_numpy`.
-MORE = {
-    "acos": np.arccos, "acosh": np.arccosh, "asin": np.arcsin, "asinh": np.arcsinh, "atan": np.arctan,
-    "atanh": np.arctanh, "copy": np.copy, "cosh": np.cosh, "expm1": np.expm1, "sinh": np.sinh, "tan": np.tan,
-    "stop_gradient": np.copy,
-}  # fmt: skip
-MORE_WITH_PARAMETERS = {
-    "pad": lambda x, value, padding_config: np.pad(x, [row[:2] for row in padding_config], constant_values=value),
-    "split": lambda x, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
-    "stack": lambda *x, axis: np.stack(x, axis),
-    "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
-}
+from tests.jaxtools.in_numpy import run
 
 
 def numbers(*args):
@@ -44,33 +30,6 @@ def by_numpy(function):
         return jax.tree.unflatten(results, run(program, *leaves))
 
     return evaluated
-
-
-def run(closed, *args):
-    """The results of a program."""
-
-    def rule(equation, operands):
-        name, params = equation.primitive.name, equation.params
-        if name in (plain := PLAIN | MORE):
-            found = plain[name](*operands)
-        elif name in (others := WITH_PARAMETERS | MORE_WITH_PARAMETERS | {"scan": _loop}):
-            found = others[name](*operands, **params)
-        else:
-            found = applied(closed.jaxpr, equation, operands)
-        found = found if isinstance(found, list) else [found]
-        return [np.asarray(x, like.aval.dtype) for x, like in zip(found, equation.outvars)]
-
-    with np.errstate(all="ignore"):
-        return interpreted(closed, list(args), rule, lambda x, aval: np.asarray(x, aval.dtype))
-
-
-def _loop(*operands, jaxpr, length, reverse, num_consts, num_carry, **_):
-    last = num_consts + num_carry
-    fixed, carry, each, rows = operands[:num_consts], operands[num_consts:last], operands[last:], [None] * length
-    for i in range(length)[:: -1 if reverse else 1]:
-        found = run(jaxpr, *fixed, *carry, *(x[i] for x in each))
-        carry, rows[i] = found[:num_carry], found[num_carry:]
-    return [*carry, *map(np.stack, zip(*rows))]
 
 
 class Equations(NamedTuple):

@@ -106,7 +106,7 @@ PLAIN = IN_NUMPY | {
     "pow": np.power, "rem": np.fmod, "sign": np.sign, "sin": np.sin, "sincos": lambda x: [np.sin(x), np.cos(x)],
     "sqrt": np.sqrt, "stop_gradient": np.copy,
     "acos": np.arccos, "asin": np.arcsin, "atan": np.arctan, "copy": np.copy, "cosh": np.cosh, "sinh": np.sinh,
-    "tan": np.tan, "tanh": np.tanh,
+    "tan": np.tan, "tanh": np.tanh, "acosh": np.arccosh, "asinh": np.arcsinh, "atanh": np.arctanh, "expm1": np.expm1,
 }  # fmt: skip
 WITH_PARAMETERS = {
     "argmax": lambda x, axes, index_dtype: np.argmax(x, axes[0]),
