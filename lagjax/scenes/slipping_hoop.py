@@ -179,7 +179,8 @@ def picture(tier=FULL):
     left.legend(fontsize=8, frameon=False)
     a = PARAMS["a"]
     right.semilogx(lines, a * curves.spin / curves.speed, label="closed form", **plots.style(0))
-    right.semilogx(marks, a * points.spin / points.speed, "o", color="black", markersize=4, label="integrated")
+    label = "integrated" if len(marks) else None
+    right.semilogx(marks, a * points.spin / points.speed, "o", color="black", markersize=4, label=label)
     right.set(
         xlabel="coefficient of friction μ", ylabel="a φ' / speed", title="How it turns when it leaves: 1 is rolling"
     )
