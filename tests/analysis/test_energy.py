@@ -44,7 +44,7 @@ def negative(function):
 
 def flipped(system):
     """The system with forces and dissipation of the opposite sign, and constraints that push the other way."""
-    other = lambda c: (lj.Holonomic(negative(c.g)) if isinstance(c, lj.Holonomic) else lj.Nonholonomic(negative(c.phi)))
+    other = lambda c: lj.Holonomic(negative(c.g)) if isinstance(c, lj.Holonomic) else lj.Nonholonomic(negative(c.phi))
     constraints = {name: other(constraint) for name, constraint in system.constraints.items()}
     return lj.System(system.lagrangian, constraints, negative(system.force), negative(system.dissipation))
 
@@ -237,7 +237,7 @@ def test_tolerances():
     assert ledger.closes and ledger.t.dtype == np.float32
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_settings_are_those_of_the_motion():
     """A stiff decay by Radau5, with forces that jump: the motion is integrated again with the same settings."""
     push = lambda t, q, v, params: jnp.where(t < 1.0, 2.0, 0.0)

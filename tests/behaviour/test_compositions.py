@@ -105,7 +105,7 @@ def pushed(function, composition):
     return sum(jax.jvp(at(s), (P,), (W,))[1] for s in points)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_curvature_in_closed_form():
     """Of an oscillator of stiffness p·k: u·H·w is the second derivative by the stiffness, times (u·k)(w·k)."""
     k = np.linspace(0.5, 1.5, P.size)

@@ -302,7 +302,7 @@ def bomb(path):
     mutated.mark(path, "y", 1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stores_that_reach_out(good, tmp_path, monkeypatch):
     """A store writes nothing, reads nothing outside of it, and takes no more memory than its files have room for.
 
@@ -380,7 +380,7 @@ def test_three_hundred_changed_stores(good, tmp_path):
     assert attack_stores(good / "store", tmp_path, range(1000, 1300))[0] == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_changed_fits(tmp_path):
     """A hundred changed fits, some of which can be read."""
     spring = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"] * q["x"] ** 2)

@@ -131,7 +131,7 @@ def on_the_rod(p):
     return lj.integrate(rod, start, np.zeros(2), p, ts=MANY, rtol=1e-4, throw=False, **between)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_on_the_constraints():
     """Outputs satisfy them to round-off, with the multiplier there."""
     traj = on_the_rod(SHARES)

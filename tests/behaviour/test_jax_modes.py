@@ -66,7 +66,7 @@ def test_events_in_a_mode(mode):
     assert np.isclose(at.q, np.cos(w * 0.6), atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_and_gradients_in_a_mode(mode):
     """A mass turns on a rod as it must; slopes by stiffness, in a program of the user's and out of it."""
     context, m = mode
@@ -117,7 +117,7 @@ def test_failures_sweeps_and_fits_in_a_mode(mode):
     assert np.isclose(found.params["k"], 1.5**2 * m, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("half", exhaustive_but((jnp.float16,), (jnp.float16, jnp.bfloat16)))
 def test_networks_in_half_precision(half):
     """Parameters in half precision give the motion of their values, and slopes in their dtype; twin: other values."""

@@ -112,7 +112,7 @@ def test_jumps_backward_with_constraints_and_lanes():
     np.testing.assert_allclose(lanes, [np.sin(angle(x)) for x in on], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_by_the_time_of_a_jump():
     """A fall, and a force F from t_on: q(T) = v0 T - g/2 T² + F/2 (T - t_on)², differentiated in both modes.
 

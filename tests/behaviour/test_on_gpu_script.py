@@ -65,7 +65,7 @@ def test_steps_for_cuda_call_nothing():
     assert calls_for_cuda(lambda k, q0: jnp.linalg.inv(jnp.eye(3) * k), *arguments)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_products_keep_their_digits():
     """On a GPU each product of matrices of a rod's motion asks for all digits of float32; twin: as the user sets it."""
     rod = lj.Holonomic(lambda t, q, params: jnp.sum(q**2) - 1.0)
@@ -112,7 +112,7 @@ def test_names_are_no_operations():
     assert host_operations(named) == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_callback_in_the_lagrangian_is_found():
     """Twin: a callback is found in the program of the gradient as well."""
     assert host_operations(text_of_gradient(learned(looked_at=True)))

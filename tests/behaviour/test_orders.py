@@ -123,7 +123,6 @@ OTHERS = [
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
 TIERS = {
     ("Tsit5", "free"): pytest.mark.slow,
-    ("Radau5", "constrained"): pytest.mark.slow,
 }
 
 

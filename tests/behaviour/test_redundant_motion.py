@@ -28,7 +28,7 @@ def test_pendulum_on_two_rods():
     assert float(two.residual()) < 1e-15
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("drift", exhaustive_but(("project",), ("project", "none")))
 def test_door_swings_like_its_angle(drift):
     """A door with 18 equations of which 11 are independent follows its one-angle equation, whatever the drift control.

@@ -248,7 +248,7 @@ def friction(xp, v, z):
     return STIFF * z + np.sqrt(STIFF) * bristle_rate(xp, v, z) + VISCOUS * v
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_stick_and_slip_of_bristles():
     """A block that a spring pulls over LuGre's bristles: as by SciPy's Radau. Twin: it sticks first, then slips."""
 

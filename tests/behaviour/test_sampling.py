@@ -83,6 +83,7 @@ def test_a_normal_posterior():
     assert np.max(np.abs(errors(draws["g"], mean[0], sd[0], mean[0] + 1.2816 * sd[0]))) > 8
 
 
+@pytest.mark.exhaustive
 def test_a_bent_posterior():
     """Draws for a large swing of unknown frequency and amplitude agree with quadrature of Jacobi's functions."""
     data = angle(TS, 4.0, 2.2) + ROUGH * np.random.default_rng(0).normal(size=4)

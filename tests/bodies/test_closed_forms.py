@@ -23,7 +23,7 @@ def along(motion, body, vector=(0.0, 0.0, 1.0)):
     return np.asarray(jax.vmap(lambda q: body.direction(q, vector))(motion.q))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_free_body(tmp_path):
     """Ω of a tumbling body over 100 turns, and near the middle axis, by Jacobi's functions; its L in space stays.
 

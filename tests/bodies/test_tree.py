@@ -103,7 +103,7 @@ def test_poses_and_rates():
     assert turned[0](0.0, poses, None, None) < 1e-30 < turned[1](0.0, poses, None, None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_recursion_solves_lagranges_equations():
     """d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v with all joints and loads, at random states; without Coriolis terms it is not."""
     rng, tree, system, params = every_joint()

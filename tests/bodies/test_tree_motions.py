@@ -68,7 +68,7 @@ def test_forces_on_a_tree_have_no_jumps():
         assert (jumps_found(model, start) is None) == smooth
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_place_falls_on_a_floor():
     """The tip of an arm on a hinge bounces: its energy stays, and at each impact loses the part 1 - e² of what moves.
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.bodies.contact_point import least_of
+from lagjax.bodies.contact_point import least_of, searched
 from lagjax.bodies.wheels import tangents
+from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import evaluated
 
 G, SMALL, LARGE, SHARE = 9.81, 0.3, 2.0, 0.4
@@ -200,6 +201,19 @@ def test_the_point_of_contact():
     assert abs(1.0 - np.sum((centre - 0.1 * down) ** 2 / squares)) > 5e-5
 
 
+def test_the_normal_is_that_of_the_place_of_contact():
+    """On a globe an ellipsoid touches along the globe's radius at that place, not along that of its own centre."""
+    place, half_axes = 2.0 * np.array([0.48, 0.6, 0.64]), np.diag([0.3, 0.2, 0.1])
+    normal = place / 2.0
+    arm = -half_axes @ half_axes @ normal / np.linalg.norm(half_axes @ normal)
+    distance = lambda r: jnp.sqrt(jnp.sum(r**2)) - 2.0
+    found = by_numpy(lambda centre, shape: searched(distance, centre, shape))(place - arm, half_axes)
+    np.testing.assert_allclose(np.stack([found.point, found.normal]), [place, normal], rtol=1e-12)
+    np.testing.assert_allclose([found.height, found.slope], [0.0, 1.0], atol=1e-14)
+    # Twin: from the centre the radius points elsewhere.
+    assert np.max(np.abs((place - arm) / np.linalg.norm(place - arm) - normal)) > 1e-2
+
+
 def test_tangents():
     """Two unit vectors at right angles to each other and to the normal, whatever it is."""
     for seed in range(5):
@@ -286,7 +300,7 @@ def steadily(params, radius, height, lean):
     return lj.Pose.at(place, across, half), rate * (up + own * axis), rate
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_wheel_on_surfaces():
     """In a bowl as Newton and Euler have it; in circles in a cylinder, a bowl, a cone and a paraboloid."""
     system = rolling_wheel()
@@ -385,7 +399,7 @@ def derivatives(f):
     return jax.jit(lambda x: (f(x), first(x), second(x), jax.jacfwd(second)(x)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_the_point_of_contact():
     """In a spherical bowl it lies outwards, c/|c|, on a rim along c in its plane: derivatives up to the third."""
     place, axes = jnp.array([0.5, -1.2, 0.9]), lj.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3).matrix.T

@@ -56,7 +56,7 @@ def by_sympy_and_scipy(L, coordinates, parameters, params, q0, v0, ts):
     return solve_ivp(rate, ts[[0, -1]], [*q0, *v0], "DOP853", ts, rtol=3e-14, atol=1e-14).y[:n]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_double_pendulum():
     """The same motion as from a Lagrangian by hand and SymPy's equations; twin: without a term it differs."""
     L, coordinates, parameters = double_pendulum_of_particles()

@@ -82,7 +82,7 @@ def read(folder, name, call):
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_another_process_without_lagjax(tmp_path):
     """Motions, forces, events and derivatives equal those here bit for bit; twin: other arguments change them."""
     for name, (run, *calls) in CASES.items():

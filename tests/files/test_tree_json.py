@@ -36,3 +36,11 @@ def test_objects_of_flax():
         state = type("State", (), {"__module__": module})()
         with pytest.raises(TypeError, match=f"(?s)params.net is a State.*Fix.*{fix}"):
             tree_json.Writer().down(state, "params.net")
+
+
+def test_what_is_nested_too_deep():
+    """A list in a list, a hundred times, is written; once more is refused, named by the beginning of its path."""
+    inside = lambda depth: [inside(depth - 1)] if depth else 1.0
+    tree_json.Writer().down(inside(tree_json.DEEPEST), "params")
+    with pytest.raises(tree_json.NotWritable, match=r"params\[0\].* is nested deeper than 100 levels"):
+        tree_json.Writer().down(inside(tree_json.DEEPEST + 1), "params")

@@ -262,7 +262,7 @@ def test_outliers_from_far(swinging, monkeypatch):
     assert not np.allclose(astray.values, found.values, atol=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_inside_a_program(swinging):
     """Fits of many measurements in one program give the same as one by one."""
     data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])

@@ -36,7 +36,6 @@ def trained(loss, unknowns, optimiser, steps, batch=None, seed=0):
     """The recipe of `docs/learned.md`: the unknowns after some steps of an optimiser of optax."""
     import optax
 
-
     @jax.jit
     def train(unknowns):
         def step(carry, key):
@@ -251,7 +250,6 @@ def test_a_potential_is_learned():
 def test_inside_of_a_program():
     """Under jit and in lanes, a training gives the same as a single call."""
     import optax
-
 
     def stiffness(q):
         seen = lj.Record(T, q=q, q0=1.0, v0=0.0, sigma=0.01)

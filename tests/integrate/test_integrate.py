@@ -30,7 +30,7 @@ def test_against_scipy():
     np.testing.assert_allclose(exact.v, y[1], atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_in_both_modes():
     """d(final state, multiplier)/d(start, params), forward and reverse, jitted or not, match a central difference."""
 

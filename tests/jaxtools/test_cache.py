@@ -72,7 +72,7 @@ def test_dropped_programs_are_freed(monkeypatch):
 
 
 @not_plain
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not MAPS.exists(), reason="only Linux tells")
 def test_programs_are_bounded(monkeypatch):
     """The memory of dropped programs is freed; the twin, which keeps all, needs more for each."""

@@ -101,7 +101,7 @@ def test_what_is_singular_is_said():
         lj.accelerations(odd, 0.0, *start, None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_vortices():
     """Ten thousand steps by Gauss: on the circle, with H and the impulses to round-off. Twin: in the first test."""
     ts = np.linspace(0.0, 1000.0, 5)

@@ -166,7 +166,7 @@ def test_derivatives_of_a_thermostat():
 relay = lj.System(oscillator, states={"c": lambda t, q, v, p: jnp.where(t < p, 1.0, -2.0)})
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_relay_is_followed():
     """A rate that jumps, found in its program: exact, with its derivative."""
 
@@ -192,7 +192,7 @@ def spring(t, q, v, k):
 alone = lj.System(spring, dissipation=lambda t, q, v, k: 0.5 * 3.0 * v**2)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_massless_point_between_spring_and_damper():
     """c s' = -k s: an exponential, whatever velocity is given, and its derivative by k, forward and in reverse.
 

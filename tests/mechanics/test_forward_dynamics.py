@@ -35,7 +35,7 @@ Q, V, PARAMS = np.array([2.0, 0.3]), np.array([0.5, -1.0]), {"m": 3.0}
 ROD = {"rod": lj.Holonomic(lambda t, q, params: q[0] ** 2 - 4.0)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_system_that_solves_itself():
     """Accelerations, multipliers, motion and explanation are those of L's own equations, under forces, with a rod."""
     beside = dict(force=lambda t, q, v, params: jnp.array([0.0, 2.0]), dissipation=lambda t, q, v, params: v[1] ** 2)

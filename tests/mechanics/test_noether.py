@@ -56,7 +56,7 @@ def moved_and_predicted(system, generator, q, v, params):
     return values[-1] - values[0], 0.5 * weights @ rates[1:-1], rates[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_rate_of_a_broken_charge_is_that_of_the_motion():
     """dC/dt along motions agrees with `rate` for L, friction, velocity constraints. Twin: without the latter two."""
     squashed = lambda t, q, v, p: central(t, q, v, p) - 0.25 * q[0] ** 2 * jnp.cos(t)

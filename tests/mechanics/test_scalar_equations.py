@@ -112,7 +112,7 @@ def library_solves(system, q0, v0, params):
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_compiled_program():
     """No LAPACK call with one coordinate or a rod; seven coupled coordinates need one."""
     seven = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) + jnp.sum(v) ** 2 * jnp.cos(q[0]) ** 2)

@@ -146,8 +146,8 @@ def ladder_end(windows, end, p, speed=1.0):
         return q, np.tile([float(rate * y), float(-rate * x)], (N + 1, 1))
 
 
-def governor_end(end, p, method="Radau", rtol=1e-12):
-    """(q, v) at `end` in the order (ψ, z, C, D), from the equations of α and z with ∂L/∂ψ̇ constant."""
+def governor_field(p):
+    """The right-hand side of (ψ, α, z, dα/dt, dz/dt) with ∂L/∂ψ̇ constant."""
     m, M, ms, I = p["rod"], p["ball"], p["slider"], p["I"]
     l, b, h, k, c, l0, g = (p[x] for x in ("l", "b", "h", "k", "c", "l0", "g"))
     J, moment = 2 * (m / 3 + M) * l**2, (m / 2 + M) * l
@@ -171,16 +171,29 @@ def governor_end(end, p, method="Radau", rtol=1e-12):
         acceleration = (0.5 * slope * turn**2 + 2 * g * moment * np.cos(angle) - 2 * force * by_angle) / J
         return [turn, rate, slide, acceleration, -g - 2 * force * by_z / ms]
 
-    start = [0.0, np.pi / 6, 0.5, 0.0, 0.0]
-    # Nothing depends on ψ, so Radau's difference step for its column of zeros grows until it overflows.
-    with np.errstate(over="ignore"):
-        psi, angle, z, rate, slide = solve_ivp(field, (0, end), start, method, rtol=rtol, atol=rtol / 10).y[:, -1]
-    turn, reach = momentum / spin(angle)[0], b + l * np.cos(angle)
+    return field
+
+
+def governor_state(p, field, y):
+    """(q, v) in the order (ψ, z, C, D) of the five numbers that `governor_field` integrates."""
+    psi, angle, z, rate, slide = y
+    l, b, h, turn = p["l"], p["b"], p["h"], field(0.0, y)[0]
+    reach = b + l * np.cos(angle)
     e, n, up = np.array([np.cos(psi), np.sin(psi), 0]), np.array([-np.sin(psi), np.cos(psi), 0]), np.array([0, 0, 1])
     height, outwards = (h - l * np.sin(angle)) * up, -l * np.sin(angle) * rate * e + reach * turn * n
     sinking = -l * np.cos(angle) * rate * up
     q = np.concatenate([[psi, z], reach * e + height, -reach * e + height])
     return q, np.concatenate([[turn, slide], outwards + sinking, -outwards + sinking])
+
+
+def governor_end(end, p, method="Radau", rtol=1e-12):
+    """(q, v) at `end` in the order (ψ, z, C, D), from the equations of α and z."""
+    field = governor_field(p)
+    start = [0.0, np.pi / 6, 0.5, 0.0, 0.0]
+    # Nothing depends on ψ, so Radau's difference step for its column of zeros grows until it overflows.
+    with np.errstate(over="ignore"):
+        y = solve_ivp(field, (0, end), start, method, rtol=rtol, atol=rtol / 10).y[:, -1]
+    return governor_state(p, field, y)
 
 
 def double_pendulum_end(end, p, rtol=3e-14):

@@ -36,7 +36,7 @@ def test_andrews_against_the_printed_equations():
     assert not np.allclose(jacobian, published.andrews(q, v, params | {"d": 0.0285})[3], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_andrews_published_end():
     """At 1e-8, the end published for Andrews' mechanism is reached as well as the recomputed one."""
     assert np.all(relative_errors(run(andrews.MECHANISM, 1e-8), andrews.MECHANISM.reference) <= WITHIN * 1e-8)

@@ -6,6 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanisms import driven_crank
+from tests.by_numpy import equations
 from tests.mechanisms.test_mechanism import assert_reference, stacked
 
 
@@ -24,6 +25,14 @@ def test_driven_crank():
         rtol=1e-6,
         atol=1e-6,
     )
+
+
+def test_torque_of_the_motor():
+    """At a state the motor's multiplier is the closed form's torque."""
+    params = driven_crank.PARAMS | {"rate": 3.0}
+    q, v, torque = driven_crank.exact(0.3, params)
+    found = equations(driven_crank.system, 0.3, q, v, params).multipliers["motor"]
+    np.testing.assert_allclose(found, torque, rtol=1e-12)
 
 
 @pytest.mark.exhaustive

@@ -132,7 +132,7 @@ def test_float32_stays():
     assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(ours, *single))} == {np.dtype("float32")}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_in_both_modes():
     """With a rod: at round-off in every state; the gradient is that of forward mode, and, to a step's error, of
     differences."""

@@ -548,7 +548,7 @@ def test_traced_numbers_from_outside(lagrangian):
         np.testing.assert_allclose(found, -2.0, rtol=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motions_with_traced_numbers_from_outside():
     """d/dk cos(sqrt k) at k = 3, and the time 0.5 c of an event at q = c, for defaults of L and of a guard."""
     ts = np.array([0.0, 1.0])

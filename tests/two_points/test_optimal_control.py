@@ -119,7 +119,7 @@ def test_brachistochrone():
     assert abs(slope[0] + np.pi / 2) < 1e-6 and np.ptp(np.diff(slope)) < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_change_nothing():
     """A pendulum swung up by a torque: its angle, and x and y on a rod, have one cost."""
     angle = lj.System(lambda t, q, v, p: 0.5 * v**2 + 9.81 * jnp.cos(q), force=lambda t, q, v, p: p["torque"])

@@ -64,7 +64,7 @@ def test_derivatives():
         assert np.allclose(jax.jit(mode(speed, (0, 1)))(PARAMS["g"], END[0]), exact, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_friction():
     """A block on an incline with friction μ N: uniformly accelerated, so the start velocity is known. Twin: without
     friction it is slower. Where no motion gets there, that is said with what was tried."""

@@ -62,7 +62,7 @@ def test_lambert_with_revolutions():
     assert count == 8
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_both_catenaries():
     """The surface of a soap film between two rings is a length, y² |dq|²: the upper catenary is a minimum, the lower
     one, which steeper launches find, a saddle of index 1. Twin: the straight line finds the upper one alone."""

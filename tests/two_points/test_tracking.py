@@ -74,7 +74,7 @@ def test_riccati():
     np.testing.assert_allclose(long.cost_to_go, algebraic, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_on_a_constraint():
     """A point that turns on a circle, by its angle and by its place on a rod: with |q|² + |v|², which is (1 + Ω²) δθ² +
     δω² along the circle, the pushes and the cost to go are the same. Twin: without Ω² they are others."""

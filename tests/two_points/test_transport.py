@@ -23,7 +23,7 @@ def carried(psi, share=1.0):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_round_a_latitude():
     """Once round it turns by 2π (1 - cos ψ), to 1e-13, with the derivative in both modes. Twin: half way by half."""
     for psi in (0.4, 1.1):

@@ -202,3 +202,9 @@ def test_bad_input(settings, words):
     """Errors name what is wrong before anything is computed."""
     with pytest.raises(ValueError, match=words):
         lj.equilibria(pendulum, PARAMS, **settings)
+
+
+def test_traced_velocities_need_names():
+    """Which coordinates move is not known while the velocities are traced, unless they are named."""
+    with pytest.raises(ValueError, match="(?s)tracing the velocities.*cyclic="):
+        jax.make_jaxpr(lambda v: lj.equilibria(pendulum, PARAMS, starts=[0.1], velocities=v).q)(1.0)

@@ -61,7 +61,7 @@ def bounce_of(system, A):
     return orbit, lj.floquet(orbit)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ball_on_a_moving_table():
     """One bounce in a period: state, M and the amplitude where it becomes unstable; twin: a table that is not curved.
 

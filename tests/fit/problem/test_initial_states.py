@@ -13,7 +13,7 @@ from lagjax.numerics.windowed_least_squares import Unknowns
 from tests.fit.cases import CASES
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_start_that_the_data_do_not_see():
     """The start of an unmeasured, uncoupled coordinate is not determined; without a guess of it the fit is refused."""
     both = lambda t, q, v, p: 0.5 * (v["a"] ** 2 + v["b"] ** 2) - 0.5 * p["k"] * q["a"] ** 2 - 0.5 * q["b"] ** 2

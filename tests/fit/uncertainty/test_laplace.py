@@ -33,7 +33,7 @@ def exact(y, prior):
     return mean, inverse, evidence + 1.5 * np.log(2 * np.pi) + 0.5 * np.linalg.slogdet(inverse)[1]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_linear_motion_has_this_posterior():
     """Mean, covariance and evidence of a fall with a prior; there are no caveats, and nothing is compiled twice."""
     y = measured()

@@ -92,7 +92,7 @@ def test_what_is_not_determined(monkeypatch, system):
     assert np.isinf(ask(shrink="m", candidates={"free": of(0.0)}).next.best.sd)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_pendulum_in_air_against_scipy():
     """Further positions and velocities for friction agree with slopes by differences of SciPy's motion."""
     ts, free = np.linspace(0.0, 5.0, 40), ["c", "l"]

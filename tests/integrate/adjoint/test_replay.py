@@ -116,7 +116,7 @@ def test_constraints_and_their_multipliers(copies):
     modes_agree(lambda x: jnp.sum(jax.vmap(one, (0, None))(*x)), (jnp.array([0.0, 0.5]), PARAMS))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_constraint_and_its_multiplier():
     """A mass on a rod turns evenly without gravity, y = l sin(v t/l) with λ = v²/(2 l²): by l and v, in closed form."""
     system = rod()

@@ -36,7 +36,7 @@ def restitution(k, c):
     return jnp.exp(-b / w * (jnp.pi - jnp.arctan2(2 * b * w, w**2 - b**2)))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_restitution():
     """Impacts of four dampings at once, up to heavy ones. Twin: contacts that pull until the gap opens return less."""
     c = np.array([0.0, 8.0, 40.0, 60.0])
@@ -111,7 +111,7 @@ def landed(element: bool):
 
 
 @pytest.mark.parametrize(
-    "element", [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)]
+    "element", [pytest.param(False, marks=pytest.mark.exhaustive), pytest.param(True, marks=pytest.mark.exhaustive)]
 )
 def test_friction_on_a_spring(element):
     """A block falls on a mat and slides until μ times the push, added up, has taken its speed: the time in closed form.

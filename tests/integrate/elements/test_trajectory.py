@@ -38,7 +38,7 @@ def thrown(mu=MU, ts=(0.0, 1.0, 5.0), **options) -> lj.HybridTrajectory:
 computed = functools.cache(thrown)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_between_outputs():
     """In flight, between impacts, sliding and at rest as in closed form, from outputs far apart. Twin: free fall."""
     traj = computed()
@@ -87,7 +87,7 @@ def test_as_a_dataset():
     assert modes.dims == ("t", "mode") and modes.sel(mode="floor friction").values.tolist() == [0, 0, 2]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_energy_by_element():
     """Friction takes what is left at rest, impacts the rest of the energy, and the sum closes. Twin: it does not with
     another friction."""

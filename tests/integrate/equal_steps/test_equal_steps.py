@@ -105,9 +105,7 @@ def test_a_rod_given_three_times(method):
         "root": lj.Holonomic(lambda t, q, g: jnp.sqrt(q @ q) - 1.0),
     }
     ts = np.linspace(0.0, 10.0, 51)
-    one, three = (
-        run(system, RAISED, G, ts, method, 0.01) for system in (rod, lj.System(fall, constraints=again))
-    )
+    one, three = (run(system, RAISED, G, ts, method, 0.01) for system in (rod, lj.System(fall, constraints=again)))
     np.testing.assert_allclose(three.q, one.q, atol=1e-13)
     # Rows 1, 1/2 and 1/2 of the first one: the shortest is in proportion to them.
     for name, share in zip(again, (1.0, 0.5, 0.5)):

@@ -261,7 +261,7 @@ def steep(guards, **options):
     return lj.integrate(FREE, 0.0, 1.0, ts=jnp.array([0.0, 10.0]), events=events, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_infinite_slope_does_not_stop_the_motion():
     """sqrt(t), ∛q, arccos, log and T₃₀, steep at the start or the end, cross at their roots, in a few hundred looks."""
     motion = steep({name: guard for name, (guard, _) in STEEP.items()})

@@ -92,7 +92,7 @@ def test_derivative_by_many_numbers():
         np.testing.assert_allclose(jax.grad(second)(weights, dt0), np.full(40, jax.grad(by_sum)(1.0)), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_with_and_without_a_crossing():
     """By many numbers, in reverse mode: one ball reaches a height, t = (v - √(v² - 2 g h)) / g; the other one does not,
     q = v T - g T²/2, and its derivative is not that of a crossing at NaN, times zero."""

@@ -105,7 +105,7 @@ def test_continued_as_it_was_asked_for():
     assert (asked.drift, asked.by_size, asked.jumps, asked.method) == ("project", True, "ignored", None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_constraints_hold():
     """States are projected and have multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1."""
     found, (q, v) = rotate().at(BETWEEN), exact(BETWEEN)

@@ -139,7 +139,7 @@ def predator(t, y, args):
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_order():
     """Order 5 at the ends of steps; twin: the same measurement finds order 4 for diffrax's interpolant."""
     integrate = pytest.importorskip("scipy.integrate")
@@ -158,7 +158,7 @@ def test_order():
 
 
 @pytest.mark.optimised
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", exhaustive_but(("rod_pendulum",), ("pendulum", "rod_pendulum")))
 def test_order_of_a_motion(name):
     """Order 5 at outputs between the steps of `lagjax.integrate`, free and under a constraint (round-off)."""
