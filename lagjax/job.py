@@ -3,10 +3,10 @@
 For each scene: error against run time by method and tolerance beside a peer written by hand, the time of the first
 answer, the results of stiff and extreme cases, what its source gets wrong; work-precision diagrams and a picture as
 PNG, all numbers as JSON. `--full` adds what repeats this: second variations of a motion by all methods, slow peers,
-further cases, the whole stability report (`python -m lagjax stability` prints it alone). The exit status is 1 if a
-scene misses its accuracy, or a row of the stability report is silently wrong or has another outcome than expected.
-Parts run side by side, one per core: most of their time is compilation, which uses one thread. Each is printed as it
-ends.
+further cases, the whole stability report (`python -m lagjax stability` prints it alone), and all of it compiled as
+users get it, where else XLA optimises little what is not timed. The exit status is 1 if a scene misses its accuracy,
+or a row of the stability report is silently wrong or has another outcome than expected. Parts run side by side, one per
+core: most of their time is compilation, which uses one thread. Each is printed as it ends.
 """
 
 import argparse
@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import asdict
 from multiprocessing import get_all_start_methods, get_context, parent_process
 from pathlib import Path
@@ -127,6 +128,19 @@ def _part(name, tier, of_stability, folder) -> JobPart:
     return part._replace(summary=(*part.summary[:-1], seconds, part.summary[-1]))
 
 
+@contextmanager
+def _quickly_compiled(tier):
+    """XLA optimises little, for what runs once and is not timed; its numbers change by round-off. `FULL` has everything
+    as users get it.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", before or tier < FULL)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+
+
 def _parse(arguments):
     parser = argparse.ArgumentParser(
         prog="python -m lagjax", description="Check, time and draw the scenes: error against run time."
@@ -166,7 +180,8 @@ def _parse(arguments):
 
 def _stability(tier) -> JobPart:
     """The stability report, with the rows that do not have the expected outcome."""
-    outcomes = [row.attempt() for row in stability.trials(tier)]
+    with _quickly_compiled(tier):
+        outcomes = [row.attempt() for row in stability.trials(tier)]
     title = "Stability: accurate, degraded with a warning, or refused with a reason"
     printed = f"{title}\n{'=' * len(title)}\n\n{stability.stability_table(outcomes)}"
     numbers = [asdict(outcome) | {"verdict": outcome.verdict} for outcome in outcomes]
@@ -183,8 +198,9 @@ def _scene(scene, tier, folder) -> JobPart:
     runs = [run for run in scene.runs() if run.tier <= max(tier, MAIN)]
     runs = runs[:1] if tier == QUICK else runs
     found = [(run, report.work_precision(run, tier, **SETTINGS[tier])) for run in runs]
-    cases = scene.cases(tier)
-    picture = _draw(scene, found, folder, tier)
+    with _quickly_compiled(tier):
+        cases = scene.cases(tier)
+        picture = _draw(scene, found, folder, tier)
     rows = [row for run, of_run in found for row in report.rows_of(run, of_run)]
     missed = [f"{scene.name}: {row.run}, error {row.error:.1e} > {row.required:.0e}" for row in rows if not row.passed]
     missed += [
