@@ -1,5 +1,6 @@
 """A system of bodies: the sum of their kinetic energies, and the constraints of their joints."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -62,7 +63,7 @@ def multibody(
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
     names = [body.name for body in (*bodies, *driven.bodies)]
-    twice = {name for name in names if names.count(name) > 1}
+    twice = {name for name, count in Counter(names).items() if count > 1}
     if twice or units.keys() & joints.keys():
         name = sorted(twice or units.keys() & joints.keys())[0]
         raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")

@@ -480,9 +480,11 @@ def _check_inertia(name: str, given: np.ndarray):
             f"the inertia of '{name}' must be three principal moments or a symmetric matrix (3, 3), and is "
             f"{given.tolist()}."
         )
-    moments = np.sort(given if given.ndim == 1 else np.linalg.eigvalsh(given))
+    # Sums of the largest numbers overflow, those of shares of them do not.
+    size = np.abs(given).max() or 1.0
+    moments = np.sort(given / size if given.ndim == 1 else np.linalg.eigvalsh(given / size))
     if moments[0] < 0 or moments[2] > (moments[0] + moments[1]) * (1 + ROUNDED):
-        listed = ", ".join(f"{x:.6g}" for x in moments)
+        listed = ", ".join(f"{x:.6g}" for x in moments * size)
         raise ValueError(
             f"no body has the moments of inertia of '{name}', {listed}: each is at most the sum of the two others.\n"
             "Usual cause: moments about a point that is not the centre of mass, or products of inertia with the wrong "

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lagjax.display import Faces, triangles
+from lagjax.models.parts import is_file
 
 CORNER = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
@@ -24,7 +25,8 @@ def mesh_of(name: str, folder: Path | None) -> Faces | None:
         if not np.all(np.isfinite(vertices)) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
             return None
         return triangles(vertices, faces)
-    except (ValueError, IndexError):
+    # Numbers that are none, too few, too many digits; a file that may not be read.
+    except (ValueError, IndexError, OverflowError, OSError):
         return None
 
 
@@ -36,7 +38,7 @@ def _found(name: str, folder: Path | None) -> Path | None:
         )
     else:
         places = [Path(rest) if folder is None else folder / rest]
-    return next((place for place in places if place.is_file()), None)
+    return next((place for place in places if is_file(place)), None)
 
 
 def _stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:

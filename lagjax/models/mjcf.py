@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
 from lagjax.models.parts import (
+    BEFORE_TEXT,
     LinkShape,
     Loop,
     MergedLinks,
@@ -20,6 +21,7 @@ from lagjax.models.parts import (
     RobotJoint,
     RobotLink,
     file_of,
+    made_up,
     merged,
 )
 from lagjax.models.robot_model import RobotModel
@@ -73,7 +75,11 @@ def read_mjcf(source: str | Path) -> RobotModel:
     """
     path, mujoco = file_of(source, "lj.read_mjcf"), mujoco_itself()
     try:
-        spec = mujoco.MjSpec.from_string(str(source)) if path is None else mujoco.MjSpec.from_file(str(path))
+        spec = (
+            mujoco.MjSpec.from_string(str(source).lstrip(BEFORE_TEXT))
+            if path is None
+            else mujoco.MjSpec.from_file(str(path))
+        )
         compiled = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo does not take {'the text' if path is None else path.name}: {error}") from error
@@ -88,7 +94,9 @@ class _Reading:
         self.not_taken: list[NotTaken] = []
         lists = {"body": spec.bodies, "joint": spec.joints, "geom": spec.geoms, "equality": spec.equalities}
         self.lines = {(kind, x.id): x.info for kind, found in lists.items() for x in found}
-        self.bodies = [compiled.body(i).name or f"body {i}" for i in range(compiled.nbody)]
+        self.known = {x.name for kind in ("body", "joint", "equality") for x in lists[kind]}
+        self.bodies = [compiled.body(i).name or self._made_up(f"body {i}") for i in range(compiled.nbody)]
+        self.joints = [compiled.joint(k).name or self._made_up(f"joint {k}") for k in range(compiled.njnt)]
 
     def model(self) -> RobotModel:
         links: dict[str, RobotLink] = {}
@@ -107,17 +115,28 @@ class _Reading:
         gravity = np.zeros(3) if self._disabled("GRAVITY") else self.m.opt.gravity
         return RobotModel.of(self.spec.modelname, tree, shapes, loops, gravity, self.not_taken)
 
+    def _made_up(self, name: str) -> str:
+        name = made_up(name, self.known)
+        self.known.add(name)
+        return name
+
     def _body(self, i: int, shift: np.ndarray, links: dict[str, RobotLink], joints: list[RobotJoint]) -> np.ndarray:
         """Add a body's links and joints; return where its link's frame is in the body."""
         m, name, line = self.m, self.bodies[i], self.lines.get(("body", i), "")
         parent = None if i == 0 else self.bodies[m.body_parentid[i]]
+        told = np.concatenate([m.body_pos[i], m.body_quat[i], m.body_ipos[i], m.body_iquat[i], m.body_inertia[i]])
+        if not (np.isfinite(told).all() and np.isfinite(m.body_mass[i]) and m.body_quat[i].any()):
+            raise ValueError(
+                f"{line}: place, mass or inertia of '{name}' are no finite numbers.\n"
+                "Usual cause: a misprinted exponent.\nFix: its numbers in the file."
+            )
         frame = Placement(m.body_pos[i] - shift, _matrix(m.body_quat[i]))
         numbers = range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i])
         at = np.zeros(3)
         for k in numbers:
             # MuJoCo ignores the place of a free joint.
             pivot = np.zeros(3) if self._kind(k) == "floating" else m.jnt_pos[k]
-            child = name if k == numbers[-1] else f"{name} before {self._joint_name(k + 1)}"
+            child = name if k == numbers[-1] else self._made_up(f"{name} before {self.joints[k + 1]}")
             joints.append(self._joint(k, parent, child, frame.then(Placement(pivot - at, np.eye(3)))))
             links[child] = RobotLink(child, 0.0, np.zeros(3), np.zeros((3, 3)), line)
             parent, frame, at = child, Placement(np.zeros(3), np.eye(3)), pivot
@@ -125,17 +144,14 @@ class _Reading:
             joints.append(RobotJoint(f"{name} is fixed", "fixed", parent, name, frame, np.zeros(3), line))
         axes = _matrix(m.body_iquat[i])
         inertia = axes @ np.diag(m.body_inertia[i]) @ axes.T
-        links[name] = RobotLink(name, float(m.body_mass[i]), m.body_ipos[i] - at, (inertia + inertia.T) / 2, line)
+        links[name] = RobotLink(name, float(m.body_mass[i]), m.body_ipos[i] - at, inertia / 2 + inertia.T / 2, line)
         return at
 
     def _kind(self, k: int) -> str:
         return KIND[self.mujoco.mjtJoint(self.m.jnt_type[k]).name]
 
-    def _joint_name(self, k: int) -> str:
-        return self.m.joint(k).name or f"joint {k}"
-
     def _joint(self, k: int, parent: str | None, child: str, placement: Placement) -> RobotJoint:
-        m, kind, name, line = self.m, self._kind(k), self._joint_name(k), self.lines.get(("joint", k), "")
+        m, kind, name, line = self.m, self._kind(k), self.joints[k], self.lines.get(("joint", k), "")
         first, at = m.jnt_dofadr[k], m.jnt_qposadr[k]
         stiffness, damping = float(m.jnt_stiffness[k]), float(m.dof_damping[first])
         armature, rest = float(m.dof_armature[first]), 0.0
@@ -154,11 +170,17 @@ class _Reading:
             damping = armature = 0.0
         self.not_taken += [NotTaken(what, name, line) for what, there in left.items() if there]
         axis = m.jnt_axis[k] if kind in ("revolute", "prismatic") else np.zeros(3)
+        if kind in ("revolute", "prismatic") and not 0 < np.abs(axis).max() < np.inf:
+            raise ValueError(
+                f"{line}: the axis of '{name}' has no direction that numbers can hold.\nFix: a unit vector."
+            )
         return RobotJoint(name, kind, parent, child, placement, axis.copy(), line, damping, stiffness, rest, armature)
 
     def _loop(self, i: int, tree: MergedLinks) -> Loop | None:
         m, mujoco, line = self.m, self.mujoco, self.lines.get(("equality", i), "")
-        name = m.equality(i).name or f"equality {i}"
+        # A loop and a joint of one name would be one constraint.
+        name = m.equality(i).name or self._made_up(f"equality {i}")
+        name = self._made_up(f"equality {name}") if name in self.joints else name
         if not m.eq_active0[i] or self._disabled("EQUALITY"):
             self.not_taken.append(NotTaken("inactive equalities", name, line))
             return None

@@ -9,7 +9,7 @@ the sum by the parallel-axis theorem,
 Source: Featherstone, *Rigid Body Dynamics Algorithms* (2008), §2.13 and Ch. 4.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,9 @@ import numpy as np
 
 from lagjax.display import Faces
 
+# What may stand before the text of a file: white space and a byte-order mark.
+BEFORE_TEXT = " \t\r\n\ufeff"
+LONGEST_SHOWN = 200
 # By how much of their sum principal moments may miss the triangle inequality, as in `lj.Body`.
 ROUNDED = 1e-9
 
@@ -156,6 +159,11 @@ def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> Merg
 def _sum(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink:
     if len(parts) == 1:
         return head
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _summed(head, parts)
+
+
+def _summed(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink:
     mass = sum(link.mass for link, _ in parts)
     moment = sum(link.mass * frame.point(link.centre) for link, frame in parts)
     centre = moment / mass if mass else np.zeros(3)
@@ -163,32 +171,58 @@ def _sum(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink
     for link, frame in parts:
         d = frame.point(link.centre) - centre
         inertia += frame.axes @ link.inertia @ frame.axes.T + link.mass * (d @ d * np.eye(3) - np.outer(d, d))
-    return head._replace(mass=mass, centre=centre, inertia=(inertia + inertia.T) / 2)
+    return head._replace(mass=mass, centre=centre, inertia=inertia / 2 + inertia.T / 2)
 
 
 def fault_of_inertia(link: RobotLink) -> str:
     """Why no body has these numbers, "" where one has."""
     if link.mass < 0:
         return f"has the mass {link.mass:.6g}"
-    moments = np.linalg.eigvalsh(link.inertia)
+    # Sums of the largest numbers overflow, those of the moments by the largest do not.
+    size = np.abs(link.inertia).max() or 1.0
+    if not np.isfinite(size):
+        return "has moments of inertia beyond the largest number"
+    moments = np.linalg.eigvalsh(link.inertia / size)
     if moments[0] < -ROUNDED * np.abs(moments).max():
-        return f"has a negative principal moment of inertia, {moments[0]:.6g}"
+        return f"has a negative principal moment of inertia, {moments[0] * size:.6g}"
     if moments[2] > (moments[0] + moments[1]) * (1 + ROUNDED):
-        listed = ", ".join(f"{x:.6g}" for x in moments)
+        listed = ", ".join(f"{x:.6g}" for x in moments * size)
         return f"has the principal moments {listed}, of which the last is more than the sum of the others"
     return ""
 
 
+def made_up(name: str, known: Container[str]) -> str:
+    """A name for what has none in the file, that nothing there has."""
+    while name in known:
+        name += "'"
+    return name
+
+
+def unit(axis: np.ndarray) -> np.ndarray:
+    """A vector of length one, zero for zero; its numbers may be the largest or the least there are."""
+    size = np.abs(axis).max()
+    return axis if size == 0 else axis / size / np.linalg.norm(axis / size)
+
+
 def file_of(source: str | Path, user: str) -> Path | None:
     """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
-    if isinstance(source, str) and source.strip().startswith("<"):
+    if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):
         return None
     if not isinstance(source, (str, Path)):
         raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
     path = Path(source).expanduser()
-    if not path.is_file():
+    if not is_file(path):
+        shown = str(source) if len(str(source)) <= LONGEST_SHOWN else str(source)[:LONGEST_SHOWN] + "..."
         raise FileNotFoundError(
-            f"there is no file '{source}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
+            f"there is no file '{shown}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
             f'package:// name, which ROS alone knows.\nFix: {user}("/path/to/the/file"), or the text itself.'
         )
     return path
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that is too long for the system is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False

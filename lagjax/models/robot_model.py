@@ -1,5 +1,6 @@
 """A mechanism from a file: bodies and joints, its system in either kind of coordinates, and the way between them."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -44,7 +45,17 @@ from lagjax.models.joint_positions import (
     rate_squared,
 )
 from lagjax.models.looks import looks_of, not_drawn
-from lagjax.models.parts import LinkShape, Loop, MergedLinks, NotTaken, Placement, RobotJoint, RobotLink, unmoved
+from lagjax.models.parts import (
+    LinkShape,
+    Loop,
+    MergedLinks,
+    NotTaken,
+    Placement,
+    RobotJoint,
+    RobotLink,
+    made_up,
+    unmoved,
+)
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
@@ -107,6 +118,12 @@ class RobotModel:
                 f"{empty[0].line}: '{empty[0].name}' has moments of inertia and no mass.\n"
                 "Fix: its mass; or all of them zero, if it is a frame."
             )
+        for link in merged.links.values():
+            if not np.isfinite([link.mass, *link.centre, *link.inertia.flat]).all():
+                raise ValueError(
+                    f"{link.line}: mass, centre or inertia of '{link.name}', with what is fixed to it, are beyond the "
+                    "largest number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
+                )
         return cls(name, *merged, placed, tuple(loops), tuple(field.tolist()), tuple(not_taken))
 
     def __reduce__(self):
@@ -163,9 +180,13 @@ class RobotModel:
 
         **Raises:** `ValueError` for a massless link that no joint of `lj` stands for, by its line.
         """
-        own = {" ".join(joint.name for joint in x.joints): EQUATIONS[x.kind](x.a, x.b)
-               for x in self._between.values() if x.kind != "floating"}  # fmt: skip
-        own |= self._loops()
+        own, loops = {}, self._loops()
+        for x in self._between.values():
+            if x.kind != "floating":
+                name = " ".join(joint.name for joint in x.joints)
+                name = name if len(x.joints) == 1 else made_up(name, own.keys() | self.joints.keys() | loops.keys())
+                own[name] = EQUATIONS[x.kind](x.a, x.b)
+        own |= loops
         if both := own.keys() & (joints or {}).keys():
             raise ValueError(f"the file has a joint '{sorted(both)[0]}' already.\nFix: another name.")
         bodies, lagrangian = list(self.bodies.values()), others.pop("lagrangian", None)
@@ -222,9 +243,13 @@ class RobotModel:
 
     @cached_property
     def _tree(self) -> Tree:
-        for name in self.links:
-            if not self._mass_from(name):
-                raise self._massless([joint for joint in self.joints.values() if joint.child == name])
+        # The mass of a link and of what hangs on it; children come after their parents.
+        mass = {name: link.mass for name, link in self.links.items()}
+        for joint in reversed(self.joints.values()):
+            if joint.parent is not None:
+                mass[joint.parent] += mass[joint.child]
+        if bare := [joint for joint in self.joints.values() if not mass[joint.child]]:
+            raise self._massless(bare[:1])
         frames = {name: Body(name, 0.0, (0.0, 0.0, 0.0)) for name in self.links if name not in self.bodies}
         bodies = {name: frames.get(name) or self.bodies[name] for name in self.links}
 
@@ -317,7 +342,7 @@ class RobotModel:
     def _between(self) -> dict[str, BodyJoint]:
         """By body, what joins it to the body before it."""
         above = {joint.child: joint for joint in self.joints.values()}
-        holds = [joint.parent for joint in self.joints.values()]
+        holds = Counter(joint.parent for joint in self.joints.values())
         found, passed = {}, set()
         for name in self.bodies:
             joints = [above[name]]
@@ -327,7 +352,7 @@ class RobotModel:
             ends = (ground if parent is None else self.bodies[parent], self.bodies[name])
             centres = (np.zeros(3) if parent is None else self.links[parent].centre, self.links[name].centre)
             # A massless link that holds several joints moves them together.
-            forks = any(holds.count(joint.parent) > 1 for joint in joints[1:])
+            forks = any(holds[joint.parent] > 1 for joint in joints[1:])
             joined = None if forks else connected(tuple(joints), ends, centres)
             if joined is None:
                 raise self._massless(joints)
@@ -335,11 +360,6 @@ class RobotModel:
         for name in self.links.keys() - self.bodies.keys() - passed:
             raise self._massless([above[name]])
         return found
-
-    def _mass_from(self, name: str) -> float:
-        """The mass of a link and of what hangs on it."""
-        children = [joint.child for joint in self.joints.values() if joint.parent == name]
-        return self.links[name].mass + sum(self._mass_from(child) for child in children)
 
     def _massless(self, joints: list[RobotJoint]) -> ValueError:
         link = self.links[joints[0].child]

@@ -4,6 +4,7 @@ The elements are those of `wiki.ros.org/urdf/XML`. A rotation `rpy="r p y"` turn
 order, R = Rz(y) Ry(p) Rx(r). Numbers are in the file's units, which are meant to be SI, angles in radians.
 """
 
+import codecs
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.models.meshes import mesh_of
 from lagjax.models.parts import (
+    BEFORE_TEXT,
     LinkShape,
     NotTaken,
     Placement,
@@ -22,6 +24,7 @@ from lagjax.models.parts import (
     fault_of_inertia,
     file_of,
     merged,
+    unit,
     unmoved,
 )
 from lagjax.models.robot_model import RobotModel
@@ -177,7 +180,7 @@ def _parsed(text: str | bytes, called: str) -> XMLElement:
     top = XMLElement("", {}, 0)
     open_ = [top]
     # A declaration must stand at the very beginning.
-    begun = text.lstrip()
+    begun = text.lstrip(BEFORE_TEXT) if isinstance(text, str) else text.removeprefix(codecs.BOM_UTF8).lstrip()
     left_out = text[: len(text) - len(begun)]
     above = left_out.count("\n") if isinstance(left_out, str) else left_out.count(b"\n")
 
@@ -232,7 +235,10 @@ def _placement(x: XMLElement | None) -> Placement:
     if "quat_xyzw" in x.attributes:
         if "rpy" in x.attributes:
             raise ValueError(f"line {x.line}: <origin> has rpy= and quat_xyzw=.\nFix: leave one of them.")
-        axes = Rotation.from_quat(x.numbers("quat_xyzw", 4))
+        quaternion = unit(x.numbers("quat_xyzw", 4))
+        if not quaternion.any():
+            raise ValueError(f"line {x.line}: quat_xyzw= of <origin> is zero, which is no rotation.\nFix: 0 0 0 1.")
+        axes = Rotation.from_quat(quaternion)
     return Placement(x.numbers("xyz", 3, np.zeros(3)), axes.as_matrix())
 
 
@@ -254,8 +260,9 @@ def _link(x: XMLElement, not_taken: list[NotTaken]) -> RobotLink:
     given.only("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     xx, yy, zz = (given.number(key) for key in ("ixx", "iyy", "izz"))
     xy, xz, yz = (given.number(key, 0.0) for key in ("ixy", "ixz", "iyz"))
-    inertia = frame.axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ frame.axes.T
-    return RobotLink(name, mass.number("value"), frame.origin, (inertia + inertia.T) / 2, f"line {inertial.line}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        inertia = frame.axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ frame.axes.T
+    return RobotLink(name, mass.number("value"), frame.origin, inertia / 2 + inertia.T / 2, f"line {inertial.line}")
 
 
 def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]) -> RobotJoint:
@@ -283,7 +290,8 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
         raise ValueError(f"line {x.line}: {x.called} joins '{ends[0]}' to itself.")
     given = x.one("axis")
     axis = np.array([1.0, 0.0, 0.0]) if given is None else given.numbers("xyz", 3)
-    size = np.sqrt(axis @ axis)
+    with np.errstate(over="ignore"):
+        size = np.hypot.reduce(axis)
     if kind in ("revolute", "continuous", "prismatic", "planar"):
         if not size > 0:
             raise ValueError(f"line {given.line if given else x.line}: the axis of {x.called} is zero.")
@@ -297,8 +305,7 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
         if damping and kind not in ("revolute", "continuous", "prismatic"):
             not_taken.append(NotTaken("damping", name, f"line {dynamics.line}"))
             damping = 0.0
-    axis = axis / size if size > 0 else axis
-    return RobotJoint(name, TYPES[kind], ends[0], ends[1], _placement(x.one("origin")), axis, line, damping)
+    return RobotJoint(name, TYPES[kind], *ends, _placement(x.one("origin")), unit(axis), line, damping)
 
 
 def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: str) -> list[RobotJoint]:
@@ -325,10 +332,13 @@ def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: 
         )
     kind = "fixed" if base == "fixed" else "floating"
     ordered = [RobotJoint(roots[0], kind, None, roots[0], unmoved(), np.zeros(3), links[roots[0]].line)]
-    held = {roots[0]}
-    while left := [joint for joint in joints if joint.parent in held and joint.child not in held]:
-        ordered += left
-        held |= {joint.child for joint in left}
+    below: dict[str | None, list[RobotJoint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    # It grows while it is gone through.
+    for joint in ordered:
+        ordered += below.get(joint.child, [])
+    held = {joint.child for joint in ordered}
     if len(held) < len(links):
         lost = [joint for joint in joints if joint.child not in held]
         listed = ", ".join(f"'{joint.name}' ({joint.line})" for joint in lost)

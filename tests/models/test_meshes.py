@@ -52,6 +52,8 @@ def test_what_is_no_mesh(tmp_path):
     for name, data in broken.items():
         (tmp_path / name).write_bytes(data)
         assert mesh_of(name, tmp_path) is None, name
+    (tmp_path / "f.obj").write_text("v 0 0 0\nf 1 1 " + 40 * "9")
+    assert mesh_of("f.obj", tmp_path) is None and mesh_of(5000 * "x", tmp_path) is None
     assert mesh_of("none.stl", tmp_path) is None and mesh_of("a.stl", None) is None
     assert mesh_of("package://arm/a.stl", None) is None
 

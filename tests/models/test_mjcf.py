@@ -175,10 +175,48 @@ def test_files(tmp_path):
     part.write_text('<mujoco><body name="b"><joint type="ball"/><geom type="sphere" size="1"/></body></mujoco>')
     whole.write_text('<mujoco><worldbody><include file="part.xml"/></worldbody></mujoco>')
     assert list(lj.read_mjcf(whole).bodies) == ["b"]
+    assert list(lj.read_mjcf("\ufeff" + part.read_text().replace("<body", "<worldbody><body").replace(
+        "</body>", "</body></worldbody>")).bodies) == ["b"]  # fmt: skip
     with pytest.raises(ValueError, match="(?s)MuJoCo does not take the text: .*bdy.*line 2"):
         lj.read_mjcf("<mujoco><worldbody>\n<bdy/></worldbody></mujoco>")
     with pytest.raises(FileNotFoundError, match="there is no file 'nowhere.xml'"):
         lj.read_mjcf("nowhere.xml")
+
+
+def welded_beside(name):
+    """A body with another of mass 5 welded to it, which has no name, and a second body of this name."""
+    return f"""<mujoco><worldbody><body name="a"><joint name="h" axis="0 1 0"/><geom size=".1" mass="1"/>
+        <body><geom size=".1" mass="5"/></body></body>
+        <body name="{name}"><joint axis="0 1 0"/><joint name="k"/><geom size=".1" mass="1"/></body></worldbody>
+        <equality><connect name="h" body1="{name}" body2="world" anchor="0 0 0"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["body 2", "body 2'", "a before k", "body 3 before k", "joint 1", "h", "equality h"])
+def test_made_up_names_meet_none_of_the_file(name):
+    """Whatever a body is called, masses and joints are those of the file, and a loop takes no joint's place."""
+    model = lj.read_mjcf(welded_beside(name))
+    assert {key: body.mass for key, body in model.bodies.items()} == {"a": 6.0, name: 1.0}
+    assert [joint.parent for joint in model.joints.values()][:2] == [None, None] and len(model.joints) == 3
+    assert len({*model.joints, *(loop.name for loop in model.loops)}) == 4
+
+
+@pytest.mark.parametrize(
+    ("attributes", "axis", "message"),
+    [
+        ('quat="0 0 0 0"', "0 1 0", "MuJoCo does not take the text: .*zero quaternion"),
+        ('quat="1e200 0 0 1e200"', "0 1 0", "line 1: place, mass or inertia of 'rod' are no finite numbers"),
+        ('pos="nan 0 0"', "0 1 0", "line 1: place, mass or inertia of 'rod' are no finite numbers"),
+        pytest.param("", "0 1e200 0", "line 1: the axis of 'hinge' has no direction",
+                     marks=pytest.mark.filterwarnings("ignore:Inertia matrix is too close")),
+    ],
+)  # fmt: skip
+def test_numbers_that_are_none(attributes, axis, message):
+    """Refused with line and name."""
+    with pytest.raises(ValueError, match=message):
+        lj.read_mjcf(
+            f'<mujoco><worldbody><body name="rod" {attributes}><joint name="hinge" axis="{axis}"/>'
+            '<geom size=".1" mass="1"/></body></worldbody></mujoco>'
+        )
 
 
 @pytest.mark.exhaustive

@@ -199,6 +199,7 @@ def test_accelerations_of_an_arm():
 
 
 BODY = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+LARGEST = BODY.replace('"1"', '"1.7e308"')
 
 
 def two_links(joint="", link=BODY, kind="revolute", beside=""):
@@ -233,6 +234,11 @@ def also(parent, child, name="x"):
         (two_links(link=BODY.replace("mass value=", "mass kg=")), "line 3: <mass> has no value="),
         (two_links(link=BODY.replace('mass value="1"', 'mass value="-1"')), "line 3: 'rod' has the mass -1"),
         (two_links(link=BODY.replace('mass value="1"', 'mass value="0"')), "line 3: 'rod' has moments of .* no mass"),
+        (
+            two_links(link=LARGEST, beside=f'<link name="hand">{LARGEST}</link>' + also("rod", "hand")),
+            "line 3: .* of 'rod', with what is fixed to it, are beyond the largest number",
+        ),
+        (two_links('<origin quat_xyzw="0 0 0 0"/>'), "line 5: quat_xyzw= of <origin> is zero"),
         (two_links(beside='<link name="other"/>'), "no joint holds 'post' .line 2., 'other' .line 6."),
         (two_links(beside='<link name="rod"/>'), "line 6: <link> 'rod' is there already, in line 3"),
         (two_links(beside=also("post", "rod")), "line 6: 'rod' is the child of 'x' and of 'hinge' .line 4."),
@@ -260,11 +266,32 @@ def test_what_is_refused(text, message):
         lj.read_urdf(text)
 
 
+@pytest.mark.parametrize(("axis", "unit"), [("0 1e200 0", [0, 1, 0]), ("3e-200 0 4e-200", [0.6, 0, 0.8])])
+def test_axes_of_any_length(axis, unit):
+    """An axis is a direction, however long it is written; moments of inertia may be the largest numbers."""
+    model = lj.read_urdf(two_links(f'<axis xyz="{axis}"/>', link=BODY.replace('"1"', '"1e308"')))
+    np.testing.assert_allclose(model.joints["hinge"].axis, unit, rtol=1e-15)
+    assert model.bodies["rod"].mass == 1e308
+
+
+def test_a_long_chain():
+    """A thousand links are read, and are a tree, though Python's calls are not so deep."""
+    links = "".join(f'<link name="{i}">{BODY}</link>' for i in range(1001))
+    joint = '<joint name="{0}" type="revolute"><parent link="{0}"/><child link="{1}"/></joint>'
+    model = lj.read_urdf(f"<robot>{links}{''.join(joint.format(i, i + 1) for i in reversed(range(1000)))}</robot>")
+    assert [joint.name for joint in model.joints.values()] == [str(i) for i in range(1000)]
+    model.tree()
+
+
 def test_files_and_texts(tmp_path):
     """A path as text or Path, a text with its declaration; what is neither."""
     path = tmp_path / "two links.urdf"
     path.write_text(PENDULUM)
     assert repr(lj.read_urdf(path)) == repr(lj.read_urdf(str(path))) == repr(lj.read_urdf(PENDULUM))
+    path.write_bytes(b"\xef\xbb\xbf" + PENDULUM.encode())
+    assert repr(lj.read_urdf(path)) == repr(lj.read_urdf("\ufeff" + PENDULUM)) == repr(lj.read_urdf(PENDULUM))
+    with pytest.raises(FileNotFoundError, match="there is no file 'xxx.*[.][.][.]'"):
+        lj.read_urdf(5000 * "x")
     with pytest.raises(FileNotFoundError, match="there is no file 'nowhere.urdf'"):
         lj.read_urdf("nowhere.urdf")
     with pytest.raises(TypeError, match="takes the path of a file or its text, not int"):

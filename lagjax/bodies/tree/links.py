@@ -8,6 +8,7 @@ children to come. Each of these has a slot, which its last child takes over; a c
 always fork at most log2(n), as the largest branch comes last.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -116,7 +117,7 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
             entries.append(Entry(body.name, ("free",), None))
             quaternions += 1
     names = [entry.name for entry in entries]
-    if twice := [name for name in names if names.count(name) > 1]:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ValueError(f"a joint and a free body are called '{twice[0]}'.\nFix: a name for each.")
     return _in_order(bodies, held_by), entries
 
@@ -198,7 +199,8 @@ def _in_order(bodies: Sequence[Body], held_by: Mapping) -> list[Link]:
     while ahead:
         met.append(ahead.pop())
         ahead += children.get(met[-1], ())
-    if lost := [body.name for body in bodies if body not in set(met)]:
+    reached = set(met)
+    if lost := [body.name for body in bodies if body not in reached]:
         raise ValueError(
             f"bodies {', '.join(map(repr, lost[:4]))} hang on each other in a ring, and on nothing else.\n"
             "Usual cause: a closed loop, or the places of a joint in the wrong order, which is the parent's first.\n"
