@@ -30,6 +30,7 @@ from lagjax.jaxtools.jaxpr import (
     anywhere,
     applied,
     bodies,
+    callbacks_in_turn,
     depends,
     equations,
     evaluate,

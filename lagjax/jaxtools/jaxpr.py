@@ -112,6 +112,17 @@ def rewritten(closed: ClosedJaxpr, change: Callable) -> ClosedJaxpr:
     return _rewritten(closed, lambda jaxpr: jaxpr.replace(eqns=list(map(change, jaxpr.eqns))))
 
 
+def callbacks_in_turn(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The program with callbacks that JAX would refuse in lanes called for one lane after the other."""
+
+    def change(equation: JaxprEqn):
+        if equation.primitive.name != "pure_callback" or equation.params.get("vmap_method", "") is not None:
+            return equation
+        return equation.replace(params=equation.params | {"vmap_method": "sequential"})
+
+    return rewritten(closed, change)
+
+
 def _rewritten(closed: ClosedJaxpr, change: Callable[[Jaxpr], Jaxpr]) -> ClosedJaxpr:
     """The program with its list of equations changed, and the lists inside loops, branches and functions.
 

@@ -98,14 +98,25 @@ def _operation(equation: JaxprEqn) -> tuple:
     return equation.primitive, *operands, *map(_key, equation.params.values())
 
 
-def rules_of(function: Callable, program: ClosedJaxpr, *args) -> tuple:
-    """What the derivatives of a function compute, where parts of it have rules of their own; () where none has."""
+def rules_of(function: Callable, program: ClosedJaxpr, *args, user: Callable | None = None) -> tuple:
+    """What the derivatives of a function compute, where parts of it have rules of their own; () where none has.
+
+    Backward where that can be traced, else forward, as through a loop. Where there is no derivative of an order, as of
+    a callback in a rule, the function is known by the `user`'s that it calls.
+    """
     found = []
     for _ in range(ORDERS):
         if not any(map(_has_a_rule, equations(program.jaxpr))):
             break
-        function = _pulled_back(function)
-        program = jax.make_jaxpr(function)(*args)
+        derivatives = (_pulled_back(function), args), (_pushed_forward(function), (args, *_floats_and_rest(args)[:1]))
+        for function, args in derivatives:
+            try:
+                program = jax.make_jaxpr(function)(*args)
+                break
+            except (TypeError, ValueError, NotImplementedError):
+                continue
+        else:
+            return *found, Itself(function if user is None else user)
         found.append((meaning_of(program.jaxpr), tuple(map(_key, program.consts))))
     return tuple(found)
 
@@ -138,6 +149,15 @@ def _pulled_back(function: Callable):
         values, back = jax.vjp(lambda *floats: [x for x in jtu.tree_leaves(function(*rest(floats))) if _is_float(x)],
                                *floats)  # fmt: skip
         return back([jnp.ones_like(x) for x in values])
+
+    return slopes
+
+
+def _pushed_forward(function: Callable):
+    def slopes(args, along):
+        floats, rest = _floats_and_rest(args)
+        values = lambda *floats: [x for x in jtu.tree_leaves(function(*rest(floats))) if _is_float(x)]
+        return jax.jvp(values, tuple(floats), tuple(along))[1]
 
     return slopes
 

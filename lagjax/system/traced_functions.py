@@ -26,6 +26,7 @@ from lagjax.jaxtools import (
     FACTS,
     Itself,
     Meaning,
+    callbacks_in_turn,
     full_products,
     is_array,
     meaning_of,
@@ -75,9 +76,10 @@ class TracedProgram:
         arrays = arrays_of(args)
         with full_products():
             closed = with_own_constants(jax.make_jaxpr(of_arrays)(own, arrays))
+            closed = callbacks_in_turn(closed)
             # What a function computes and does not use would be traced again with each of its derivatives.
             closed = closed.replace(jaxpr=closed.jaxpr.replace(eqns=needed(closed.jaxpr)))
-            rules = rules_of(of_arrays, closed, own, arrays)
+            rules = rules_of(of_arrays, closed, own, arrays, user=function)
         self.value, self._structure, self.jaxpr = returned[0], structures[0], closed.jaxpr
         # A user may write to a NumPy array afterwards.
         constants = [np.array(x) if isinstance(x, np.ndarray) else x for x in closed.consts]
