@@ -36,6 +36,9 @@ from lagjax.mechanics import has_networks
 from lagjax.numerics import EqualSteps
 from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates, with_rates
 
+# The steps that a motion may take unless `max_steps` says otherwise.
+MANY_STEPS = 2**20
+
 
 @by_name("lj.integrate(system, q0, v0, params, ts=ts)", "ts")
 def integrate(
@@ -56,7 +59,7 @@ def integrate(
     events: Mapping[str, Crossing] | None = None,
     event: diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | Replay | None = None,
-    max_steps: int | None = 2**20,
+    max_steps: int | None = MANY_STEPS,
     throw: bool = True,
     progress: bool | None = None,
     drift: str | None = None,
@@ -124,9 +127,9 @@ def integrate(
       like `events`, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,
       which says how much memory reverse mode may use.
-    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events. A motion
-      ends before (`lj.RESULTS.no_progress`) after 4096 attempts in a row, each so short that a hundred times
-      `max_steps` of them would not be enough.
+    - `max_steps`: the largest number of steps, accepted and rejected, including those that search for events; of
+      steps of equal length by default as many as there are. A motion ends before (`lj.RESULTS.no_progress`) after 4096
+      attempts in a row, each so short that a hundred times `max_steps` of them would not be enough.
     - `throw`: raise if the integration fails. With `throw=False` the trajectory carries the reason in
       `result` and NaN from there on.
     - `progress`: True shows a progress meter. By default only the wait for the compiler is shown, if someone may look.
@@ -176,6 +179,9 @@ def integrate(
             drift=drift if drift == "baumgarte" else None,
         )  # fmt: skip
         stepsize_controller = diffrax.ConstantStepSize()
+        if method.pace is None and max_steps == MANY_STEPS:
+            # `dt0` says how many there are.
+            max_steps = None
     arguments.check_controller(stepsize_controller, max_step, jump_ts)
     arguments.check_max_steps(max_steps)
     ts = arguments.vector_of_times(ts)

@@ -1,7 +1,9 @@
-"""The steps of a motion, all of one length between two outputs, or following a pace (`pace.py`); and for which systems.
+"""The steps of a motion, all of one length, or following a pace (`pace.py`); and for which systems they are.
 
-An interval between two outputs is divided into the fewest equal steps that are no longer than `dt0`. Only outputs are
-kept. In reverse mode an interval is run again, from the state at its start, with the states of some of its steps.
+Outputs at equal distances divide the motion: the steps are the longest, up to `dt0`, of which a whole number fits
+between two of them. Other outputs leave the steps alone, which then have the length `dt0`: each is the end of one more
+step, taken aside from the last state before it. Only outputs are kept. In reverse mode an interval is run again, from
+the state at its start, with the states of some of its steps.
 """
 
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.equal_steps.gauss_step import GaussStep
 from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
@@ -27,6 +29,8 @@ from lagjax.system import Model
 
 # Part of a step by which an interval may be longer than so many steps: outputs are rounded.
 ROUNDED = 1e-6
+# And so many round-offs of the largest time.
+ROUND_OFFS_OF_TIMES = 8
 # The states kept in reverse mode within an interval.
 CHECKPOINTS = 64
 # How often a progress meter is moved.
@@ -48,9 +52,12 @@ def stepped(
         x, u = model.vectors(q, v)
         step = _step_of(method, model, ts[0], x, u, settings.differentiated)
         loop = _forward if forward else _checkpointed
-        steps = EquallyLong(step, dt, loop) if pace is None else PacedSteps(step, pace, dt, loop)
+        if pace is None:
+            steps, rows = EquallyLong(step, loop), spans(ts, dt, settings.max_steps)
+        else:
+            steps, rows = PacedSteps(step, pace, dt, loop, settings.max_steps), (ts[:-1], ts[1:])
 
-        def interval(carried: tuple[Any, Any], row: tuple[Array, Array]):
+        def interval(carried: tuple[Any, Any], row: Any):
             state, bar = carried
             watched = Metered(meter, bar, ts, dt)
             state, output = (steps._replace(loop=watched.loop) if shown else steps).interval(state, row)
@@ -58,7 +65,7 @@ def stepped(
 
         interval = interval if forward else jax.checkpoint(interval, prevent_cse=False)
         first = steps.first(ts[0], x, u), meter.init() if shown else None
-        (_, bar), (times, xs, us, unsolved, counts) = lax.scan(interval, first, (ts[:-1], ts[1:]))
+        (_, bar), (times, xs, us, unsolved, counts, used_up) = lax.scan(interval, first, rows)
         if shown:
             meter.close(bar)
         states = jax.tree.map(
@@ -67,12 +74,14 @@ def stepped(
         reached = jnp.concatenate([jnp.ones(1, bool), ~unsolved])
         last = jnp.minimum(jnp.sum(reached), ts.size - 1)[None]
         end = jnp.concatenate([ts[:1], times])[last], jax.tree.map(lambda x: x[last], states)
-        return states, reached, jnp.sum(counts), end
+        return states, reached, jnp.sum(counts), end, jnp.any(used_up)
 
     arguments = model, pace, q, v, ts, dt
-    states, reached, count, end = one_function(steps, *arguments) if forward and not shown else steps(*arguments)
-    diverged = diffrax.RESULTS.nonlinear_divergence
-    result = diffrax.RESULTS.where(jnp.all(reached), diffrax.RESULTS.successful, diverged)
+    found = one_function(steps, *arguments) if forward and not shown else steps(*arguments)
+    states, reached, count, end, used_up = found
+    results = diffrax.RESULTS
+    failed = results.where(used_up, results.max_steps_reached, results.nonlinear_divergence)
+    result = results.where(jnp.all(reached), results.successful, failed)
     return states, reached, count, end, result
 
 
@@ -108,41 +117,89 @@ class Metered:
         return state
 
 
+class Span(NamedTuple):
+    """The steps of an interval: `count` of the length `h` from `start` on, and one aside, of the length `left`, to the
+    output at `end`, unless that is 0. `still`: whether it has no length, as between outputs that only fill up an array;
+    `used_up`: whether there would be too many steps.
+    """
+
+    start: Float[Array, ""]
+    h: Float[Array, ""]
+    count: Int[Array, ""]
+    left: Float[Array, ""]
+    end: Float[Array, ""]
+    still: Bool[Array, ""]
+    used_up: Bool[Array, ""]
+
+
+def spans(ts: Float[Array, " T"], dt: Float[Array, ""], most: int | None) -> Span:
+    """The steps of all intervals, in rows of (T - 1,); `most`: how many they may be in all.
+
+    >>> of = jax.jit(lambda *ts: spans(jnp.stack(ts), 0.4, None))
+    >>> print(of(0.0, 1.0, 2.0, 3.0).count)  # three of 1/3 in each interval
+    [3 3 3]
+    >>> found = of(0.0, 0.9, 2.0, 3.0)  # of 0.4 throughout
+    >>> print(found.count, found.left.__array__().round(2))
+    [2 3 2] [0.1 0.  0.2]
+    """
+    slack = ROUND_OFFS_OF_TIMES * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
+    starts, ends, lengths = ts[:-1], ts[1:], ts[1:] - ts[:-1]
+    still = lengths == 0
+    alike = jnp.all(still | (jnp.abs(lengths - lengths[0]) <= ROUNDED * dt + slack))
+    many = jnp.ceil(lengths / dt - ROUNDED).astype(int)
+    many = jnp.where(lengths > 0, jnp.maximum(many, 1), 0)
+    # Of steps from the first output on: the number before each output, and what is left there.
+    passed = jnp.floor((ts - ts[0] + slack) / dt).astype(int)
+    left = (ends - ts[0]) - passed[1:] * dt
+    left = jnp.where(alike | still | (jnp.abs(left) <= slack), 0.0, left)
+    count = jnp.where(alike, many, jnp.diff(passed))
+    start = jnp.where(alike, starts, ts[0] + passed[:-1] * dt)
+    h = jnp.where(alike, lengths / jnp.maximum(many, 1), dt)
+    if most is None:
+        return Span(start, h, count, left, ends, still, jnp.zeros(lengths.shape, bool))
+    free = jnp.maximum(most - (jnp.cumsum(count) - count), 0)
+    return Span(start, h, jnp.minimum(count, free), left, ends, still, count > free)
+
+
 class EquallyLong(NamedTuple):
-    """Steps by `step` of equal length between two outputs, at most `dt`.
+    """Steps by `step` of equal length.
 
     `loop`: called like JAX's `while_loop`, and with a function of its state that returns the time.
     """
 
     step: Any
-    dt: Float[Array, ""]
     loop: Callable
 
     def first(self, t: Array, x: Array, u: Array):
-        """The start of the motion."""
-        return self.step.first(t, x, u)
+        """The start of the motion: the state to go on from, and the one at the last output."""
+        way = self.step.first(t, x, u)
+        return way, way
 
-    def interval(self, way: Any, row: tuple[Array, Array]):
-        """The state at the end of an interval, twice: to go on from, and as an output."""
-        t0, t1 = row
-        count = jnp.ceil((t1 - t0) / self.dt - ROUNDED).astype(int)
-        count = jnp.where(way.unsolved, 0, jnp.where(t1 > t0, jnp.maximum(count, 1), 0))
-        h = (t1 - t0) / jnp.maximum(count, 1)
+    def interval(self, ways: tuple[Any, Any], span: Span):
+        """The same at the end of an interval, and the output there."""
+        way, there = ways
+        begun = ~way.unsolved
+        total = span.count + ((span.left != 0) & ~span.used_up)
 
         def goes_on(state: tuple) -> Array:
-            k, way = state
-            return (k < count) & ~way.unsolved
+            k, way, _ = state
+            return (k < total) & ~way.unsolved
 
         def one(state: tuple) -> tuple:
-            k, way = state
-            new = self.step.advanced(way, t0 + k * h, h)
+            k, way, _ = state
+            whole = k < span.count
+            new = self.step.advanced(way, span.start + k * span.h, jnp.where(whole, span.h, span.left))
             # A step that was not solved is where the motion ends.
-            before = way._replace(unsolved=jnp.asarray(True))
-            return jnp.where(new.unsolved, k, k + 1), where(new.unsolved, before, new)
+            there = where(new.unsolved, way._replace(unsolved=jnp.asarray(True)), new)
+            return jnp.where(new.unsolved, k, k + 1), where(whole | new.unsolved, there, way), there
 
-        k, way = self.loop(goes_on, one, (jnp.asarray(0), way), lambda state: t0 + state[0] * h)
-        t = jnp.where(way.unsolved, jnp.minimum(t0 + k * h, t1), t1)
-        return way, (t, way.x, self.step.velocity(way, t), way.unsolved, k)
+        k, way, there = self.loop(
+            goes_on, one, (jnp.asarray(0), way, way), lambda state: span.start + state[0] * span.h
+        )
+        used_up = begun & ~way.unsolved & span.used_up
+        way, there = (x._replace(unsolved=x.unsolved | used_up) for x in (way, there))
+        t = jnp.where(there.unsolved, jnp.minimum(span.start + k * span.h, span.end), span.end)
+        return (way, there), (t, there.x, self.step.velocity(there, t), there.unsolved, k, used_up)
 
 
 def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, differentiated: bool):

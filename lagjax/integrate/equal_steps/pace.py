@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.integrate.equal_steps.gauss_step import added
 from lagjax.jaxtools import where
@@ -64,43 +64,50 @@ class Pace(NamedTuple):
 
 
 class Line(NamedTuple):
-    """The steps so far: the state `way` at t, what is to be added to t, and log ρ of the next step."""
+    """The steps so far, `count` of them: the state `way` at t, what is to be added to t, and log ρ of the next step."""
 
     way: Any
     t: Float[Array, ""]
     t_rest: Float[Array, ""]
     log_pace: Float[Array, ""]
+    count: Int[Array, ""]
 
 
 class PacedSteps(NamedTuple):
-    """Steps by `step` of the length `dt` times the pace; `loop`: as in `loop.py`."""
+    """Steps by `step` of the length `dt` times the pace, at most `most`; `loop`: as in `loop.py`."""
 
     step: Any
     pace: Pace
     dt: Float[Array, ""]
     loop: Callable
+    most: int | None
 
     def first(self, t: Array, x: Array, u: Array) -> Line:
         """The start of the motion."""
         log_pace = jnp.log(self.pace.at(t, x)) + self.dt / 2 * self.pace.rate(t, x, u)
         way = self.step.first(t, x, u)
-        return Line(way._replace(unsolved=~jnp.isfinite(log_pace)), t, jnp.zeros_like(t), log_pace)
+        return Line(way._replace(unsolved=~jnp.isfinite(log_pace)), t, jnp.zeros_like(t), log_pace, jnp.asarray(0))
 
     def interval(self, line: Line, row: tuple[Array, Array]):
         """The last state before the end of an interval, and the output there."""
         _, t1 = row
 
-        def goes_on(state: tuple) -> Array:
-            _, line = state
-            return (self._left(line, t1) > self._length(line)) & ~line.way.unsolved
+        before = line.count
 
-        k, line = self.loop(goes_on, self._one, (jnp.asarray(0), line), lambda state: state[1].t)
+        def goes_on(state: tuple) -> Array:
+            k, line = state
+            ahead = (self._left(line, t1) > self._length(line)) & ~line.way.unsolved
+            return ahead if self.most is None else ahead & (k < self.most)
+
+        k, line = self.loop(goes_on, self._one, (before, line), lambda state: state[1].t)
+        used_up = ~line.way.unsolved & (self._left(line, t1) > self._length(line))
         # Never of the length zero: a step that would end at an output is this one.
         there = self.step.advanced(line.way, line.t, self._left(line, t1))
-        unsolved = line.way.unsolved | there.unsolved
+        unsolved = line.way.unsolved | there.unsolved | used_up
         way, t = where(unsolved, line.way, there), jnp.where(unsolved, line.t, t1)
-        line = line._replace(way=line.way._replace(unsolved=unsolved))
-        return line, (t, way.x, self.step.velocity(way, t), unsolved, jnp.where(unsolved, k, k + 1))
+        line = line._replace(way=line.way._replace(unsolved=unsolved), count=k)
+        k = jnp.where(unsolved, k, k + 1) - before
+        return line, (t, way.x, self.step.velocity(way, t), unsolved, k, used_up)
 
     def _one(self, state: tuple) -> tuple:
         k, line = state
@@ -108,7 +115,7 @@ class PacedSteps(NamedTuple):
         way = self.step.advanced(line.way, line.t, h)
         t, t_rest = added(line.t, line.t_rest + h)
         log_pace = line.log_pace + self.dt * self.pace.rate(t, way.x, self.step.velocity(way, t))
-        new = Line(way, t, t_rest, log_pace)
+        new = Line(way, t, t_rest, log_pace, k + 1)
         # A step that was not solved, or does not move t, is where the motion ends.
         unsolved = way.unsolved | ~jnp.isfinite(log_pace) | (t <= line.t)
         before = line._replace(way=line.way._replace(unsolved=jnp.asarray(True)))

@@ -164,6 +164,37 @@ def test_what_they_refuse(name):
         lj.integrate(system, *start, 1.0, ts=[0.0, 1.0], method=method, **{"dt0": 0.1} | options)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("motion", "method"),
+    [
+        ((kepler, ellipse(0.6), 1.0), lj.Splitting(4)),
+        pytest.param((kepler, ellipse(0.6), 1.0), lj.Gauss(2), marks=pytest.mark.exhaustive),
+        pytest.param((rod, RAISED, G), lj.Splitting(4), marks=pytest.mark.exhaustive),
+    ],
+    ids=["splitting", "gauss", "rattle"],
+)
+def test_outputs_leave_the_steps_alone(motion, method):
+    """Outputs at random times change nothing in the motion, and lie on it; too many steps are said."""
+    dt, every = 1 / 64, np.arange(257) / 4
+    whole = run(*motion, every, method, dt)
+    others = np.random.default_rng(0).uniform(0.0, 64.0, 257)
+    mixed = np.sort(np.concatenate([every, others]))
+    found, exact = run(*motion, mixed, method, dt), adaptive(*motion, mixed)
+    np.testing.assert_allclose(found.q[np.isin(mixed, every)], whole.q, atol=1e-12)
+    error = np.abs(np.asarray(found.q) - np.asarray(exact.q)).max(axis=1)
+    between = ~np.isin(mixed, every)
+    assert error[between].max() < 3 * error.max() and 0 < error.max() < 1e-2
+    assert int(found.stats["num_steps"]) == 64 * 64 + 257
+    # Twin: divided anew in each interval, the motion is another one.
+    anew = run(*motion, [0.0, 0.23, 0.25], method, dt), run(*motion, [0.0, 0.23], method, dt)
+    np.testing.assert_array_equal(anew[0].q[2], whole.q[1])
+    assert np.max(np.abs(anew[1].q[1] - anew[0].q[1])) > 1e-12
+    stopped = run(*motion, mixed, method, dt, max_steps=1000, throw=False)
+    assert bool(stopped.result == lj.RESULTS.max_steps_reached) and np.isnan(np.asarray(stopped.q[-1])).all()
+    assert np.isfinite(np.asarray(stopped.q[mixed < 15])).all()
+
+
 def test_methods_that_do_not_exist():
     """Numbers of stages and orders that there are not."""
     with pytest.raises(ValueError, match="stages must be a whole number from 1 to 8"):

@@ -93,7 +93,7 @@ def test_there_and_back(kind):
     model, s = prepare(kepler, 0.0, *ellipse(0.9), 1.0)
     x, u = model.vectors(s.q, s.v)
     step = SplittingStep.of(model, 2, s.t, x, u) if kind == "splitting" else GaussStep(model, tableau(2), False, False)
-    steps = PacedSteps(step, Pace(pace, model.form, model.params), jnp.asarray(0.1), lax.while_loop)
+    steps = PacedSteps(step, Pace(pace, model.form, model.params), jnp.asarray(0.1), lax.while_loop, None)
 
     many = partial(lax.fori_loop, 0, 150, lambda _, line: steps._one((0, line))[1])
 
@@ -130,3 +130,15 @@ def test_a_pace_that_is_not_positive():
     """It ends the motion there, and says what it is."""
     with pytest.raises(RuntimeError, match=r"stopped at t = [\d.]+, (?s:.*)a pace that is positive and finite: there"):
         run(lj.Splitting(4, pace=lambda t, q, params: q[0] + 0.5), [0.0, 10.0], e=0.3)
+
+
+@pytest.mark.slow
+def test_steps_that_get_nowhere():
+    """A pace that is too small ends at `max_steps`, and says so."""
+    swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
+    given = {"ts": [0.0, 1.0, 2.0], "method": lj.Gauss(1, pace=lambda t, q, params: 1e-300), "dt0": 0.1}
+    found = lj.integrate(swing, 1.0, 0.0, max_steps=1000, throw=False, **given)
+    assert bool(found.result == lj.RESULTS.max_steps_reached) and np.isnan(np.asarray(found.q[1:])).all()
+    assert int(found.stats["num_steps"]) == 1000
+    with pytest.raises(RuntimeError, match="max_steps = 1000 is used up"):
+        lj.integrate(swing, 1.0, 0.0, max_steps=1000, **given)
