@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
+from lagjax.jaxtools.jaxpr import callbacks_in_turn
 from lagjax.jaxtools.jaxpr_identity import (
     Itself,
     content_of,
@@ -97,6 +98,43 @@ def test_rules_of_differentiation_count():
     rules = lambda function: rules_of(function, jax.make_jaxpr(function)(1.0), 1.0)
     assert meaning(right) == meaning(wrong) and rules(right) != rules(wrong)
     assert rules(right) == rules(with_rule(lambda x: 2 * x)) and rules(jnp.sin) == ()
+
+
+def on_host(function):
+    """A function of the host's, which JAX cannot differentiate."""
+    shape = jax.ShapeDtypeStruct((), float)
+    return lambda x: jax.pure_callback(lambda x: np.asarray(function(x)), shape, x)
+
+
+def with_slope(function, slope):
+    """A function of the host's with its own derivative, which is of the host's too."""
+    known = jax.custom_jvp(on_host(function))
+    known.defjvp(lambda primals, tangents: (known(primals[0]), tangents[0] * on_host(slope)(primals[0])))
+    return known
+
+
+def test_rules_without_a_derivative_of_their_own():
+    """A rule that calls the host has no second derivative, and one beside a loop none in reverse: nothing is refused,
+    and functions are told apart."""
+    half, other = with_slope(lambda x: x / 2, lambda x: 0.5), with_slope(lambda x: x / 2, lambda x: 0.7)
+    rules = lambda function, user: rules_of(function, jax.make_jaxpr(function)(1.0), 1.0, user=user)
+    assert rules(half, half) == rules(lambda x: half(x), half) != rules(other, other)
+
+    def beside_a_loop(function):
+        shrunk = lambda x: jax.lax.while_loop(lambda c: c > 2.0, lambda c: c / 2, x)
+        return lambda x: function(x) + shrunk(x)
+
+    relu = rules(beside_a_loop(jax.nn.relu), None)
+    assert relu == rules(beside_a_loop(jax.nn.relu), None) != rules(beside_a_loop(jax.nn.softplus), None)
+
+
+def test_callbacks_in_lanes():
+    """A callback that does not say how it is put in lanes is called for one after the other; twin: JAX refuses."""
+    function = lambda x: jax.lax.cond(x > 0, on_host(lambda x: x / 2), jnp.negative, x)
+    lanes, closed = np.array([4.0, -1.0]), jax.make_jaxpr(function)(1.0)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jaxpr_as_fun(callbacks_in_turn(closed))))(lanes)[0], [2.0, 1.0])
+    with pytest.raises(NotImplementedError, match="vmap is only supported"):
+        jax.make_jaxpr(jax.vmap(jaxpr_as_fun(closed)))(lanes)
 
 
 def repeated(q):

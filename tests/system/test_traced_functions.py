@@ -559,3 +559,29 @@ def test_motions_with_traced_numbers_from_outside():
     level = lambda c: {"level": lj.Crossing(lambda t, q, v, p, c=c: q - c)}
     when = lambda c: lj.integrate(free, 0.0, 2.0, ts=10 * ts, events=level(c)).end.t
     np.testing.assert_allclose([jax.grad(when)(3.0), jax.jit(jax.grad(when))(3.0)], 0.5, rtol=1e-12)
+
+
+TABLE_SHAPE = jax.ShapeDtypeStruct((), float)
+
+
+@jax.custom_jvp
+def table(q):
+    """q / 8 by a table of the host's."""
+    return jax.pure_callback(lambda q: np.asarray(q / 8), TABLE_SHAPE, q)
+
+
+@table.defjvp
+def _slope_of_table(at, tangents):
+    slope = jax.pure_callback(lambda q: np.asarray(1 / 8 + 0 * q), TABLE_SHAPE, at[0])
+    return table(at[0]), tangents[0] * slope
+
+
+@pytest.mark.slow
+def test_a_table_with_its_own_derivative():
+    """A spring by a table of the host's, as a force: its acceleration, alone and in lanes, and cos(t/√8) over time."""
+    spring = lj.System(lambda t, q, v, p: 0.5 * v**2, force=lambda t, q, v, p: -table(q))
+    assert float(lj.accelerations(spring, 0.0, 0.7, 0.0, None)[0]) == -0.0875
+    lanes = jax.jit(jax.vmap(lambda q: lj.accelerations(spring, 0.0, q, 0.0, None)[0]))(jnp.array([0.7, 0.2]))
+    np.testing.assert_allclose(lanes, [-0.0875, -0.025], rtol=1e-15)
+    ts = np.linspace(0.0, 9.0, 4)
+    np.testing.assert_allclose(lj.integrate(spring, 0.7, 0.0, ts=ts).q, 0.7 * np.cos(ts / np.sqrt(8)), atol=1e-7)

@@ -35,6 +35,7 @@ CLOSED_WITHIN = 1e-3
 # A spurious crossing means that a step jumped to another branch, and it is repeated (AGAIN) with a shorter one, unless
 # it is shorter than SHORT already.
 AGAIN, SHORT = "again", 1e-6
+AT_EDGE = "the end of the range"
 # The number of values from which a zero is interpolated.
 INTERPOLATED = 6
 LOST = "equations that are redundant at the start of the branch are no longer redundant"
@@ -177,7 +178,7 @@ class Tracer(abc.ABC):
                 return path
             path.points.append(after)
             if outside:
-                path.status = "the end of the range"
+                path.status = AT_EDGE
                 return path
             if np.max(np.abs(after.z[: self.positions])) > INFINITY:
                 path.status = "infinity"

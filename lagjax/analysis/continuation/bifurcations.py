@@ -66,8 +66,8 @@ def between(tracer: SteadyTracer, a: BranchPoint, b: BranchPoint) -> list[Critic
     crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
     if crosses and (point := _branch_point(tracer, a, b)):
         found.append(point)
-    if folds and not found and (point := _fold(tracer, a, b)):
-        found.append(point)
+    if folds and not found:
+        found.append(_fold(tracer, a, b))
     known = a.growing is not None and b.growing is not None
     if known and a.growing != b.growing and not found and (point := _loses_stability(tracer, a, b)):
         found.append(point)
@@ -164,7 +164,8 @@ def _fold(tracer, a, b):
     psi, phi = _null_vectors(tracer.at(z)[1])
     solved = _newton(tracer, FOLD, np.concatenate([z, psi]), np.zeros(1))
     if solved is None or not _inside(tracer, a, b, solved[0][: z.size]):
-        return None
+        off = np.sqrt(tracer.weights @ (b.z - a.z) ** 2) * max(abs(a.tangent[-1]), abs(b.tangent[-1]))
+        return CriticalPoint("fold", z, [], 0.0, None, float(off), [])
     big, accuracy = solved
     return CriticalPoint("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
 

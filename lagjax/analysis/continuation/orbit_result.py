@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from lagjax.analysis.continuation.arclength import AT_EDGE
 from lagjax.analysis.continuation.orbit_equations import NUMBER, Along
 from lagjax.analysis.continuation.result import (
     OTHER_MARK,
@@ -28,10 +29,13 @@ MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3)
 class CriticalOrbit(eqx.Module):
     """A point where a branch of cycles folds, where others branch off, or where stability is lost.
 
-    - `kind`: `"fold"`; `"branch point"`, where a multiplier passes 1 and the branch continues; `"period doubling"`,
+    - `kind`: `"fold"`, where the parameter turns; `"branch point"`, where a multiplier passes 1 and the branch
+      continues, or where the parameter turns as the branch meets another, of whose orbits it is a side branch;
+      `"period doubling"`,
       where one passes -1; `"torus"`, where a pair leaves the unit circle (Neimark-Sacker; without damping two pairs
       meet).
-    - `parameter`: its value; `accuracy`: how far off it may be.
+    - `parameter`: its value; `accuracy`: how far off it may be; `located`: False where no more is known than that it
+      lies between two points of the branch, since the equations are nearly singular there.
     - `index`: its index on the branch: `branch[index]` is the cycle.
     - `multipliers` (k,): the trivial ones (1 for a known reason) first.
     """
@@ -41,9 +45,15 @@ class CriticalOrbit(eqx.Module):
     accuracy: Float[Array, ""]
     index: int = eqx.field(static=True)
     multipliers: Complex[Array, " k"]
+    located: bool = eqx.field(static=True, default=True)
 
     def __repr__(self):
-        return f"{self.kind} at {float(self.parameter):.10g}"
+        return f"{self.kind} at {float(self.parameter):.10g}{self.doubt}"
+
+    @property
+    def doubt(self) -> str:
+        """In words, how far off the parameter may be, where it was not located."""
+        return "" if self.located else f" (to {float(self.accuracy):.0e})"
 
 
 class OrbitBranch(eqx.Module):
@@ -154,15 +164,20 @@ class OrbitBranch(eqx.Module):
         def number(x: float) -> str:
             return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.10g}"
 
-        lines = [
-            f"Branch of cycles along {self.along}, from {self.first:.6g} to {self.last:.6g}: {len(self)} of them, "
-            f"with {points}"
+        reached = [float(np.min(self.parameter)), float(np.max(self.parameter))]
+        reached = reached if self.first <= self.last else reached[::-1]
+        # Of the range that was asked for, which ends may lie beside by round-off.
+        whole = abs(reached[1] - self.last) < 1e-9 * abs(self.last - self.first)
+        span = f"from {number(reached[0])} to {number(reached[1])}" + ("" if whole else f" (asked to {self.last:.6g})")
+        lines = [f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {points}"]
+        lines += [
+            f"  {c.kind:<16}{self.along} = {number(c.parameter) + c.doubt:<14} {_torus_angle(c)}" for c in self.critical
         ]
-        lines += [f"  {c.kind:<16}{self.along} = {number(c.parameter):<14} {_torus_angle(c)}" for c in self.critical]
         low, high = np.min(self.period), np.max(self.period)
         lines.append(f"  {'periods':<16}{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else ""))
         lines.append(f"  {'stability':<16}{stability_in_words(self._verdicts())}")
-        lines.append(f"  {'ends at':<16}{self.status}")
+        where = f", {self.along} = {number(self.parameter[-1])}" if self.status == AT_EDGE else ""
+        lines.append(f"  {'ends at':<16}{self.status}{where}")
         return "\n".join(lines)
 
 

@@ -39,11 +39,12 @@ DIPS, VERTICES = 0.3, 8
 
 
 class FoundOrbit(NamedTuple):
-    """The kind of a critical point, the point, and how far off its parameter may be."""
+    """The kind of a critical point, the point, how far off its parameter may be, and whether it was located."""
 
     kind: str
     point: BranchPoint
     accuracy: float
+    located: bool = True
 
 
 def between(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint) -> list[FoundOrbit]:
@@ -106,10 +107,17 @@ def _beyond_zero(tracer, a, b, c, of):
 
 def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
     found = tracer.zero_between(a, b, of)
-    if found is None or not np.isfinite(found[1]):
+    if found is None:
         return None
     point, off = found
-    return FoundOrbit(kind, point, off * tracer.unit)
+    if np.isfinite(off):
+        return FoundOrbit(kind, point, off * tracer.unit)
+    # Somewhere between the two points: by a straight line, and how far the parameter changes on the way.
+    share = of(a) / (of(a) - of(b))
+    point = tracer.between(a, b, share) or replace(a if share < 0.5 else b)
+    length, steepest = np.sqrt(tracer.weights @ (b.z - a.z) ** 2), max(abs(a.tangent[-1]), abs(b.tangent[-1]))
+    off = max(abs(float((b.z - a.z)[-1])), float(length * steepest))
+    return FoundOrbit(kind, point, off * tracer.unit, located=False)
 
 
 def _torus(tracer, a, b) -> FoundOrbit | None:
@@ -413,7 +421,7 @@ def _result(orbit, problem, place, tracer, path, found, along, first, last) -> O
     critical = [
         CriticalOrbit(
             found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
-            p.outputs.multipliers,
+            p.outputs.multipliers, found[p.critical].located,
         ) for i, p in enumerate(path.points) if p.critical is not None
     ]  # fmt: skip
 

@@ -1,8 +1,9 @@
 """The result of a search for symmetries: a mapping of names to charges, with a printed summary.
 
 A ratio of two coefficients is written as a whole number, a parameter of the user's, or a pitch over 2π where it is one:
-`h p_z + 2π L_z with h = 0.5` says more than `0.0795774715 p_z + L_z`. A number is recognised if it agrees to round-off.
-The recognised form is only a guess, so it is displayed but never used in computations.
+`h p_z + 2π L_z with h = 0.5` says more than `0.0795774715 p_z + L_z`. A number is recognised if it agrees to round-off,
+also where the parameters have other values: 3 is not the mass because the mass is 3. The recognised form is only a
+guess, so it is displayed but never used in computations.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ from lagjax.system import coordinates
 
 # Parameters are recognised among at most so many, and at most so many terms of a combination are written.
 MOST_PARAMETERS, MOST_TERMS = 30, 8
+# How well a form must agree where the parameters have other values: null vectors there are found to less.
+PERSISTS = 1e-6
 WHOLE = [Fraction(n) for n in (1, 2, 3, 4)] + [Fraction(1, 2)]
 FRACTIONS = [Fraction(n, d) for d in range(1, 13) for n in range(1, 13)]
 
@@ -50,6 +53,13 @@ class RecognisedNumber(NamedTuple):
         return (" ".join(up) or "1") + (f"/({' '.join(down)})" if len(down) > 1 else f"/{down[0]}" if down else "")
 
 
+class Ratios(NamedTuple):
+    """The coefficients of a combination relative to the first, (k,), where the parameters have these values."""
+
+    values: np.ndarray
+    params: dict[str, float]
+
+
 class Words(NamedTuple):
     """A combination in words, and the factor by which the original coefficients are multiplied there."""
 
@@ -71,11 +81,18 @@ def named_parameters(params: PyTree) -> dict[str, float]:
     return dict(zip(names, values)) if len(values) <= MOST_PARAMETERS else {}
 
 
-def in_words(coefficients, names, params: dict[str, float], agrees: float, first=()) -> Words:
-    """A combination in words; `first`: the names whose coefficients are tried as parameters before whole numbers."""
+def in_words(
+    coefficients, names, params: dict[str, float], agrees: float, first=(), elsewhere: Ratios | None = None
+) -> Words:
+    """A combination in words; `first`: the names whose coefficients are tried as parameters before whole numbers;
+    `elsewhere`: what they are where the parameters have other values, None if that is not known."""
     coefficients = np.asarray(coefficients, float)
     leading = coefficients[0]
-    found = [_recognised(c / leading, params, agrees, name in first) for c, name in zip(coefficients, names)]
+    others = [None] * len(coefficients) if elsewhere is None else [(x, elsewhere.params) for x in elsewhere.values]
+    found = [
+        _recognised(c / leading, params, agrees, name in first, other)
+        for c, name, other in zip(coefficients, names, others)
+    ]
     known = [number for number in found if number is not None]
     # The combination is multiplied by its common denominator.
     below = {}
@@ -109,8 +126,8 @@ def _value(number: RecognisedNumber, params: PyTree) -> float:
     return float(number.fraction) * np.pi**number.pi * float(np.prod([params[p] ** e for p, e in number.params]))
 
 
-def _recognised(value: float, params: PyTree, agrees, parameters_first) -> RecognisedNumber | None:
-    """The form in which a number is recognised; None if there is none."""
+def _recognised(value: float, params: PyTree, agrees, parameters_first, other) -> RecognisedNumber | None:
+    """The form in which a number is recognised; None if there is none. `other`: its value for other parameters."""
     if abs(value - 1.0) <= agrees:
         return RecognisedNumber(Fraction(1))
     plain = [RecognisedNumber(fraction) for fraction in WHOLE]
@@ -130,6 +147,9 @@ def _recognised(value: float, params: PyTree, agrees, parameters_first) -> Recog
     else:
         order = [*plain, *single, *pitch, *pairs, *rest]
     alike = [found for number in order if (found := _agreeing(value, number, params, agrees)) is not None]
+    if other is not None:
+        # Its sign is that of the first form, so it is compared, too.
+        alike = [number for number in alike if abs(_value(number, other[1]) - other[0]) <= PERSISTS * abs(other[0])]
     # If two parameters have the same value, it is ambiguous which one is meant.
     clear = [found for found in alike[:1] if not found.params or _only(found, alike)]
     return (clear or [found for found in alike if not found.params] or [None])[0]

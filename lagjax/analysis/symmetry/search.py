@@ -21,10 +21,12 @@ Equations*, §4.4; Landau & Lifshitz, *Mechanics*, §10 (scalings); Golub & Van 
 (numerical rank), §3.4 (elimination).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
+from functools import cache
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import PyTree
 
@@ -32,7 +34,7 @@ from lagjax.analysis.symmetry.ansatz import Basis, Clock, Combination, Gauge, ga
 from lagjax.analysis.symmetry.charge_rates import Affine, Precision, Rates, precision_of, rates
 from lagjax.analysis.symmetry.is_symmetry import AT_LEAST, STATES, too_few
 from lagjax.analysis.symmetry.random_states import draws
-from lagjax.analysis.symmetry.result import Found, Scaling, Symmetries, Words, in_words, named_parameters
+from lagjax.analysis.symmetry.result import Found, Ratios, Scaling, Symmetries, Words, in_words, named_parameters
 from lagjax.jaxtools import filled_up, is_traced, remembered
 from lagjax.mechanics import Generator, NoetherCharge, as_generator, conserved_momenta, describe
 from lagjax.system import Model, check_system, coordinates, model_of, traced_system
@@ -232,11 +234,15 @@ def symmetries(
     tried = motions(s.q)
     gauge = gauges(s.q)
     count = filled_up(max(STATES, 4 * (len(tried.names) + len(own)) + 2 * len(gauge.names)))
-    sampled = rates(model, tried.affine, own, s, draws(count, model.n))
-    sampled = _those_found(sampled)
-    if len(sampled.value) < AT_LEAST:
-        raise ValueError(too_few(model.system, s, len(sampled.value)))
-    return _found(model, s, tried, own, gauge, sampled)
+
+    def columns_at(s) -> tuple[Rates, _Columns]:
+        model = model_of(traced_system(system, s), *s)
+        sampled = _those_found(rates(model, tried.affine, own, s, draws(count, model.n)))
+        if len(sampled.value) < AT_LEAST:
+            raise ValueError(too_few(model.system, s, len(sampled.value)))
+        return sampled, _columns(tried, own, gauge, sampled)
+
+    return _found(model, s, tried, own, gauge, columns_at)
 
 
 def _given(basis, s) -> tuple[Generator, ...]:
@@ -262,6 +268,8 @@ def _those_found(sampled: Rates) -> Rates:
     return Rates(states, **{name: y if name in stateless else y[kept] for name, y in of_states.items()})
 
 
+# Its multiples are spread evenly between 0 and 1.
+GOLDEN = 0.6180339887498949
 # A combination whose residual exceeds this many times the null tolerance is an artefact of round-off.
 DOUBTFUL = 100.0
 
@@ -294,9 +302,31 @@ class _Spaces(NamedTuple):
     gap: float
 
 
-def _found(model: Model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> Symmetries:
+def _elsewhere(s, columns_at: Callable) -> tuple[dict[str, float], _Columns] | None:
+    """Other values of the parameters, each changed in another way, and the columns there; None if there are none."""
+    leaves, structure = jax.tree.flatten(s.params)
+    count = 0
+
+    def changed(x: np.ndarray) -> np.ndarray:
+        nonlocal count
+        numbers = np.arange(count + 1, count + 1 + x.size).reshape(x.shape)
+        count += x.size
+        if np.issubdtype(x.dtype, np.floating):
+            return x * (1 + 0.1 * np.modf(GOLDEN * numbers)[0]).astype(x.dtype)
+        return x + numbers.astype(x.dtype) if np.issubdtype(x.dtype, np.integer) else x
+
+    other = s._replace(params=jax.tree.unflatten(structure, [changed(np.asarray(x)) for x in leaves]))
+    try:
+        return named_parameters(other.params), columns_at(other)[1]
+    except (ValueError, TypeError, IndexError):
+        # A length that no constraint allows, a whole number that counts something.
+        return None
+
+
+def _found(model: Model, s, tried: Basis, own, gauge: Gauge, columns_at: Callable) -> Symmetries:
     precision = precision_of(s.t.dtype)
-    columns = _columns(tried, own, gauge, sampled)
+    sampled, columns = columns_at(s)
+    others = cache(lambda: _elsewhere(s, columns_at))
     spaces = _spaces(columns, gauge, precision)
     parameters = named_parameters(s.params)
     shown = remembered(model, conserved_momenta, lambda: conserved_momenta(model))
@@ -312,7 +342,7 @@ def _found(model: Model, s, tried: Basis, own, gauge: Gauge, sampled: Rates) -> 
         residual = _residual(columns, whole, weights)
         if residual > DOUBTFUL * precision.null:
             continue
-        words = _words(whole / columns.size, columns.names, weights, gauge, parameters, precision.agrees)
+        words = _words(whole / columns.size, columns.names, weights, gauge, parameters, precision, others)
         physical = whole / columns.size * words.factor
         generator = _generator(physical, weights * words.factor, tried, own, gauge, words.text)
         single = len(np.flatnonzero(whole)) == 1 and not np.any(weights)
@@ -446,12 +476,34 @@ def _residual(columns: _Columns, whole, weights) -> float:
     return float(worst * root / np.max(np.abs(whole)))
 
 
-def _words(physical, names, weights, gauge: Gauge, parameters, agrees) -> Words:
+def _words(physical, names, weights, gauge: Gauge, parameters, precision: Precision, others: Callable) -> Words:
     chosen = np.flatnonzero(physical)
     of_gauge = np.flatnonzero(weights)
     named = [names[i] for i in chosen] + [gauge.names[i] for i in of_gauge]
     numbers = [*physical[chosen], *(-weights[of_gauge])]
-    return in_words(numbers, named, parameters, agrees, first=[gauge.names[i] for i in of_gauge])
+    elsewhere = None
+    if len(named) > 1 and parameters and (other := others()) is not None:
+        values = _ratios(other[1], chosen, of_gauge, precision)
+        elsewhere = None if values is None else Ratios(values, other[0])
+    return in_words(
+        numbers, named, parameters, precision.agrees, first=[gauge.names[i] for i in of_gauge], elsewhere=elsewhere
+    )
+
+
+def _ratios(columns: _Columns, chosen, of_gauge, precision: Precision) -> np.ndarray | None:
+    """The coefficients of the one combination of these motions and gauge functions that is conserved, relative to the
+    first; None if there is not just one."""
+    charge = np.concatenate([columns.charge[:, chosen], columns.gauge[:, of_gauge]], axis=1)
+    forbidden = np.pad(columns.forbidden[:, chosen], ((0, 0), (0, len(of_gauge))))
+    rows = np.concatenate([charge, forbidden])
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > precision.null, size, 1.0)
+    _, sizes, directions = np.linalg.svd(rows / size, full_matrices=False)
+    if len(sizes) < len(size) or sizes[-1] > 10 * precision.null or sizes[-2] <= 10 * precision.null:
+        return None
+    numbers = directions[-1] / size
+    numbers[: len(chosen)] /= columns.size[chosen]
+    return numbers / numbers[0] if numbers[0] else None
 
 
 def _generator(physical, weights, tried: Basis, own, gauge, name: str) -> Generator:

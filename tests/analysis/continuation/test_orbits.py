@@ -6,6 +6,9 @@ import pytest
 from scipy import integrate, optimize, special
 
 import lagjax as lj
+from lagjax.analysis.continuation.arclength import BranchPoint
+from lagjax.analysis.continuation.orbit_result import CriticalOrbit
+from lagjax.analysis.continuation.orbits import _zero
 from tests.analysis import closed_forms as known
 from tests.systems import PARAMS, pendulum
 
@@ -55,6 +58,54 @@ def test_pendulum_by_its_amplitude():
     by_period = lj.continue_orbits(orbit, along="period", to=9.0)
     np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
     np.testing.assert_allclose(by_period.period, known.swinging(by_period.q, UNIT), rtol=1e-11)
+
+
+@pytest.mark.exhaustive
+def test_a_branch_that_turns():
+    """Halo orbits (mass ratio 0.04) end where z = 0 and turn there: a critical point, and the range that was reached.
+
+    Published: the first row, and that x turns at 0.723719.
+    """
+
+    def rotating(t, q, v, p):
+        x, y, z = q["x"], q["y"], q["z"]
+        kinetic = 0.5 * ((v["x"] - y) ** 2 + (v["y"] + x) ** 2 + v["z"] ** 2)
+        far, near = (x + p["mu"]) ** 2 + y**2 + z**2, (x - 1 + p["mu"]) ** 2 + y**2 + z**2
+        return kinetic + (1 - p["mu"]) / jnp.sqrt(far) + p["mu"] / jnp.sqrt(near)
+
+    start = {"x": 0.723268, "y": 0.0, "z": 0.04}, {"x": 0.0, "y": 0.198019, "z": 0.0}
+    orbit = lj.periodic_orbit(lj.System(rotating), start, 2.600354, {"mu": 0.04}, hold="x")
+    branch = lj.continue_orbits(orbit, along="x", to=0.817724)
+    (turn,) = branch.critical
+    np.testing.assert_allclose(turn.parameter, 0.723719, atol=1e-6)
+    assert float(turn.accuracy) < 1e-6 and abs(float(branch.q["z"][turn.index])) < 0.01
+    assert float(branch.q["z"][-1]) < -0.03, "it comes back with z turned round"
+    assert "from 0.723268 to 0.723719" in repr(branch) and "(asked to 0.817724)" in repr(branch)
+    assert "the end of the range, x = 0.723268" in repr(branch)
+
+
+class Nearby:
+    """A branch between points whose zero cannot be refined."""
+
+    unit, weights = 2.0, np.ones(2)
+
+    def zero_between(self, a, b, of):
+        return b, np.inf
+
+    def between(self, a, b, share):
+        return None
+
+
+def test_a_candidate_that_is_not_located():
+    """It is listed beside the nearer point, with what is known of its parameter."""
+    points = [BranchPoint(np.array(z), np.eye(2), np.array(along), 1.0, None, 0, 0)
+              for z, along in (([0.0, 1.0], [1.0, 0.3]), ([0.6, 1.0], [1.0, -0.1]))]  # fmt: skip
+    found = _zero(Nearby(), *points, "fold", lambda p: p.tangent[-1])
+    assert found is not None and not found.located and found.point is not points[1]
+    np.testing.assert_array_equal(found.point.z, points[1].z)
+    np.testing.assert_allclose(found.accuracy, 0.6 * 0.3 * 2.0)
+    listed = CriticalOrbit("fold", np.asarray(2.0), np.asarray(found.accuracy), 1, np.ones(2, complex), found.located)
+    assert repr(listed) == "fold at 2 (to 4e-01)"
 
 
 # Driven systems.

@@ -162,3 +162,17 @@ def test_bad_input():
     found = lj.symmetries(KEPLER, *IN_SPACE, OF_KEPLER)
     with pytest.raises(KeyError, match="no symmetry 'p_x' was found; there are 'L_x'"):
         found["p_x"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("values", [(2.0, 1.0, 3.0), (3.0, 3.0, 3.0), (2.0, 1.0, 1.0), (2, 1, 3)])
+def test_a_coefficient_is_no_parameter_because_it_has_its_value(values):
+    """For any mass 2 p_x - e B y is conserved in a magnetic field, whatever m, e and B are here."""
+
+    def charge(t, q, v, p):
+        kinetic = 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2)
+        return kinetic + 0.5 * p["e"] * p["B"] * (q["x"] * v["y"] - q["y"] * v["x"])
+
+    at = {"x": 0.3, "y": 0.2}, {"x": 1.0, "y": -0.4}
+    found = list(lj.symmetries(lj.System(charge), *at, dict(zip("meB", values))))
+    assert [name.split(" with")[0] for name in found[:2]] == ["2 p_x - B e y", "2 p_y + B e x"]
