@@ -55,6 +55,7 @@ class CriticalPoint:
     derivative: Any
     accuracy: float
     used: list[np.ndarray]
+    located: bool = True
 
 
 def between(tracer: SteadyTracer, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
@@ -165,7 +166,7 @@ def _fold(tracer, a, b):
     solved = _newton(tracer, FOLD, np.concatenate([z, psi]), np.zeros(1))
     if solved is None or not _inside(tracer, a, b, solved[0][: z.size]):
         off = np.sqrt(tracer.weights @ (b.z - a.z) ** 2) * max(abs(a.tangent[-1]), abs(b.tangent[-1]))
-        return CriticalPoint("fold", z, [], 0.0, None, float(off), [])
+        return CriticalPoint("fold", z, [], 0.0, None, float(off), [], located=False)
     big, accuracy = solved
     return CriticalPoint("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
 

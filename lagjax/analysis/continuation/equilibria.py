@@ -290,7 +290,8 @@ class _Run:
                 self.found[points[0].critical].kind = "line of equilibria"
                 return "a line of equilibria, which goes on"
         ended = None
-        all_critical = between(self.tracer, before, after)
+        # A turn that was not located, in a step past a crossing, is that crossing.
+        all_critical = [c for c in between(self.tracer, before, after) if c.located or not self._crosses(before, after)]
         if before.sign * after.sign < 0 and not any(critical.directions for critical in all_critical):
             return AGAIN
         for critical in all_critical:
@@ -312,6 +313,11 @@ class _Run:
                     kept.used += others
             path.points.append(self._point(kept, number, after))
         return ended
+
+    def _crosses(self, before: BranchPoint, after: BranchPoint) -> bool:
+        """Whether a known critical point is as near to a point as another one."""
+        length = lambda z: np.sqrt(self.tracer.weights @ z**2)
+        return any(length(found.z - before.z) <= 2 * length(after.z - before.z) for found in self.found)
 
     def _value(self, found):
         return f"{self.tracer.frame.place.name} = {found.z[-1] * self.tracer.unit:.6g}"

@@ -11,7 +11,7 @@ from tests.symmetric_systems import OF_STONE, STONE
 
 def test_names_of_coefficients_hold_at_other_values():
     """-3/2 is -e B/2 and not -3/m, which it is only here; what agrees with nothing elsewhere is a number."""
-    here, there = {"m": 2.0, "e": 1.0, "B": 3.0}, {"m": 2.1, "e": 1.05, "B": 3.2}
+    here, there = {"m": 2.0, "e": 1.0, "B": 3.0}, {"m": 2.12, "e": 1.05, "B": 3.2}
     words = lambda elsewhere: in_words([1.0, -1.5], ["p_x", "y"], here, 1e-9, first=["y"], elsewhere=elsewhere).text
     assert words(Ratios(np.array([1.0, -1.05 * 3.2 / 2]), there)) == "2 p_x - e B y with e = 1, B = 3"
     assert words(Ratios(np.array([1.0, -1.5]), there)) == "2 p_x - 3 y"
