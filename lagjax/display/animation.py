@@ -7,7 +7,6 @@ page shows one of them. Films in space are those of `in_space/film.py`.
 
 import html
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from lagjax.display.in_space.film import film_in_space
 from lagjax.display.in_space.scenery import InSpace
 from lagjax.display.plots import COLOURS
 from lagjax.display.web_page import encoded, fragment, whole
-from lagjax.display.web_page.page import in_bytes
+from lagjax.display.web_page.page import as_page, in_bytes
 
 # The largest field of the picture in tenths of a pixel, and its margins: left, top, right, bottom.
 FIELD = (4200, 3600)
@@ -48,7 +47,7 @@ class Animation:
 
     def save(self, path) -> None:
         """Write a page that plays in any browser, without Python and without a network."""
-        Path(path).write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
+        as_page(path).write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
 
     def _repr_html_(self):
         points = self.points

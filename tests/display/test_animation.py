@@ -86,6 +86,8 @@ def test_the_same_film_is_the_same_text(page):
 def test_saves_a_page(tmp_path, page):
     """The saved page contains the same film."""
     Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.html")
+    with pytest.raises(ValueError, match=r'(?s)would be no .gif file.*Fix: .save."motion.html"'):
+        Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.gif")
     text = (tmp_path / "motion.html").read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>") and page in text
 

@@ -51,7 +51,7 @@ class Page:
 
     def save(self, path) -> None:
         """Write a page that works in any browser, without Python and without a network."""
-        Path(path).write_text(whole(self.title, self.html), encoding="utf-8")
+        as_page(path).write_text(whole(self.title, self.html), encoding="utf-8")
 
     def _repr_html_(self):
         return self.html
@@ -60,6 +60,17 @@ class Page:
         return (
             f'{self.words}, {in_bytes(len(self.html))}: works in a notebook, and with .save("page.html") in a browser'
         )
+
+
+def as_page(path) -> Path:
+    """The path of a page; raise for one whose name says that it is something else."""
+    path = Path(path)
+    if path.suffix.lower() not in ("", ".html", ".htm"):
+        raise ValueError(
+            f"this is saved as a page (HTML), and '{path.name}' would be no {path.suffix} file.\n"
+            f'Fix: .save("{path.stem}.html"), which plays in any browser; for a film in a file, record the window.'
+        )
+    return path
 
 
 def whole(title: str, body: str) -> str:

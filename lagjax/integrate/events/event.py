@@ -75,9 +75,11 @@ class Crossing(eqx.Module):
                 f"a guard must be a function of (t, q, v, params), not {type(guard).__name__}.\n"
                 'Fix: lj.Crossing(lambda t, q, v, params: q["y"]).'
             )
-        if direction not in DIRECTIONS or isinstance(direction, bool):
+        # True is 1; what False means, diffrax and NumPy do not agree on.
+        if direction not in DIRECTIONS or direction is False:
             raise ValueError(
-                f"direction must be 1 (from below), -1 (from above) or 0 (both), not {direction!r}.\nFix: direction=-1."
+                f"direction must be 1 (from below), -1 (from above) or 0 (both), not {direction!r}.\n"
+                "Fix: one of them, as direction=-1 for crossings from above."
             )
         if not (isinstance(most, int) and most > 0):
             raise ValueError(f"most must be a whole number above zero, not {most!r}.\nFix: most=1000.")

@@ -135,7 +135,8 @@ def test_one_name_for_two():
 def test_refused_crossings():
     """Wrong directions, numbers and guards are refused."""
     guard = lambda t, q, v, p: q
-    for direction in (2, "up", True, 0.5):
+    assert lj.Crossing(guard, direction=True).direction == 1
+    for direction in (2, "up", False, 0.5):
         with pytest.raises(ValueError, match="direction"):
             lj.Crossing(guard, direction=direction)
     for most in (0, -1, 1.5, None):
