@@ -135,7 +135,7 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
             check(kind, "f", (x, rows), (sigma, rows), lead=True)
             check(kind, "f", (sigma, x.shape))
             columns += math.prod(x.shape[1:])
-    records, order = len(windows.first), np.diff(windows.record, prepend=-1)
+    records = len(windows.first)
     if described.starts is not None:
         (q, v), (q_slopes, v_slopes) = described.starts
         for tree, slopes in ((q, q_slopes), (v, v_slopes)):
@@ -145,7 +145,7 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
                 check("starts", "f", (slope, (*x.shape, p + k)))
             if sum(x[0].size for x in leaves) != n or jax.tree.structure(tree) != jax.tree.structure(slopes):
                 raise ValueError(f"its starts do not have {n} coordinates.")
-    if windows.record[0] != 0 or order.min() < 0 or order.max() > 1 or not 0 <= windows.last.min() <= times:
+    if not in_order(windows.record, windows.last, times):
         raise ValueError("its windows are not in the order of its records.")
     if (at := found.evaluation) is not None:
         of, determined = at.covariance, at.determined
@@ -165,3 +165,15 @@ def check_shapes(found: Fit, described: UnknownSystem) -> None:
 
 def _short(role: str):
     return role.removeprefix("options.")
+
+
+def in_order(record: np.ndarray, last: np.ndarray, times: int) -> bool:
+    """Whether windows (count,) belong to records one after the other, from the first on, and end at a sample of theirs.
+
+    >>> print([in_order(np.array(record), np.array([3, 1]), 4) for record in ([0, 0], [0, 1], [1, 1], [0, 2], [1, 0])])
+    [True, True, False, False, False]
+    >>> print([in_order(np.array([0, 1]), np.array(last), 4) for last in ([0, 4], [-1, 4], [0, 5])])
+    [True, False, False]
+    """
+    steps = np.diff(record, prepend=0)
+    return bool(record[0] == 0 and steps.min() >= 0 and steps.max() <= 1 and last.min() >= 0 and last.max() <= times)

@@ -21,7 +21,8 @@ class PeriodicOrbit(eqx.Module):
     - `shift`: how far the coordinates named in `relative` move in a period, in the structure of `q`; 0 elsewhere.
     - `residual`: how far the end is from the start, and held quantities from their values, in units of the motion's
       size.
-    - `converged`: whether the residual is within the tolerance; if not, this is the best orbit that was found.
+    - `converged`: whether the residual is within the tolerance times what the motion amplifies, and below its square
+      root; if not, this is the best orbit that was found.
     - `iterations`: the number of steps of Newton's method.
     - `nodes` (K, 2n): the states q and v, in the order of their names, at K equal parts of the period.
     - `switches`: the `Switches` in one period, where the system has phases or elements; else None.
@@ -57,7 +58,11 @@ class PeriodicOrbit(eqx.Module):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The motion over one period, 401 states, by `lj.integrate`; not available for a batch."""
+        """The motion over one period, 401 states, by `lj.integrate`; not available for a batch.
+
+        It starts at `q`, `v`, and leaves an unstable orbit by as much as that amplifies its tolerance: what lies on the
+        orbit throughout are its `nodes`.
+        """
         self._check_alone("trajectory")
         ts = float(self.t) + float(self.period) * np.linspace(0.0, 1.0, POINTS)
         return integrate(self.system, self.q, self.v, self.params, ts=ts.astype(self.t.dtype))

@@ -262,7 +262,9 @@ def _searched(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, 
         judge, unfinished, OrbitCandidate(guess.nodes, guess.period), unevaluated,
         OrbitSearch(zero + FIRST_DAMPING, zero), loop,
     )  # fmt: skip
-    converged = search.at.size <= CONVERGED_BELOW * rtol * jnp.maximum(1.0, search.at.amplified)
+    # What a motion amplifies is forgiven, as long as it still comes back.
+    allowed = CONVERGED_BELOW * rtol * jnp.maximum(1.0, search.at.amplified)
+    converged = search.at.size <= jnp.minimum(allowed, jnp.sqrt(rtol))
     if asked.moves:
         # A state of rest comes back after any time.
         converged = converged & (search.at.moves > jnp.sqrt(rtol))

@@ -1,10 +1,13 @@
 """Following a branch past its folds: none missed, no jump to another branch, and where it stalls."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis.continuation.arclength import Path, Tracer
 from tests.analysis.continuation.test_equilibria import branches, check
 from tests.analysis.steady_systems import ENDS, FOLDS, FORMS, forms  # fmt: skip
 
@@ -72,3 +75,18 @@ def test_a_branch_that_stalls():
     assert len(found[0]) > 10 and "Newton's method does not converge" in found[0].status
     np.testing.assert_allclose([found[0].parameter[-1], found[0].q[-1]], 1.0, atol=1e-2)
     assert lj.continue_equilibria(forms, ENDS, 0.0, along="mu", to=0.9)[0].status == "the end of the range"
+
+
+def test_a_path_that_comes_back_is_closed():
+    """Within a step of its start and in the same direction; twins: the other direction, a step away, too few points."""
+    circle = np.linspace(0.0, 2 * np.pi, 41)
+    tracer = SimpleNamespace(weights=np.ones(2))
+
+    def closes(angles, turned=1.0, step=0.2):
+        along = [np.array([-np.sin(a), np.cos(a)]) for a in angles]
+        along[-1] = turned * along[-1]
+        points = [SimpleNamespace(z=5.0 + np.array([np.cos(a), np.sin(a)]), tangent=v) for a, v in zip(angles, along)]
+        return Tracer.closes(tracer, Path(points), step)
+
+    assert closes(circle) and closes(circle[:-1], step=0.16)
+    assert not (closes(circle, -1.0) or closes(circle[:-1], step=0.15) or closes(circle[::8]))

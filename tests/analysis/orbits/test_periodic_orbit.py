@@ -56,6 +56,15 @@ def test_pendulum_that_goes_around():
     assert not bool(none.converged) and "WARNING" in repr(none)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("below", [1e-7, 1e-14])
+def test_what_does_not_come_back_is_no_orbit(below):
+    """So near the top that the motion amplifies any error to its own size, nothing has converged."""
+    with pytest.warns(lj.OrbitWarning, match="no periodic orbit was found near this start"):
+        orbit = lj.periodic_orbit(pendulum, (0.0, (2.0 - below) * np.sqrt(G_OVER_L)), 40.0 / np.sqrt(G_OVER_L), PARAMS)
+    assert not bool(orbit.converged) and float(orbit.residual) > 1e-3 and "WARNING" in repr(orbit)
+
+
 @pytest.mark.exhaustive
 def test_pendulum_on_a_rod():
     """The same period with a constraint, which the orbit satisfies to round-off, from a start that violates it."""

@@ -8,6 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.integrate.equal_steps import loop
+from lagjax.system import prepare
+from tests.by_numpy import by_numpy as in_numpy
 
 TURN = 2 * np.pi
 G = 9.81
@@ -162,6 +165,23 @@ def test_what_they_refuse(name):
     system, start, method, options, words = REFUSED[name]
     with pytest.raises(ValueError, match=f"(?s){words}"):
         lj.integrate(system, *start, 1.0, ts=[0.0, 1.0], method=method, **{"dt0": 0.1} | options)
+
+
+@pytest.mark.parametrize("method", [lj.Splitting(4), lj.Gauss(2)], ids=str)
+def test_a_step(method):
+    """A step from the top of a swing, in NumPy: the motion of SciPy, whose error falls with the fifth power."""
+    model, s = prepare(swing, 0.0, 1.0, 0.3, 2.0)
+
+    def after(t, x, u, h):
+        step = loop._step_of(method, model, t, x, u, False)
+        way = step.advanced(step.first(t, x, u), t, h)
+        return jnp.concatenate([way.x, step.velocity(way, t + h)])
+
+    def error(h):
+        exact = solve_ivp(lambda t, y: [y[1], -2 * np.sin(y[0])], (0.0, h), [1.0, 0.3], rtol=1e-12, atol=1e-13).y[:, -1]
+        return np.max(np.abs(in_numpy(after)(0.0, np.array([1.0]), np.array([0.3]), h) - exact))
+
+    assert 15 * error(0.1) < error(0.2) < 2e-6
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate.events.event import crossings_of
 from tests.systems import PARAMS, pendulum, rod_pendulum
 from tests.tiers import exhaustive_but
 
@@ -284,3 +285,10 @@ def test_a_guard_that_is_nowhere_known():
         motion = steep(unknown)
     assert all(bool(found.uncertain) for found in motion.events.values()) and float(motion.q[-1]) == 10.0
     assert int(motion.stats["num_rejected_steps"]) < 5000
+
+
+def test_directions_of_diffrax():
+    """True is from below, False from above, None both, as diffrax has it."""
+    for theirs, ours in ((True, 1), (False, -1), (None, 0)):
+        event = diffrax.Event(lambda t, y, args, **kwargs: y[0], direction=theirs)
+        assert crossings_of({}, event)["event"].direction == ours
