@@ -1,6 +1,7 @@
 """A motion that fails says where it stopped, why, and what to do; inside programs too."""
 
 import importlib
+import re
 from dataclasses import replace
 
 import equinox as eqx
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import failure
+from lagjax.system import coordinates
 from tests.behaviour.test_bad_input import refusal
 from tests.systems import PARAMS, TS, motion, pendulum
 
@@ -51,3 +54,17 @@ def test_what_only_a_program_knows():
         assert run(**good | {name: value}) == int(expected._value), name
     assert run(**good) == int(lj.RESULTS.successful._value)
     assert "NumPy array" in lj.RESULTS[unordered]
+
+
+def test_a_refused_start_says_why(monkeypatch):
+    """With a reason where there is one, else in the words of the result; what stopped later is another error."""
+    done, settings = motion("pendulum"), None
+    start = coordinates.state(0.0, 1.0, 0.0, PARAMS)
+    monkeypatch.setattr(failure, "of_guards", lambda *given: "")
+    monkeypatch.setattr(failure, "stopped_early", lambda *given: "stopped")
+    for reason, words in (("the mass is zero", "the mass is zero"), (None, lj.RESULTS[lj.RESULTS.start_singular])):
+        monkeypatch.setattr(failure, "explain_failure", lambda *given, reason=reason: reason)
+        with pytest.raises(ValueError, match=re.escape(words)):
+            failure.raise_failure(replace(done, result=lj.RESULTS.start_singular), start, settings, None)
+    with pytest.raises(RuntimeError, match="stopped"):
+        failure.raise_failure(replace(done, result=lj.RESULTS.max_steps_reached), start, settings, None)
