@@ -179,9 +179,8 @@ def integrate(
             drift=drift if drift == "baumgarte" else None,
         )  # fmt: skip
         stepsize_controller = diffrax.ConstantStepSize()
-        if method.pace is None and max_steps == MANY_STEPS:
-            # `dt0` says how many there are.
-            max_steps = None
+        # `dt0` says how many there are.
+        max_steps = None if method.pace is None and max_steps == MANY_STEPS else max_steps
     arguments.check_controller(stepsize_controller, max_step, jump_ts)
     arguments.check_max_steps(max_steps)
     ts = arguments.vector_of_times(ts)
