@@ -75,7 +75,8 @@ def consistent_state(
     body, or a dict of true and false by name; `hold_position`, `hold_velocity`: for the position alone, as of a crank
     whose speed a motor determines, or for the velocity alone.
 
-    **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`.
+    **Returns:** (q, v) in the same structure, differentiable in the state, `t` and `params`: on the constraints to
+    round-off, and nearer than all states around it; where constraints fold, one further off may be nearer still.
 
     **Raises:**
 
