@@ -210,8 +210,10 @@ def test_made_up_names_meet_none_of_the_file(name):
                      marks=pytest.mark.filterwarnings("ignore:Inertia matrix is too close")),
     ],
 )  # fmt: skip
-def test_numbers_that_are_none(attributes, axis, message):
+def test_numbers_that_are_none(attributes, axis, message, tmp_path, monkeypatch):
     """Refused with line and name."""
+    # MuJoCo writes its warnings to a file.
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
         lj.read_mjcf(
             f'<mujoco><worldbody><body name="rod" {attributes}><joint name="hinge" axis="{axis}"/>'
