@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lagjax.integrate import Trajectory, in_turn
+from lagjax.integrate import Trajectory, ended_well, in_turn
 from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.system import Model, constraints
 from lagjax.two_points import elements, index, path_mesh, shoot
@@ -21,7 +21,7 @@ from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.newton import FoundPath, extent
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
-from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, shoots_alone
+from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, misses_of, shoots_alone
 from lagjax.two_points.starts import PathGuess, nodes_of
 
 DEGREE, MOST_ELEMENTS = 8, 128
@@ -42,6 +42,7 @@ class SolvedPath(NamedTuple):
     amplification: Float[Array, ""]
     aim: shoot.Aim
     response: Float[Array, "n+b N+b"]
+    course: shoot.Course
 
 
 @compiled
@@ -53,9 +54,10 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
     response = shoot.response_of(model, ends, found)
     scale = extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
+    course = shoot.Course(found.path, scale, jnp.max(last.errors))
     return SolvedPath(
         found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),
-        shoot.start_of(model, ends, found), response,
+        shoot.start_by_momentum(model, ends, found), response, course,
     )  # fmt: skip
 
 
@@ -94,7 +96,10 @@ def answer_from(
         shot = found_by_shooting(model, ends, x, parts, outputs, rtol)
         if not float(shot.part) >= 1:
             return shot, None, f"Newton's method by integration failed beyond {float(shot.part):.2g} of the way"
-        return shot, _by_shooting(model, ends, shot, outputs, rtol), "found"
+        answer = _by_shooting(model, ends, shot, outputs, rtol)
+        if not bool(answer.converged):
+            return shot, None, f"the motion misses the end by {float(answer.missed):.1g} of its extent"
+        return shot, answer, "found"
     fine, before = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3), np.inf
     while True:
         solved = _solved(model, ends, x, parts)
@@ -112,8 +117,9 @@ def answer_from(
     at_nodes = np.asarray(solved.index)
     if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
         return solved, None, "a path through a singular point"
-    shot = shoot.shot(model, ends, solved.aim, solved.response, outputs, rtol)
-    return solved, _connection(model, ends, solved, shot, outputs), "found"
+    shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
+    answer = _connection(model, ends, solved, shot, outputs)
+    return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
 
 
 @compiled
@@ -125,10 +131,12 @@ def _states(model: Model, ends: Ends, found: FoundPath, t: Float[Array, " T"]):
 
 
 def _connection(
-    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | None, outputs: int, words: str = ""
+    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | str, outputs: int, words: str = ""
 ) -> Connection:
+    """The motion where it meets the end; else the path alone, and why."""
     aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
-    if shot is not None:
+    followed = not isinstance(shot, str)
+    if followed:
         aim, missed, trajectory = shot
         t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
     else:
@@ -141,28 +149,37 @@ def _connection(
     return Connection(
         t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
         np.asarray(-1 if why else at_nodes[-1]), solved.amplification, missed, np.max(solved.errors),
-        np.asarray(solved.part >= 1), times, (), words, len(solved.found.path.y), why,
+        np.asarray(followed or shot == shoot.SINGULAR), times, (), words, len(solved.found.path.y), why,
+        "" if followed else shot,
     )  # fmt: skip
 
 
 def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, rtol=None, **options) -> Connection:
     """The motion from a start that was found without a path, or that comes nearest."""
-    there, unknown = found.part >= 1, jnp.full((), jnp.nan, found.aim.u.dtype)
+    unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
+    missed = misses_of(model, ends, found, trajectory)
+    there = (found.part >= 1) & ended_well(trajectory.result) & (missed < shoot.MET.get(np.dtype(missed.dtype), 1e-3))
     aim = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), found.aim)
     return Connection(
         trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
         jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim), unknown, jnp.asarray(-1), unknown,
-        found.size, unknown, there, None, (), "", 0, why_not_variational(model),
+        missed, unknown, there, None, (), "", 0, why_not_variational(model),
     )  # fmt: skip
 
 
 def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
     """What there is where no path is an answer."""
     if isinstance(solved, FoundVelocity):
-        return replace(_by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False), tried=words)
-    nearest = _connection(model, ends, solved, None, outputs, words)
-    return eqx.tree_at(lambda c: c.converged, nearest, np.asarray(False))
+        nearest = _by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False)
+    else:
+        nearest = _connection(model, ends, solved, "", outputs)
+    nothing = np.asarray(np.nan, nearest.t.dtype)
+    velocities = jax.tree.map(lambda x: np.full(np.shape(x), nothing), (nearest.start_velocity, nearest.end_velocity))
+    return replace(
+        nearest, start_velocity=velocities[0], end_velocity=velocities[1], action=nothing, index=np.asarray(-1),
+        amplification=nothing, converged=np.asarray(False), conjugate_times=None, tried=words,
+    )  # fmt: skip
 
 
 def is_same(a: Connection, b: Connection) -> bool:
@@ -181,7 +198,8 @@ def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int,
         found = found_by_shooting(model, ends, *start, 2, rtol)
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
-    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE)
+    met = shot.size < shoot.MET.get(np.dtype(ends.x_a.dtype), 1e-3)
+    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE) & met & ended_well(shot.trajectory.result)
     aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)
     why, trajectory = why_not_variational(model), shot.trajectory
     return Connection(
@@ -199,7 +217,7 @@ def _search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array
 
     def search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array) -> tuple[SolvedPath, shoot.Shot]:
         solved = _solved(*problem, *start)
-        return solved, shoot.shot_inside(*problem, solved.aim, solved.response, outputs, rtol)
+        return solved, shoot.shot_inside(*problem, solved.course, solved.aim, solved.response, outputs, rtol)
 
     return in_turn(search, problem, start, rtol)
 
