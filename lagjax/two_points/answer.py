@@ -22,13 +22,17 @@ from lagjax.two_points.newton import FoundPath, extent
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
 from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, misses_of, shoots_alone
-from lagjax.two_points.starts import PathGuess, nodes_of
+from lagjax.two_points.starts import DEGREE, PathGuess, nodes_of
 
-DEGREE, MOST_ELEMENTS = 8, 128
+MOST_ELEMENTS = 128
 # An answer with larger highest coefficients on its elements is none.
 COARSE = 0.05
 # Answers whose start velocities and times differ by less, relative, are the same.
 SAME = 1e-6
+# A path this small, in parts of its start, does not move.
+AT_REST = 1e-9
+# How often elements are halved once more where no motion follows the path.
+FINER = 2
 
 
 class SolvedPath(NamedTuple):
@@ -100,26 +104,50 @@ def answer_from(
         if not bool(answer.converged):
             return shot, None, f"the motion misses the end by {float(answer.missed):.1g} of its extent"
         return shot, answer, "found"
-    fine, before = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3), np.inf
+    fine = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3)
+    solved, error = _refined(model, ends, x, parts, fine)
+    if np.max(np.asarray(solved.course.sizes) / _reach(ends, x)) < AT_REST:
+        # All that is left of the start is round-off: it is the straight line, on which nothing moves.
+        solved, error = _refined(model, ends, *nodes_of(model, ends, PathGuess("at rest"), count, DEGREE), fine)
+    if float(solved.part) < 1 and len(solved.errors) == count:
+        return solved, None, f"Newton's method failed beyond {float(solved.part):.2g} of the way"
+    if not error < COARSE:
+        return solved, None, f"{len(solved.errors)} elements do not follow the path"
+    at_nodes = np.asarray(solved.index)
+    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
+        return solved, None, "a path through a singular point"
+    shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
+    # A motion that amplifies errors needs a start that is as good as the path can be.
+    for _ in range(FINER if isinstance(shot, str) and shot != shoot.SINGULAR else 0):
+        x, parts = path_mesh.halved(ends, solved.found.path)
+        finer = _solved(model, ends, x, parts)
+        if 2 * len(x) > MOST_ELEMENTS or not float(finer.part) >= 1 or not float(finer.course.error) < error:
+            break
+        solved, error = finer, float(finer.course.error)
+        shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
+        if not isinstance(shot, str):
+            break
+    answer = _connection(model, ends, solved, shot, outputs)
+    return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
+
+
+def _reach(ends: Ends, x: Array) -> np.ndarray:
+    """How far each coordinate goes on given nodes."""
+    reach = np.max(np.abs(np.asarray(x) - np.asarray(ends.x_a)), axis=(0, 1))
+    return np.where(reach > 0, reach, np.inf)
+
+
+def _refined(model: Model, ends: Ends, x: Array, parts: Array, fine: float) -> tuple[SolvedPath, float]:
+    """The path on as many elements as it takes, and the error of these."""
+    before = np.inf
     while True:
         solved = _solved(model, ends, x, parts)
         part, error = float(solved.part), float(np.max(solved.errors))
         # Where twice as many elements are hardly better, the path has a corner: no more of them help.
         if part < 1 or error <= fine or 2 * len(x) > MOST_ELEMENTS or error > before / 2:
-            break
+            return solved, error if part >= 1 else np.inf
         before = error
         x, parts = path_mesh.halved(ends, solved.found.path)
-    if part < 1 and len(x) == count:
-        return solved, None, f"Newton's method failed beyond {part:.2g} of the way"
-    error = error if part >= 1 else np.inf
-    if not error < COARSE:
-        return solved, None, f"{len(x)} elements do not follow the path"
-    at_nodes = np.asarray(solved.index)
-    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
-        return solved, None, "a path through a singular point"
-    shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
-    answer = _connection(model, ends, solved, shot, outputs)
-    return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
 
 
 @compiled
@@ -183,9 +211,22 @@ def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outp
 
 
 def is_same(a: Connection, b: Connection) -> bool:
-    """Whether two answers are the same: by start velocity and time."""
-    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves((c.start_velocity, c.duration))]) for c in (a, b)]
-    return bool(np.max(np.abs(flat[0] - flat[1])) <= SAME * np.max(np.abs(flat)))
+    """Whether two answers are the same: by start velocity and time, and at the outputs.
+
+    Motions that amplify errors may start alike, and be others.
+    """
+    times, starts, q, v = (
+        [np.concatenate([np.ravel(x) for x in jax.tree.leaves(getattr(c, name))]) for c in (a, b)]
+        for name in ("duration", "start_velocity", "q", "v")
+    )
+    # At rest all velocities are round-off.
+    speed = max(np.max(np.abs(v)), SAME * max(np.max(np.abs(q)), 1.0) / float(a.duration))
+    return bool(
+        abs(times[0] - times[1]) <= SAME * abs(times[0])
+        and np.max(np.abs(starts[0] - starts[1])) <= SAME * speed
+        and np.max(np.abs(q[0] - q[1])) <= shoot.ALONG * np.max(np.abs(q))
+        and np.max(np.abs(v[0] - v[1])) <= shoot.ALONG * speed
+    )
 
 
 # -- In a program. --

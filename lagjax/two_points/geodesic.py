@@ -22,7 +22,8 @@ from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import listed
 from lagjax.system import System, check_system, coordinates, model_of, prepare
-from lagjax.two_points.connect import ELEMENTS, connect
+from lagjax.two_points.answer import is_same
+from lagjax.two_points.connect import ELEMENTS, connected
 from lagjax.two_points.result import Connection
 from lagjax.two_points.starts import Starts, guesses_of
 
@@ -59,7 +60,8 @@ class Geodesic(eqx.Module):
 
     @property
     def conjugate_lengths(self) -> np.ndarray:
-        return self.connection.conjugate_times * np.asarray(self.length)
+        times = self.connection.conjugate_times
+        return np.zeros(0) if times is None else times * np.asarray(self.length)
 
     def __repr__(self):
         if np.ndim(self.length):
@@ -107,10 +109,10 @@ def geodesic(
     - `angles`: the names of coordinates that come back after a turn of 2π: the nearer way round is taken, and for each
       the other way as well.
     - `starts`, `elements`, `outputs`, `rtol`: as for `connect`. Where the straight line leads to nothing but a saddle,
-      seven random starts follow.
+      what lies below it on both sides is looked for, and then seven random starts follow.
 
-    **Returns:** a `Geodesic`; longer ones in `others`. Differentiable in both modes; under `jit` and `vmap` the one
-    from the straight line.
+    **Returns:** a `Geodesic`: the shortest that was found, longer ones in `others`; where none was, its length is NaN.
+    Differentiable in both modes; under `jit` and `vmap` the one from the straight line.
 
     **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v.
 
@@ -125,14 +127,17 @@ def geodesic(
         _check_quadratic(model, s)
     if eager and all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(s.q), jax.tree.leaves(one.q))):
         return _point(system, s, outputs)
-    options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol)
+    many = isinstance(starts, int) and starts > 1
+    options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol, goes_down=many)
     ends = _round_the_other_way(model, s.q, b, angles) if eager and angles else [b]
     found = _different([], system, s, ends, options)
     # The shortest path is no saddle: the straight line was a start on a ridge.
-    if eager and starts == 1 and found and all(answer.kind.startswith("saddle") for answer in found):
-        found = _different(found, system, s, ends, {**options, "starts": guesses_of(model, 1 + FURTHER)[1:]})
+    line, *random = guesses_of(model, 1 + FURTHER)
+    for more in ([line], random) if eager and starts == 1 else ():
+        if found and all(int(answer.index) > 0 for answer in found):
+            found = _different(found, system, s, ends, {**options, "starts": more, "goes_down": True})
     if not found:
-        return _of(system, s, connect(system, s.q, b, 0.0, 1.0, s.params, **options))
+        return _of(system, s, _between(system, s, b, **options))
     if eager:
         found.sort(key=lambda answer: float(answer.length))
     return eqx.tree_at(lambda g: g.others, found[0], tuple(found[1:]), is_leaf=lambda x: isinstance(x, tuple))
@@ -163,11 +168,20 @@ def _different(found: list[Geodesic], system, s, ends, options) -> list[Geodesic
     """The answers that are there, and those to these ends that are others."""
     quiet = bool(found) or len(ends) > 1
     for end in ends:
-        first = connect(system, s.q, end, 0.0, 1.0, s.params, **options, quiet=quiet)
-        if not quiet or bool(first.converged):
+        first = _between(system, s, end, **options, quiet=quiet)
+        # Traced, it is not known whether it converged.
+        if not quiet or bool(first.converged) or first.alone:
             answers = [_of(system, s, answer) for answer in (first, *first.others)]
-            found = [*found, *(x for x in answers if not any(_same(x, other) for other in found))]
+            known = [other.connection for other in found]
+            found = [*found, *(x for x in answers if not any(is_same(x.connection, other) for other in known))]
     return found
+
+
+def _between(system, s, end: PyTree, starts, elements, outputs, rtol, goes_down, quiet=False) -> Connection:
+    """The motions to a point in a time of one."""
+    return connected(
+        system, (s.q, end), (0.0, 1.0), s.params, None, False, starts, elements, outputs, rtol, quiet, goes_down
+    )
 
 
 def _of(system, s, connection: Connection) -> Geodesic:
@@ -236,9 +250,3 @@ def _at_speeds(model, s):
     u = jnp.asarray(np.random.default_rng(0).normal(size=model.n), x.dtype)
     at = x + 1e-3 * jnp.maximum(jnp.abs(x), 1.0)
     return jax.vmap(lambda u: model.lagrangian(s.t, at, u))(jnp.stack([u, 2 * u]))
-
-
-def _same(a: Geodesic, b: Geodesic) -> bool:
-    """Whether two answers are the same: by length and direction."""
-    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(g.connection.start_velocity)]) for g in (a, b)]
-    return bool(np.max(np.abs(flat[0] - flat[1])) <= 1e-6 * np.max(np.abs(flat)))
