@@ -106,7 +106,8 @@ def answer_from(
         return shot, answer, "found"
     fine = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3)
     solved, error = _refined(model, ends, x, parts, fine)
-    if np.max(np.asarray(solved.course.sizes) / _reach(ends, x)) < AT_REST:
+    reach = np.max(np.abs(np.asarray(x) - np.asarray(ends.x_a)), axis=(0, 1))
+    if 0 < np.max(np.asarray(solved.course.sizes)[reach > 0] / reach[reach > 0], initial=0.0) < AT_REST:
         # All that is left of the start is round-off: it is the straight line, on which nothing moves.
         solved, error = _refined(model, ends, *nodes_of(model, ends, PathGuess("at rest"), count, DEGREE), fine)
     if float(solved.part) < 1 and len(solved.errors) == count:
@@ -129,12 +130,6 @@ def answer_from(
             break
     answer = _connection(model, ends, solved, shot, outputs)
     return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
-
-
-def _reach(ends: Ends, x: Array) -> np.ndarray:
-    """How far each coordinate goes on given nodes."""
-    reach = np.max(np.abs(np.asarray(x) - np.asarray(ends.x_a)), axis=(0, 1))
-    return np.where(reach > 0, reach, np.inf)
 
 
 def _refined(model: Model, ends: Ends, x: Array, parts: Array, fine: float) -> tuple[SolvedPath, float]:

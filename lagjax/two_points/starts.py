@@ -117,7 +117,7 @@ def sizes_of(model: Model, ends: Ends) -> Sizes:
 def _probed(model: Model, ends: Ends):
     """Masses and forces on the straight line; by how much L changes with a turn of each coordinate, and elsewhere."""
     u = (ends.x_b - ends.x_a) / ends.duration
-    more = jnp.asarray([TURN, ELSEWHERE], u.dtype)[:, None, None] * jnp.eye(len(u), dtype=u.dtype)
+    more = jnp.asarray([TURN, ELSEWHERE], u.dtype)[:, None, None] * jnp.eye(len(u), dtype=u.dtype)[None]
 
     def at(share: Array):
         t, x = ends.t_a + share * ends.duration, ends.x_a + share * (ends.x_b - ends.x_a)
