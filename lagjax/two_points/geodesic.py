@@ -21,13 +21,15 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import listed
-from lagjax.system import System, check_system, coordinates, model_of, prepare
+from lagjax.system import State, System, check_system, coordinates, model_of, prepare
 from lagjax.two_points.answer import is_same
 from lagjax.two_points.connect import ELEMENTS, connected
 from lagjax.two_points.result import Connection
 from lagjax.two_points.starts import Starts, guesses_of
 
 TURN = 2 * np.pi
+# The tolerance of motions along geodesics that are given.
+TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-6}
 # Random starts where the straight line leads to a path that is not the shortest.
 FURTHER = 7
 
@@ -114,11 +116,12 @@ def geodesic(
     **Returns:** a `Geodesic`: the shortest that was found, longer ones in `others`; where none was, its length is NaN.
     Differentiable in both modes; under `jit` and `vmap` the one from the straight line.
 
-    **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v.
+    **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v, and a system with a force, a
+    dissipation or velocity constraints.
 
     Source: do Carmo, *Riemannian Geometry*, §9.2.
     """
-    system = metric if isinstance(metric, System) else System(LineElement(metric))
+    system = of_metric(metric)
     check_system(system, a, b, params, states=False)
     model, s = prepare(system, 0.0, a, a, params)
     one = prepare(system, 0.0, b, b, params)[1] if jax.tree.structure(a) == jax.tree.structure(b) else s
@@ -143,6 +146,25 @@ def geodesic(
     return eqx.tree_at(lambda g: g.others, found[0], tuple(found[1:]), is_leaf=lambda x: isinstance(x, tuple))
 
 
+def of_metric(metric: Callable | System) -> System:
+    """The system whose motions are geodesics; raises for what turns motions off them."""
+    if not isinstance(metric, System):
+        return System(LineElement(metric))
+    off = [name for name in ("force", "dissipation") if getattr(metric, name) is not None]
+    off += [f"velocity constraint '{name}'" for name, c in metric.constraints.items() if not c.of_positions]
+    if off:
+        raise ValueError(
+            f"the system has a {off[0]}, and its motions are no geodesics.\n"
+            "Fix: a lj.System of L = ½ g(v, v) and holonomic constraints alone; for other motions lj.connect."
+        )
+    return metric
+
+
+def tolerance_in(s: State) -> float:
+    """The tolerance of a motion along a geodesic."""
+    return TOLERANCE.get(np.dtype(s.t.dtype), 1e-5)
+
+
 def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[ArrayLike], params: PyTree = None):
     """Return where the geodesic from a with the velocity v is after a time of one, and its velocity there.
 
@@ -155,12 +177,13 @@ def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[A
 
     **Returns:** (q, v), like `a`; differentiable in both modes.
 
-    **Raises:** as `integrate`.
+    **Raises:** as `integrate`; `ValueError` for a system with a force, a dissipation or velocity constraints.
 
     Source: do Carmo, *Riemannian Geometry*, §3.2.
     """
-    system = metric if isinstance(metric, System) else System(LineElement(metric))
-    trajectory = integrate(system, a, v, params, ts=np.array([0.0, 1.0]), rtol=1e-12)
+    system = of_metric(metric)
+    s = coordinates.prepared(0.0, a, v, params)
+    trajectory = integrate(system, a, v, params, ts=np.array([0.0, 1.0]), rtol=tolerance_in(s))
     return jax.tree.map(lambda x: x[-1], (trajectory.q, trajectory.v))
 
 
@@ -185,9 +208,12 @@ def _between(system, s, end: PyTree, starts, elements, outputs, rtol, goes_down,
 
 
 def _of(system, s, connection: Connection) -> Geodesic:
+    known = not is_traced(connection.amplification)
+    # Between conjugate ends the start velocity has fewer digits than the action.
+    moves = connection.trajectory is not None and not (known and connection.kind.startswith("degenerate"))
     length, starting, ending = _lengths(
         system, s, connection.start_velocity, jax.tree.map(lambda x: x[-1], (connection.q, connection.v)),
-        connection.action, connection.trajectory is not None,
+        connection.action, moves,
     )  # fmt: skip
     return Geodesic(length, starting, ending, eqx.tree_at(lambda c: c.others, connection, ()))
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lagjax.integrate import ENDED_WELL, Trajectory, ended_well, integrate, is_among
 from lagjax.jaxtools import compiled, numpy_of
@@ -162,7 +162,7 @@ class Course(NamedTuple):
         xp, count = numpy_of((trajectory.t, self, ends)), len(trajectory.t)
         x = [xp.reshape(xp.asarray(q), (count, -1)) for q in jax.tree.leaves(trajectory.q)]
         off = xp.concatenate(x, axis=1) - positions(ends, self.path, trajectory.t)
-        return xp.max(xp.abs(off) / xp.asarray(self.sizes))
+        return xp.max(xp.abs(off) / xp.asarray(self.sizes)[None])
 
     def allows(self) -> Float[Array, ""]:
         """By how much the motion that it describes may be off it."""
@@ -187,10 +187,10 @@ def shot(model: Model, ends: Ends, course: Course, aim: Aim, response: Array, ou
             last = last_well(motion(model, ends, aim, 2, rtol, throw=False, estimate_error=False))
         except ValueError:
             # L or its equations are singular there: there is a path, and no motion.
-            if best is None:
-                return SINGULAR
-            break
+            last = None
         if last is None:
+            if best is None and not bool(_is_regular(model, ends, aim)):
+                return SINGULAR
             break
         rho = np.asarray(missed(model, ends, aim, *last))
         if not (off := float(np.max(np.abs(rho)))) < SHRINKS * least:
@@ -223,6 +223,17 @@ def shot(model: Model, ends: Ends, course: Course, aim: Aim, response: Array, ou
     return (
         f"motions from its start miss the end by {nearest:.1g} of its extent: {_grows(model, ends, course, response)}"
     )
+
+
+@compiled
+def _is_regular(model: Model, ends: Ends, aim: Aim) -> Bool[Array, ""]:
+    """Whether ∂L/∂v and constraints say at the start what a velocity and its change are."""
+    arguments = ends.t_a, ends.x_a, aim.u
+    mass, rows = jax.jacfwd(jax.grad(model.lagrangian, argnums=2), argnums=2)(*arguments), constraints.jacobian
+    held = mass + rows(model, *arguments).T @ rows(model, *arguments) * jnp.max(jnp.abs(mass)) if model.m else mass
+    forces = jax.grad(model.lagrangian, argnums=1)(*arguments)
+    well = jnp.all(jnp.isfinite(held)) & jnp.all(jnp.isfinite(forces))
+    return well & (dense.reciprocal_condition(jnp.where(well, held, 0.0)) > 10 * jnp.finfo(mass.dtype).eps)
 
 
 def last_well(trajectory: Trajectory):
