@@ -140,7 +140,7 @@ def lambert(a, b, time, sense):
 
     def y(z):
         c, s = stumpff(z)
-        return r_a + r_b + reach * (z * s - 1) / np.sqrt(c)
+        return r_a + r_b + reach * (z * s - 1) / np.sqrt(c) if c > 0 else -1.0
 
     def off(z):
         c, s = stumpff(z)
@@ -150,7 +150,7 @@ def lambert(a, b, time, sense):
     while revolutions == 0 or 2 * np.pi * revolutions * (0.1 * min(r_a, r_b)) ** 1.5 < time and revolutions < 8:
         low, high = (2 * np.pi * revolutions) ** 2, (2 * np.pi * (revolutions + 1)) ** 2
         low = -60.0 if not revolutions else low + 1e-6
-        zs = np.linspace(low, high - 1e-6, 4000)
+        zs = np.linspace(low, high - 1e-6, 4000) + 1e-7
         values = np.array([off(z) for z in zs])
         for i in np.flatnonzero(values[:-1] * values[1:] < 0):
             z = brentq(off, zs[i], zs[i + 1], xtol=1e-14, rtol=1e-14)
@@ -230,7 +230,10 @@ class Surface(NamedTuple):
             y = many.y.reshape(5, count, -1)
             beyond = np.abs(y[0]) >= abs(to)
             reached, at = beyond.any(axis=1), np.argmax(beyond, axis=1)
-            off = np.where(reached, y[1, np.arange(count), at] - b[1], np.nan)
+            lane, before = np.arange(count), np.maximum(at - 1, 0)
+            (u_0, u_1), (v_0, v_1) = ((y[k, lane, before], y[k, lane, at]) for k in (0, 1))
+            part = (to - u_0) / np.where(u_1 == u_0, 1.0, u_1 - u_0)
+            off = np.where(reached, v_0 + part * (v_1 - v_0) - b[1], np.nan)
 
             def arrival(azimuth, to=to):
                 event = lambda s, y: y[0] - to  # noqa: E731
@@ -245,10 +248,14 @@ class Surface(NamedTuple):
             for shift in shifts:
                 value = off - shift
                 for i in np.flatnonzero(value[:-1] * value[1:] <= 0):
-                    low, high = sides[i : i + 2]
+                    # The lanes are interpolated: the root may be in a cell beside.
                     wanted = b[1] + shift
-                    first, last = (arrival(x)[0] - wanted for x in (low, high))
-                    if not first * last <= 0:
+                    cells = [(sides[max(j, 0)], sides[min(j + 1, count - 1)]) for j in (i, i - 1, i + 1)]
+                    low, high = next(
+                        (c for c in cells if (arrival(c[0])[0] - wanted) * (arrival(c[1])[0] - wanted) <= 0),
+                        (None, None),
+                    )
+                    if low is None:
                         continue
                     azimuth = brentq(lambda x: arrival(x)[0] - wanted, low, high, xtol=1e-13, rtol=1e-13)
                     lengths.append(arrival(azimuth)[1])
@@ -372,14 +379,14 @@ def wrong(problem: Problem, answer) -> list[str]:
     v = np.concatenate([np.ravel(x) for x in jax.tree.leaves(connection.start_velocity)]).astype(float)
     asked = np.concatenate([np.ravel(np.asarray(x)[-1]) for x in jax.tree.leaves(connection.q)])
     turns = (asked - problem.b) / (2 * np.pi)
-    if not np.allclose(asked, problem.b, atol=1e-6 * np.max(np.abs(problem.b))) and np.any(np.abs(turns % 1) > 1e-6):
+    size = max(float(np.max(np.abs(problem.b - problem.a))), float(np.max(np.abs(problem.a))), 1.0)
+    if not np.allclose(asked, problem.b, atol=OFF * size) and np.any(np.abs(turns - np.round(turns)) > OFF):
         said.append("its path ends elsewhere")
     if not bool(connection.converged):
         return said
     n = len(v)
     end, action, index, grown, near = followed(problem, v)
     own = np.concatenate([np.ravel(np.asarray(x)[-1]) for x in jax.tree.leaves(connection.trajectory.q)])
-    size = max(float(np.max(np.abs(problem.b - problem.a))), float(np.max(np.abs(problem.a))), 1.0)
     allowed = OFF + GROWN * grown
     if np.max(np.abs(own - asked)) > OFF * size:
         said.append(f"its trajectory ends {np.max(np.abs(own - asked)):.1e} off")
