@@ -20,7 +20,7 @@ from lagjax.two_points import elements, index, path_mesh, shoot
 from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.newton import FoundPath, extent
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
-from lagjax.two_points.result import Connection
+from lagjax.two_points.result import UNRESOLVED, Connection
 from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, misses_of, shoots_alone
 from lagjax.two_points.starts import DEGREE, PathGuess, nodes_of
 
@@ -128,6 +128,9 @@ def answer_from(
         shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
         if not isinstance(shot, str):
             break
+    resolved = error <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
+    if isinstance(shot, str) and shot != shoot.SINGULAR and not resolved:
+        return solved, None, f"neither {len(solved.errors)} elements nor a motion follow the path"
     answer = _connection(model, ends, solved, shot, outputs)
     return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
 
@@ -158,7 +161,7 @@ def _connection(
 ) -> Connection:
     """The motion where it meets the end; else the path alone, and why."""
     aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
-    followed = not isinstance(shot, str)
+    followed, resolved = not isinstance(shot, str), np.max(solved.errors) <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
     if followed:
         aim, missed, trajectory = shot
         t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
@@ -172,7 +175,7 @@ def _connection(
     return Connection(
         t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
         np.asarray(-1 if why else at_nodes[-1]), solved.amplification, missed, np.max(solved.errors),
-        np.asarray(followed or shot == shoot.SINGULAR), times, (), words, len(solved.found.path.y), why,
+        np.asarray(followed or shot == shoot.SINGULAR and resolved), times, (), words, len(solved.found.path.y), why,
         "" if followed else shot,
     )  # fmt: skip
 
@@ -201,7 +204,8 @@ def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outp
     velocities = jax.tree.map(lambda x: np.full(np.shape(x), nothing), (nearest.start_velocity, nearest.end_velocity))
     return replace(
         nearest, start_velocity=velocities[0], end_velocity=velocities[1], action=nothing, index=np.asarray(-1),
-        amplification=nothing, converged=np.asarray(False), conjugate_times=None, tried=words,
+        amplification=nothing, missed=nothing, mesh_error=nothing, converged=np.asarray(False), conjugate_times=None,
+        duration=nothing if ends.free_time else nearest.duration, tried=words,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from lagjax.integrate import Trajectory
 from lagjax.jaxtools import depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
 from lagjax.system import (
@@ -32,6 +33,7 @@ from lagjax.two_points import descent, path_mesh
 from lagjax.two_points.answer import answer_from, inside, is_same, not_found, why_not_variational
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
+from lagjax.two_points.shoot import launches_of
 from lagjax.two_points.start_velocity import shoots_alone
 from lagjax.two_points.starts import DEGREE, Nodes, PathGuess, Starts, guesses_of, nodes_of, sizes_of
 
@@ -40,6 +42,8 @@ ELEMENTS = 8
 OFF = 1e-6
 # Starts that follow where the straight line leads nowhere; starts in all for each that is asked for, with ways down.
 FURTHER, MOST_STARTS = 3, 5
+# Motions from the start that follow where several starts lead nowhere.
+LAUNCHES = 12
 TOLERANCE = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
@@ -88,10 +92,10 @@ def connect(
       the time is that of stationary action, with no energy h at the end.
     - `starts`: how many starts: the straight line, and others with random waves on it, as large in each coordinate as
       its mass makes it comparable with the line (π for an angle whose turns L knows). With more than one, what lies
-      below each saddle on both sides is looked for too, and what lies below a start that leads nowhere. Or a function
-      q(t), or a motion of `integrate` with its outputs close together, or several. A start need not end at q_b: a fan
-      of launches finds answers far from the straight line. Where the line leads to no answer, three random starts
-      follow.
+      below each saddle on both sides is looked for too, and what lies below a start that leads nowhere; where all of
+      them lead nowhere, twelve motions from the start follow, at several speeds. Or a function q(t), or a motion of
+      `integrate` with its outputs close together, or several. A start need not end at q_b: a fan of launches finds
+      answers far from the straight line. Where the line alone leads to no answer, three random starts follow.
     - `elements`: of the path, at first. They are laid anew where the path needs them, and outside of `jit` and `vmap`
       doubled until it is followed.
     - `outputs`: the number of output times, equally spaced. `rtol`: the tolerance of the motion, 1e-13 in float64.
@@ -107,7 +111,7 @@ def connect(
 
     Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `index.py`.
     """
-    goes_down = isinstance(starts, int) and starts > 1
+    goes_down = isinstance(starts, int | np.integer) and starts > 1
     return connected(
         system, (q_a, q_b), (t_a, t_b), params, end, free_time, starts, elements, outputs, rtol, quiet, goes_down
     )
@@ -125,7 +129,7 @@ def connected(
     guesses = guesses_of(model, 1 + FURTHER if starts == 1 else starts)
     if not is_eager() or is_traced((model, ends)):
         return inside(model, ends, guesses[0], elements, outputs, rtol)
-    found, tried, first, most = [], [], None, MOST_STARTS * len(guesses)
+    found, tried, first, launched, most = [], [], None, False, MOST_STARTS * len(guesses)
     descends = not why_not_variational(model) and descent.can_descend(model, ends, elements)
     # A straight line may lead through a singular point, as the centre of a sphere: others follow.
     while guesses and not (starts == 1 and found and not goes_down) and len(tried) < most:
@@ -137,6 +141,8 @@ def connected(
         found += [answer] if new else []
         if descends and (goes_down or starts == 1 and not found):
             guesses += _below(model, ends, guess, solved, answer if new else None, elements)
+        if goes_down and not guesses and not found and not launched:
+            guesses, launched = launches_of(model, ends, LAUNCHES, rtol), True
     words = "; ".join(tried)
     if not why_not_variational(model):
         found.sort(key=lambda answer: float(answer.action))
@@ -154,7 +160,7 @@ def _below(
     if answer is not None and int(answer.index) > 0:
         nodes = descent.ways_down(model, ends, solved.found.path, sizes_of(model, ends), elements)
         return [PathGuess(f"down from the saddle of {guess.name}, way {i}", Nodes(x)) for i, x in enumerate(nodes, 1)]
-    if answer is None and not float(solved.part) >= 1 and not isinstance(guess.path, Nodes):
+    if answer is None and not float(solved.part) >= 1 and not isinstance(guess.path, Nodes | Trajectory):
         nodes = descent.down_from(model, ends, *nodes_of(model, ends, guess, elements, DEGREE), sizes_of(model, ends))
         return [] if nodes is None else [PathGuess(f"down from {guess.name}", Nodes(nodes))]
     return []

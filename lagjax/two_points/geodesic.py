@@ -68,6 +68,8 @@ class Geodesic(eqx.Module):
     def __repr__(self):
         if np.ndim(self.length):
             return f"Geodesic({np.size(self.length)} lanes)"
+        if self.kind == "not found":
+            return "Geodesic(not found)"
         more = f"; {len(self.others)} longer" if self.others else ""
         return f"Geodesic(length {float(self.length):.12g}, {self.kind}{more})"
 
@@ -130,7 +132,7 @@ def geodesic(
         _check_quadratic(model, s)
     if eager and all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(s.q), jax.tree.leaves(one.q))):
         return _point(system, s, outputs)
-    many = isinstance(starts, int) and starts > 1
+    many = isinstance(starts, int | np.integer) and starts > 1
     options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol, goes_down=many)
     ends = _round_the_other_way(model, s.q, b, angles) if eager and angles else [b]
     found = _different([], system, s, ends, options)

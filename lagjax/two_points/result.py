@@ -89,6 +89,9 @@ class Connection(eqx.Module):
                 return "Connection(traced)"
             if action.ndim:
                 return f"Connection({action.size} lanes)"
+        if not bool(self.converged) and not self.alone:
+            starts = f"; {self.tried.count('; ') + 1} starts, as `tried` says" if self.tried else ""
+            return f"Connection(not found{starts})"
         motion = f"motion misses {float(self.missed):.0e}" if self.trajectory is not None else "no motion"
         more = f"; {len(self.others)} more" if self.others else ""
         found = f"action {float(self.action):.9g} in a time of {float(self.duration):.6g}; {self.elements} elements to "

@@ -25,8 +25,9 @@ from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import residual, rule_of_degree
 from lagjax.two_points.newton import FoundPath
-from lagjax.two_points.path import NATURAL, Ends, Path, end_rows
+from lagjax.two_points.path import FIXED, NATURAL, Ends, Path, end_rows
 from lagjax.two_points.path_mesh import positions
+from lagjax.two_points.starts import PathGuess, sizes_of
 
 # Corrections at most, and how much each has to shrink; and corrections of the motion that is handed out.
 SHOTS, SHRINKS, LAST_SHOTS = 8, 0.5, 3
@@ -38,6 +39,8 @@ MET = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
 ALONG = 1e-3
 # The velocity of the polynomial is off by less, as a part of it: a larger change by the momentum is none.
 OF_POLYNOMIAL = 0.1
+# Speeds of launches, beside that of the straight line, in units of a coordinate's size in the time; their outputs.
+SPEEDS, OUTPUTS = (1.0, 4.0, 10.0), 129
 SINGULAR = "L is singular at the start"
 
 
@@ -147,6 +150,20 @@ def motion(model: Model, ends: Ends, aim: Aim, outputs: int, rtol, **options) ->
 def last_of(trajectory: Trajectory):
     """The last state (q, v) of a motion."""
     return jax.tree.map(lambda x: x[-1], (trajectory.q, trajectory.v))
+
+
+def launches_of(model: Model, ends: Ends, count: int, rtol) -> list[PathGuess]:
+    """Motions from the start as starts: faster than the straight line by as much as coordinates may go, and more."""
+    if ends.kind != FIXED or ends.free_time:
+        return []
+    sizes, random, found = sizes_of(model, ends).sizes, np.random.default_rng(1), []
+    for i in range(count):
+        u = (ends.x_b - ends.x_a + SPEEDS[i % len(SPEEDS)] * random.normal(size=sizes.size) * sizes) / ends.duration
+        aim = Aim(tangent(model, ends.t_a, ends.x_a, jnp.asarray(u, ends.x_a.dtype)), jnp.zeros(0, ends.x_a.dtype))
+        launch = motion(model, ends, aim, OUTPUTS, rtol, throw=False, estimate_error=False)
+        if is_among(launch.result, ENDED_WELL):
+            found.append(PathGuess(f"launch {i + 1}", launch))
+    return found
 
 
 class Course(NamedTuple):

@@ -119,7 +119,8 @@ def _sizes_of_rows(model: Model, ends: Ends, z: Float[Array, " z"], sizes: Array
 
 
 def misses_of(model: Model, ends: Ends, found: "FoundVelocity", trajectory: Trajectory) -> Float[Array, ""]:
-    """By how much a motion misses what is asked, in units of what that changes by along it."""
+    """By how much a motion misses what is asked, in units of what that changes by along it; without derivatives."""
+    model, ends, found, trajectory = stop_gradient((model, ends, found, trajectory))
     x, u = (
         jnp.concatenate([jnp.reshape(y, (len(trajectory.t), -1)) for y in jax.tree.leaves(tree)], axis=1)
         for tree in (trajectory.q, trajectory.v)

@@ -45,7 +45,12 @@ def guesses_of(model: Model, starts: Starts) -> list[PathGuess]:
     """The starts that are asked for."""
     if callable(starts) or isinstance(starts, Trajectory):
         return [PathGuess("the given path", starts)]
-    if not isinstance(starts, int):
+    if not isinstance(starts, int | np.integer | Sequence):
+        raise TypeError(
+            f"starts is a number of starts, a path q(t), a motion of integrate, or a list of these, not "
+            f"{type(starts).__name__}.\nFix: starts=8."
+        )
+    if not isinstance(starts, int | np.integer):
         named = enumerate(starts, start=1)
         return [start if isinstance(start, PathGuess) else PathGuess(f"given path {i}", start) for i, start in named]
     if starts < 1:

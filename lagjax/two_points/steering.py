@@ -167,6 +167,8 @@ def steering_of(
     trajectory = _integrated(question, system, params, (q, v), t_b, motion)
     defects = _defects(question, trajectory)
     status, success = STATUS.get(solved.status, solved.status), is_found(solved)
+    if len(tried.split("; ")) > 1:
+        status = status.replace("near the guess", f"of {len(tried.split('; '))} starts")
     status += accuracy.in_words(solved.cost) if success else ""
     path = solved.x[at["q"]]
     size = max(float(np.max(np.ptp(path, axis=0))), float(np.max(np.abs(path[-1]))))

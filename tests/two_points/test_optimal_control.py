@@ -176,10 +176,13 @@ def test_questions_that_are_wrong():
         ({"end": (jnp.zeros(2), 0.0)}, "the start has"),
         ({"elements": 0}, "elements=0 must be a whole number of at least 1"),
         ({"interpolation": "cubic"}, "'smooth', 'linear' and 'constant'"),
+        ({"starts": 0}, "starts=0 must be a whole number of at least 1"),
         ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
     ):
         with pytest.raises(ValueError, match=words):
             pushed(**options)
+    with pytest.raises(TypeError, match="guess is a function of t or an earlier Steering, not dict"):
+        pushed(guess={"q": 1.0})
     with pytest.raises(TypeError, match="neither q nor v"):
         pushed(start=(None, None))
     with pytest.raises(ValueError, match="nothing in the system reads the control 'brake'"):
