@@ -61,7 +61,7 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
     course = shoot.Course(found.path, scale, jnp.max(last.errors))
     return SolvedPath(
         found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),
-        shoot.start_by_momentum(model, ends, found), response, course,
+        shoot.start_of(model, ends, found), response, course,
     )  # fmt: skip
 
 
@@ -119,12 +119,14 @@ def answer_from(
         return solved, None, "a path through a singular point"
     shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
     # A motion that amplifies errors needs a start that is as good as the path can be.
-    for _ in range(FINER if isinstance(shot, str) and shot != shoot.SINGULAR else 0):
-        x, parts = path_mesh.halved(ends, solved.found.path)
-        finer = _solved(model, ends, x, parts)
-        if 2 * len(x) > MOST_ELEMENTS or not float(finer.part) >= 1 or not float(finer.course.error) < error:
-            break
-        solved, error = finer, float(finer.course.error)
+    for i in range(1 + FINER if isinstance(shot, str) and shot != shoot.SINGULAR else 0):
+        if i:
+            x, parts = path_mesh.halved(ends, solved.found.path)
+            finer = _solved(model, ends, x, parts)
+            if 2 * len(x) > MOST_ELEMENTS or not float(finer.part) >= 1 or not float(finer.course.error) < error:
+                break
+            solved, error = finer, float(finer.course.error)
+        solved = solved._replace(aim=shoot.start_by_momentum(model, ends, solved.found))
         shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
         if not isinstance(shot, str):
             break

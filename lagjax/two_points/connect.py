@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import Trajectory
-from lagjax.jaxtools import depends, is_eager, is_traced
+from lagjax.jaxtools import compiled, depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
 from lagjax.system import (
     OF_STATE,
@@ -210,7 +210,7 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
         condition, kind, count = _conditions(model, s, end, free_time)
     x_a, x_b = _on_constraints(model, t_a, x_a, "q_a"), (
         _on_constraints(model, t_a + duration, x_b, "q_b") if kind == FIXED
-        else path_mesh.onto_constraints(model, t_a + duration, x_b)
+        else _onto_constraints(model, t_a + duration, x_b)
     )  # fmt: skip
     return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count)
 
@@ -298,11 +298,16 @@ def _too_many(model: Model, free_time: bool) -> str:
     )
 
 
+@compiled
+def _onto_constraints(model: Model, t: Array, x: Array) -> Array:
+    return path_mesh.onto_constraints(model, t, x)
+
+
 def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
     """An end moved onto the constraints by round-off; raises where it is farther away."""
     if not model.m:
         return x
-    near = path_mesh.onto_constraints(model, t, x)
+    near = _onto_constraints(model, t, x)
     if not is_traced((near, t)):
         off = float(jnp.max(jnp.abs(near - x))) / max(float(jnp.max(jnp.abs(x))), 1e-300)
         if not off < OFF:

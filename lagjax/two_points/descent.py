@@ -32,7 +32,7 @@ from lagjax.two_points.starts import DEGREE, Sizes
 # shortest radius, and the distance at which the action is taken to fall without limit.
 RADIUS, OFF_SADDLE, SHORTEST, FAR = 0.3, 0.2, 1e-6, 1e2
 # Steps at most; a predicted gain, relative, that ends the search; the most unknowns.
-STEPS, GAIN, MOST = 60, 1e-7, 800
+STEPS, GAIN, MOST = 60, 1e-5, 800
 
 
 class _Place(NamedTuple):

@@ -73,6 +73,7 @@ def start_of(model: Model, ends: Ends, found: FoundPath) -> Aim:
     return Aim(tangent(model, ends.t_a, ends.x_a, u), found.path.border)
 
 
+@compiled
 def start_by_momentum(model: Model, ends: Ends, found: FoundPath) -> Aim:
     """The same of a path that is stationary, with the velocity from its momentum -R at the start.
 

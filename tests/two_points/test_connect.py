@@ -118,7 +118,7 @@ def test_refused_constraints():
 swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_over_the_top():
     """A pendulum that swings once from 0 to 0 in 20, to within 4e-4 of its top: the start speed and the action of the
     elliptic integrals, and the trajectory that is returned ends there. Twin: in 40 errors grow by 1e15, so that the
