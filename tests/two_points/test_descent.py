@@ -62,7 +62,7 @@ def test_slope_and_descent_on_a_constraint():
     second = there.action + back.action - 2 * place.action
     assert abs(second / (step @ place.curvature @ step) - 1) < 1e-3
     lower = ground.at(ground.descended(place), place.multipliers)
-    assert lower is not None and abs(lower.action - 2.0) < 1e-6 and place.action > 2.1
+    assert lower is not None and abs(lower.action - 2.0) < 1e-4 and place.action > 2.1
 
 
 @pytest.mark.slow
