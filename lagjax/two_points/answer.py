@@ -13,22 +13,26 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lagjax.integrate import Trajectory, in_turn
+from lagjax.integrate import Trajectory, ended_well, in_turn
 from lagjax.jaxtools import compiled, stop_gradient
 from lagjax.system import Model, constraints
 from lagjax.two_points import elements, index, path_mesh, shoot
 from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.newton import FoundPath, extent
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
-from lagjax.two_points.result import Connection
-from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, shoots_alone
-from lagjax.two_points.starts import PathGuess, nodes_of
+from lagjax.two_points.result import UNRESOLVED, Connection
+from lagjax.two_points.start_velocity import FoundVelocity, found_by_shooting, misses_of, shoots_alone
+from lagjax.two_points.starts import DEGREE, PathGuess, nodes_of
 
-DEGREE, MOST_ELEMENTS = 8, 128
+MOST_ELEMENTS = 128
 # An answer with larger highest coefficients on its elements is none.
 COARSE = 0.05
 # Answers whose start velocities and times differ by less, relative, are the same.
 SAME = 1e-6
+# A path this small, in parts of its start, does not move.
+AT_REST = 1e-9
+# How often elements are halved once more where no motion follows the path.
+FINER = 2
 
 
 class SolvedPath(NamedTuple):
@@ -42,6 +46,7 @@ class SolvedPath(NamedTuple):
     amplification: Float[Array, ""]
     aim: shoot.Aim
     response: Float[Array, "n+b N+b"]
+    course: shoot.Course
 
 
 @compiled
@@ -53,9 +58,10 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
     response = shoot.response_of(model, ends, found)
     scale = extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
+    course = shoot.Course(found.path, scale, jnp.max(last.errors))
     return SolvedPath(
         found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),
-        shoot.start_of(model, ends, found), response,
+        shoot.start_of(model, ends, found), response, course,
     )  # fmt: skip
 
 
@@ -94,26 +100,54 @@ def answer_from(
         shot = found_by_shooting(model, ends, x, parts, outputs, rtol)
         if not float(shot.part) >= 1:
             return shot, None, f"Newton's method by integration failed beyond {float(shot.part):.2g} of the way"
-        return shot, _by_shooting(model, ends, shot, outputs, rtol), "found"
-    fine, before = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3), np.inf
+        answer = _by_shooting(model, ends, shot, outputs, rtol)
+        if not bool(answer.converged):
+            return shot, None, f"the motion misses the end by {float(answer.missed):.1g} of its extent"
+        return shot, answer, "found"
+    fine = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3)
+    solved, error = _refined(model, ends, x, parts, fine)
+    reach = np.max(np.abs(np.asarray(x) - np.asarray(ends.x_a)), axis=(0, 1))
+    if 0 < np.max(np.asarray(solved.course.sizes)[reach > 0] / reach[reach > 0], initial=0.0) < AT_REST:
+        # All that is left of the start is round-off: it is the straight line, on which nothing moves.
+        solved, error = _refined(model, ends, *nodes_of(model, ends, PathGuess("at rest"), count, DEGREE), fine)
+    if float(solved.part) < 1 and len(solved.errors) == count:
+        return solved, None, f"Newton's method failed beyond {float(solved.part):.2g} of the way"
+    if not error < COARSE:
+        return solved, None, f"{len(solved.errors)} elements do not follow the path"
+    at_nodes = np.asarray(solved.index)
+    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
+        return solved, None, "a path through a singular point"
+    shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
+    # A motion that amplifies errors needs a start that is as good as the path can be.
+    for i in range(1 + FINER if isinstance(shot, str) and shot != shoot.SINGULAR else 0):
+        if i:
+            x, parts = path_mesh.halved(ends, solved.found.path)
+            finer = _solved(model, ends, x, parts)
+            if 2 * len(x) > MOST_ELEMENTS or not float(finer.part) >= 1 or not float(finer.course.error) < error:
+                break
+            solved, error = finer, float(finer.course.error)
+        solved = solved._replace(aim=shoot.start_by_momentum(model, ends, solved.found))
+        shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
+        if not isinstance(shot, str):
+            break
+    resolved = error <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
+    if isinstance(shot, str) and shot != shoot.SINGULAR and not resolved:
+        return solved, None, f"neither {len(solved.errors)} elements nor a motion follow the path"
+    answer = _connection(model, ends, solved, shot, outputs)
+    return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
+
+
+def _refined(model: Model, ends: Ends, x: Array, parts: Array, fine: float) -> tuple[SolvedPath, float]:
+    """The path on as many elements as it takes, and the error of these."""
+    before = np.inf
     while True:
         solved = _solved(model, ends, x, parts)
         part, error = float(solved.part), float(np.max(solved.errors))
         # Where twice as many elements are hardly better, the path has a corner: no more of them help.
         if part < 1 or error <= fine or 2 * len(x) > MOST_ELEMENTS or error > before / 2:
-            break
+            return solved, error if part >= 1 else np.inf
         before = error
         x, parts = path_mesh.halved(ends, solved.found.path)
-    if part < 1 and len(x) == count:
-        return solved, None, f"Newton's method failed beyond {part:.2g} of the way"
-    error = error if part >= 1 else np.inf
-    if not error < COARSE:
-        return solved, None, f"{len(x)} elements do not follow the path"
-    at_nodes = np.asarray(solved.index)
-    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
-        return solved, None, "a path through a singular point"
-    shot = shoot.shot(model, ends, solved.aim, solved.response, outputs, rtol)
-    return solved, _connection(model, ends, solved, shot, outputs), "found"
 
 
 @compiled
@@ -125,10 +159,12 @@ def _states(model: Model, ends: Ends, found: FoundPath, t: Float[Array, " T"]):
 
 
 def _connection(
-    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | None, outputs: int, words: str = ""
+    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | str, outputs: int, words: str = ""
 ) -> Connection:
+    """The motion where it meets the end; else the path alone, and why."""
     aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
-    if shot is not None:
+    followed, resolved = not isinstance(shot, str), np.max(solved.errors) <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
+    if followed:
         aim, missed, trajectory = shot
         t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
     else:
@@ -141,34 +177,57 @@ def _connection(
     return Connection(
         t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
         np.asarray(-1 if why else at_nodes[-1]), solved.amplification, missed, np.max(solved.errors),
-        np.asarray(solved.part >= 1), times, (), words, len(solved.found.path.y), why,
+        np.asarray(followed or shot == shoot.SINGULAR and resolved), times, (), words, len(solved.found.path.y), why,
+        "" if followed else shot,
     )  # fmt: skip
 
 
 def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, rtol=None, **options) -> Connection:
     """The motion from a start that was found without a path, or that comes nearest."""
-    there, unknown = found.part >= 1, jnp.full((), jnp.nan, found.aim.u.dtype)
+    unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
+    missed = misses_of(model, ends, found, trajectory)
+    there = (found.part >= 1) & ended_well(trajectory.result) & (missed < shoot.MET.get(np.dtype(missed.dtype), 1e-3))
     aim = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), found.aim)
     return Connection(
         trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
         jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim), unknown, jnp.asarray(-1), unknown,
-        found.size, unknown, there, None, (), "", 0, why_not_variational(model),
+        missed, unknown, there, None, (), "", 0, why_not_variational(model),
     )  # fmt: skip
 
 
 def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
     """What there is where no path is an answer."""
     if isinstance(solved, FoundVelocity):
-        return replace(_by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False), tried=words)
-    nearest = _connection(model, ends, solved, None, outputs, words)
-    return eqx.tree_at(lambda c: c.converged, nearest, np.asarray(False))
+        nearest = _by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False)
+    else:
+        nearest = _connection(model, ends, solved, "", outputs)
+    nothing = np.asarray(np.nan, nearest.t.dtype)
+    velocities = jax.tree.map(lambda x: np.full(np.shape(x), nothing), (nearest.start_velocity, nearest.end_velocity))
+    return replace(
+        nearest, start_velocity=velocities[0], end_velocity=velocities[1], action=nothing, index=np.asarray(-1),
+        amplification=nothing, missed=nothing, mesh_error=nothing, converged=np.asarray(False), conjugate_times=None,
+        duration=nothing if ends.free_time else nearest.duration, tried=words,
+    )  # fmt: skip
 
 
 def is_same(a: Connection, b: Connection) -> bool:
-    """Whether two answers are the same: by start velocity and time."""
-    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves((c.start_velocity, c.duration))]) for c in (a, b)]
-    return bool(np.max(np.abs(flat[0] - flat[1])) <= SAME * np.max(np.abs(flat)))
+    """Whether two answers are the same: by start velocity and time, and at the outputs.
+
+    Motions that amplify errors may start alike, and be others.
+    """
+    times, starts, q, v = (
+        [np.concatenate([np.ravel(x) for x in jax.tree.leaves(getattr(c, name))]) for c in (a, b)]
+        for name in ("duration", "start_velocity", "q", "v")
+    )
+    # At rest all velocities are round-off.
+    speed = max(np.max(np.abs(v)), SAME * max(np.max(np.abs(q)), 1.0) / float(a.duration))
+    return bool(
+        abs(times[0] - times[1]) <= SAME * abs(times[0])
+        and np.max(np.abs(starts[0] - starts[1])) <= SAME * speed
+        and np.max(np.abs(q[0] - q[1])) <= shoot.ALONG * np.max(np.abs(q))
+        and np.max(np.abs(v[0] - v[1])) <= shoot.ALONG * speed
+    )
 
 
 # -- In a program. --
@@ -181,7 +240,8 @@ def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int,
         found = found_by_shooting(model, ends, *start, 2, rtol)
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
-    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE)
+    met = shot.size < shoot.MET.get(np.dtype(ends.x_a.dtype), 1e-3)
+    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE) & met & ended_well(shot.trajectory.result)
     aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)
     why, trajectory = why_not_variational(model), shot.trajectory
     return Connection(
@@ -199,7 +259,7 @@ def _search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array
 
     def search(problem: tuple[Model, Ends], start: tuple[Array, Array], rtol: Array) -> tuple[SolvedPath, shoot.Shot]:
         solved = _solved(*problem, *start)
-        return solved, shoot.shot_inside(*problem, solved.aim, solved.response, outputs, rtol)
+        return solved, shoot.shot_inside(*problem, solved.course, solved.aim, solved.response, outputs, rtol)
 
     return in_turn(search, problem, start, rtol)
 

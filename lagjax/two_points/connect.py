@@ -6,14 +6,15 @@ check the ends  ->  starts (`starts.py`)  ->  an answer from each (`answer.py`) 
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.jaxtools import depends, is_eager, is_traced
+from lagjax.integrate import Trajectory
+from lagjax.jaxtools import compiled, depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
 from lagjax.system import (
     OF_STATE,
@@ -28,18 +29,21 @@ from lagjax.system import (
     model_of,
     traced_call,
 )
-from lagjax.two_points import path_mesh
+from lagjax.two_points import descent, path_mesh
 from lagjax.two_points.answer import answer_from, inside, is_same, not_found, why_not_variational
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
 from lagjax.two_points.result import Connection
+from lagjax.two_points.shoot import launches_of
 from lagjax.two_points.start_velocity import shoots_alone
-from lagjax.two_points.starts import Starts, guesses_of
+from lagjax.two_points.starts import DEGREE, Nodes, PathGuess, Starts, guesses_of, nodes_of, sizes_of
 
 ELEMENTS = 8
 # Ends may be off the constraints by this part of their size.
 OFF = 1e-6
-# Starts that follow where the straight line leads nowhere.
-FURTHER = 3
+# Starts that follow where the straight line leads nowhere; starts in all for each that is asked for, with ways down.
+FURTHER, MOST_STARTS = 3, 5
+# Motions from the start that follow where several starts lead nowhere.
+LAUNCHES = 12
 TOLERANCE = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
@@ -86,57 +90,99 @@ def connect(
       multipliers. Then the start velocity is sought by integrating alone, from that of the start.
     - `free_time`: whether t_b is a guess. Without a further condition among those of `end` that depend on velocities,
       the time is that of stationary action, with no energy h at the end.
-    - `starts`: how many starts: the straight line, and others with random waves on it; or a function q(t), or a motion
-      of `integrate` with its outputs close together, or several. A start need not end at q_b: a fan of launches finds
-      answers far from the straight line. Where this alone leads to no answer, three random starts follow.
+    - `starts`: how many starts: the straight line, and others with random waves on it, as large in each coordinate as
+      its mass makes it comparable with the line (π for an angle whose turns L knows). With more than one, what lies
+      below each saddle on both sides is looked for too, and what lies below a start that leads nowhere; where all of
+      them lead nowhere, twelve motions from the start follow, at several speeds. Or a function q(t), or a motion of
+      `integrate` with its outputs close together, or several. A start need not end at q_b: a fan of launches finds
+      answers far from the straight line. Where the line alone leads to no answer, three random starts follow.
     - `elements`: of the path, at first. They are laid anew where the path needs them, and outside of `jit` and `vmap`
       doubled until it is followed.
     - `outputs`: the number of output times, equally spaced. `rtol`: the tolerance of the motion, 1e-13 in float64.
     - `quiet`: no warning where no motion is found.
 
-    **Returns:** a `Connection`; further answers in its `others`. Differentiable in both modes by `params` and the ends
-    (first derivatives), under `jit` and `vmap` from the first start.
+    **Returns:** a `Connection`: of the answers that were found, the one of least action, the others in its `others`;
+    there may be more, and one of less action, that none of the starts in `tried` led to. Differentiable in both modes
+    by `params` and the ends (first derivatives), under `jit` and `vmap` from the first start.
 
     **Raises:** `TypeError`, `ValueError` for ends of different structure, off the constraints, or at the same time; for
-    too many or too few conditions. Warns (`ConnectWarning`) where no motion was found, which
-    `converged` says under `jit` and `vmap`.
+    too many or too few conditions. Warns (`ConnectWarning`) where no motion was found, or a path that no motion
+    follows to its end; under `jit` and `vmap` `converged` says so, and the start velocity and the action are NaN.
 
     Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `index.py`.
     """
-    check_system(system, q_a, q_b, params, states=False)
-    model, ends = _problem(system, q_a, q_b, t_a, t_b, params, end, free_time)
+    goes_down = isinstance(starts, int | np.integer) and starts > 1
+    return connected(
+        system, (q_a, q_b), (t_a, t_b), params, end, free_time, starts, elements, outputs, rtol, quiet, goes_down
+    )
+
+
+def connected(
+    system: System, configurations: tuple, times: tuple, params: PyTree, end: Callable | None, free_time: bool,
+    starts: Starts, elements: int, outputs: int, rtol: ArrayLike | None, quiet: bool, goes_down: bool,
+) -> Connection:  # fmt: skip
+    """`connect`; with `goes_down` what lies below saddles, and below starts that lead nowhere, is looked for too."""
+    check_system(system, *configurations, params, states=False)
+    model, ends = _problem(system, *configurations, *times, params, end, free_time)
     dtype = np.dtype(ends.x_a.dtype)
     rtol = TOLERANCE.get(dtype, 1e-5) if rtol is None else rtol
-    if not is_eager() or is_traced((model, ends)):
-        return inside(model, ends, guesses_of(model, starts)[0], elements, outputs, rtol)
-    found, tried, first = [], [], None
-    # A straight line may lead through a singular point, as the centre of a sphere: others follow.
     guesses = guesses_of(model, 1 + FURTHER if starts == 1 else starts)
-    for guess in guesses:
-        if starts == 1 and found:
-            break
+    if not is_eager() or is_traced((model, ends)):
+        return inside(model, ends, guesses[0], elements, outputs, rtol)
+    found, tried, first, launched, most = [], [], None, False, MOST_STARTS * len(guesses)
+    descends = not why_not_variational(model) and descent.can_descend(model, ends, elements)
+    # A straight line may lead through a singular point, as the centre of a sphere: others follow.
+    while guesses and not (starts == 1 and found and not goes_down) and len(tried) < most:
+        guess = guesses.pop(0)
         solved, answer, why = answer_from(model, ends, guess, elements, outputs, rtol)
         first = solved if first is None else first
         tried.append(f"{guess.name}: {why}")
-        if answer is not None and not any(is_same(answer, other) for other in found):
-            found.append(answer)
+        new = answer is not None and not any(is_same(answer, other) for other in found)
+        found += [answer] if new else []
+        if descends and (goes_down or starts == 1 and not found):
+            guesses += _below(model, ends, guess, solved, answer if new else None, elements)
+        if goes_down and not guesses and not found and not launched:
+            guesses, launched = launches_of(model, ends, LAUNCHES, rtol), True
     words = "; ".join(tried)
-    if not found and not quiet:
-        warnings.warn(
-            f"no motion was found from {describe(model.tree(ends.x_a))} to {describe(model.tree(ends.x_b))} in a time "
-            f"of {float(ends.duration):.6g}. Tried: {words}.\n"
+    if not why_not_variational(model):
+        found.sort(key=lambda answer: float(answer.action))
+    if not quiet and not (found and bool(found[0].converged)):
+        _warn(model, ends, found[0] if found else None, words)
+    if not found:
+        return not_found(model, ends, first, outputs, words)
+    return replace(found[0], others=tuple(found[1:]), tried=words)
+
+
+def _below(
+    model: Model, ends: Ends, guess: PathGuess, solved: Any, answer: Connection | None, elements: int
+) -> list[PathGuess]:
+    """Starts that lie below a saddle that is new, or below a start that leads nowhere."""
+    if answer is not None and int(answer.index) > 0:
+        nodes = descent.ways_down(model, ends, solved.found.path, sizes_of(model, ends), elements)
+        return [PathGuess(f"down from the saddle of {guess.name}, way {i}", Nodes(x)) for i, x in enumerate(nodes, 1)]
+    if answer is None and not float(solved.part) >= 1 and not isinstance(guess.path, Nodes | Trajectory):
+        nodes = descent.down_from(model, ends, *nodes_of(model, ends, guess, elements, DEGREE), sizes_of(model, ends))
+        return [] if nodes is None else [PathGuess(f"down from {guess.name}", Nodes(nodes))]
+    return []
+
+
+def _warn(model: Model, ends: Ends, nearest: Connection | None, words: str):
+    between = f"from {describe(model.tree(ends.x_a))} to {describe(model.tree(ends.x_b))}"
+    if nearest is None:
+        text = (
+            f"no motion was found {between} in a time of {float(ends.duration):.6g}. Tried: {words}.\n"
             "Usual cause: no such motion (an end out of reach), a path through a singularity of L, or a start too far "
             "away.\n"
             "Fix: starts=8 for more starts; starts=lambda t: ... for a path that you know, or motions of lj.integrate; "
-            "a shorter time.",
-            ConnectWarning,
-            stacklevel=2,
+            "a shorter time."
         )
-    if not found:
-        return not_found(model, ends, first, outputs, words)
-    if not why_not_variational(model):
-        found.sort(key=lambda answer: float(answer.action))
-    return replace(found[0], others=tuple(found[1:]), tried=words)
+    else:
+        text = (
+            f"a path was found {between}, and no motion that follows it: {nearest.alone}.\n"
+            "Usual cause: an unstable motion over a long time: no start velocity is exact enough.\n"
+            "Fix: take the path itself (.q, .v, .action); a shorter time; or lj.connect for parts of the way."
+        )
+    warnings.warn(text, ConnectWarning, stacklevel=4)
 
 
 # -- The problem: checked arguments. --
@@ -164,7 +210,7 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
         condition, kind, count = _conditions(model, s, end, free_time)
     x_a, x_b = _on_constraints(model, t_a, x_a, "q_a"), (
         _on_constraints(model, t_a + duration, x_b, "q_b") if kind == FIXED
-        else path_mesh.onto_constraints(model, t_a + duration, x_b)
+        else _onto_constraints(model, t_a + duration, x_b)
     )  # fmt: skip
     return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count)
 
@@ -252,11 +298,16 @@ def _too_many(model: Model, free_time: bool) -> str:
     )
 
 
+@compiled
+def _onto_constraints(model: Model, t: Array, x: Array) -> Array:
+    return path_mesh.onto_constraints(model, t, x)
+
+
 def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:
     """An end moved onto the constraints by round-off; raises where it is farther away."""
     if not model.m:
         return x
-    near = path_mesh.onto_constraints(model, t, x)
+    near = _onto_constraints(model, t, x)
     if not is_traced((near, t)):
         off = float(jnp.max(jnp.abs(near - x))) / max(float(jnp.max(jnp.abs(x))), 1e-300)
         if not off < OFF:

@@ -21,12 +21,15 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import listed
-from lagjax.system import System, check_system, coordinates, model_of, prepare
-from lagjax.two_points.connect import ELEMENTS, connect
+from lagjax.system import State, System, check_system, coordinates, model_of, prepare
+from lagjax.two_points.answer import is_same
+from lagjax.two_points.connect import ELEMENTS, connected
 from lagjax.two_points.result import Connection
 from lagjax.two_points.starts import Starts, guesses_of
 
 TURN = 2 * np.pi
+# The tolerance of motions along geodesics that are given.
+TOLERANCE = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-6}
 # Random starts where the straight line leads to a path that is not the shortest.
 FURTHER = 7
 
@@ -59,11 +62,14 @@ class Geodesic(eqx.Module):
 
     @property
     def conjugate_lengths(self) -> np.ndarray:
-        return self.connection.conjugate_times * np.asarray(self.length)
+        times = self.connection.conjugate_times
+        return np.zeros(0) if times is None else times * np.asarray(self.length)
 
     def __repr__(self):
         if np.ndim(self.length):
             return f"Geodesic({np.size(self.length)} lanes)"
+        if self.kind == "not found":
+            return "Geodesic(not found)"
         more = f"; {len(self.others)} longer" if self.others else ""
         return f"Geodesic(length {float(self.length):.12g}, {self.kind}{more})"
 
@@ -107,16 +113,17 @@ def geodesic(
     - `angles`: the names of coordinates that come back after a turn of 2π: the nearer way round is taken, and for each
       the other way as well.
     - `starts`, `elements`, `outputs`, `rtol`: as for `connect`. Where the straight line leads to nothing but a saddle,
-      seven random starts follow.
+      what lies below it on both sides is looked for, and then seven random starts follow.
 
-    **Returns:** a `Geodesic`; longer ones in `others`. Differentiable in both modes; under `jit` and `vmap` the one
-    from the straight line.
+    **Returns:** a `Geodesic`: the shortest that was found, longer ones in `others`; where none was, its length is NaN.
+    Differentiable in both modes; under `jit` and `vmap` the one from the straight line.
 
-    **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v.
+    **Raises:** as `connect`; `ValueError` for a Lagrangian that is not quadratic in v, and a system with a force, a
+    dissipation or velocity constraints.
 
     Source: do Carmo, *Riemannian Geometry*, §9.2.
     """
-    system = metric if isinstance(metric, System) else System(LineElement(metric))
+    system = of_metric(metric)
     check_system(system, a, b, params, states=False)
     model, s = prepare(system, 0.0, a, a, params)
     one = prepare(system, 0.0, b, b, params)[1] if jax.tree.structure(a) == jax.tree.structure(b) else s
@@ -125,17 +132,39 @@ def geodesic(
         _check_quadratic(model, s)
     if eager and all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(s.q), jax.tree.leaves(one.q))):
         return _point(system, s, outputs)
-    options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol)
+    many = isinstance(starts, int | np.integer) and starts > 1
+    options = dict(starts=starts, elements=elements, outputs=outputs, rtol=rtol, goes_down=many)
     ends = _round_the_other_way(model, s.q, b, angles) if eager and angles else [b]
     found = _different([], system, s, ends, options)
     # The shortest path is no saddle: the straight line was a start on a ridge.
-    if eager and starts == 1 and found and all(answer.kind.startswith("saddle") for answer in found):
-        found = _different(found, system, s, ends, {**options, "starts": guesses_of(model, 1 + FURTHER)[1:]})
+    line, *random = guesses_of(model, 1 + FURTHER)
+    for more in ([line], random) if eager and starts == 1 else ():
+        if found and all(int(answer.index) > 0 for answer in found):
+            found = _different(found, system, s, ends, {**options, "starts": more, "goes_down": True})
     if not found:
-        return _of(system, s, connect(system, s.q, b, 0.0, 1.0, s.params, **options))
+        return _of(system, s, _between(system, s, b, **options))
     if eager:
         found.sort(key=lambda answer: float(answer.length))
     return eqx.tree_at(lambda g: g.others, found[0], tuple(found[1:]), is_leaf=lambda x: isinstance(x, tuple))
+
+
+def of_metric(metric: Callable | System) -> System:
+    """The system whose motions are geodesics; raises for what turns motions off them."""
+    if not isinstance(metric, System):
+        return System(LineElement(metric))
+    off = [name for name in ("force", "dissipation") if getattr(metric, name) is not None]
+    off += [f"velocity constraint '{name}'" for name, c in metric.constraints.items() if not c.of_positions]
+    if off:
+        raise ValueError(
+            f"the system has a {off[0]}, and its motions are no geodesics.\n"
+            "Fix: a lj.System of L = ½ g(v, v) and holonomic constraints alone; for other motions lj.connect."
+        )
+    return metric
+
+
+def tolerance_in(s: State) -> float:
+    """The tolerance of a motion along a geodesic."""
+    return TOLERANCE.get(np.dtype(s.t.dtype), 1e-5)
 
 
 def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[ArrayLike], params: PyTree = None):
@@ -150,12 +179,13 @@ def exponential_map(metric: Callable | System, a: PyTree[ArrayLike], v: PyTree[A
 
     **Returns:** (q, v), like `a`; differentiable in both modes.
 
-    **Raises:** as `integrate`.
+    **Raises:** as `integrate`; `ValueError` for a system with a force, a dissipation or velocity constraints.
 
     Source: do Carmo, *Riemannian Geometry*, §3.2.
     """
-    system = metric if isinstance(metric, System) else System(LineElement(metric))
-    trajectory = integrate(system, a, v, params, ts=np.array([0.0, 1.0]), rtol=1e-12)
+    system = of_metric(metric)
+    s = coordinates.prepared(0.0, a, v, params)
+    trajectory = integrate(system, a, v, params, ts=np.array([0.0, 1.0]), rtol=tolerance_in(s))
     return jax.tree.map(lambda x: x[-1], (trajectory.q, trajectory.v))
 
 
@@ -163,17 +193,29 @@ def _different(found: list[Geodesic], system, s, ends, options) -> list[Geodesic
     """The answers that are there, and those to these ends that are others."""
     quiet = bool(found) or len(ends) > 1
     for end in ends:
-        first = connect(system, s.q, end, 0.0, 1.0, s.params, **options, quiet=quiet)
-        if not quiet or bool(first.converged):
+        first = _between(system, s, end, **options, quiet=quiet)
+        # Traced, it is not known whether it converged.
+        if not quiet or bool(first.converged) or first.alone:
             answers = [_of(system, s, answer) for answer in (first, *first.others)]
-            found = [*found, *(x for x in answers if not any(_same(x, other) for other in found))]
+            known = [other.connection for other in found]
+            found = [*found, *(x for x in answers if not any(is_same(x.connection, other) for other in known))]
     return found
 
 
+def _between(system, s, end: PyTree, starts, elements, outputs, rtol, goes_down, quiet=False) -> Connection:
+    """The motions to a point in a time of one."""
+    return connected(
+        system, (s.q, end), (0.0, 1.0), s.params, None, False, starts, elements, outputs, rtol, quiet, goes_down
+    )
+
+
 def _of(system, s, connection: Connection) -> Geodesic:
+    known = not is_traced(connection.amplification)
+    # Between conjugate ends the start velocity has fewer digits than the action.
+    moves = connection.trajectory is not None and not (known and connection.kind.startswith("degenerate"))
     length, starting, ending = _lengths(
         system, s, connection.start_velocity, jax.tree.map(lambda x: x[-1], (connection.q, connection.v)),
-        connection.action, connection.trajectory is not None,
+        connection.action, moves,
     )  # fmt: skip
     return Geodesic(length, starting, ending, eqx.tree_at(lambda c: c.others, connection, ()))
 
@@ -236,9 +278,3 @@ def _at_speeds(model, s):
     u = jnp.asarray(np.random.default_rng(0).normal(size=model.n), x.dtype)
     at = x + 1e-3 * jnp.maximum(jnp.abs(x), 1.0)
     return jax.vmap(lambda u: model.lagrangian(s.t, at, u))(jnp.stack([u, 2 * u]))
-
-
-def _same(a: Geodesic, b: Geodesic) -> bool:
-    """Whether two answers are the same: by length and direction."""
-    flat = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(g.connection.start_velocity)]) for g in (a, b)]
-    return bool(np.max(np.abs(flat[0] - flat[1])) <= 1e-6 * np.max(np.abs(flat)))

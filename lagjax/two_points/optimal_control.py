@@ -9,15 +9,27 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from lagjax.system import System, coordinates
+from lagjax.system import System
+from lagjax.two_points.first_plan import FirstPlan, first_plan, random_plans, split_controls, unknowns
 from lagjax.two_points.layout import Layout
 from lagjax.two_points.mesh import Mesh, jumps_of, moved
 from lagjax.two_points.nonlinear_program import NonlinearProgram, SolverAnswer, import_casadi
 from lagjax.two_points.question import Question, asked
-from lagjax.two_points.steering import SteeredMotion, Steering, compile_ahead, failure_in_words, is_found, steering_of
+from lagjax.two_points.steering import (
+    STATUS,
+    Accuracy,
+    SteeredMotion,
+    Steering,
+    compile_ahead,
+    failure_in_words,
+    is_found,
+    steering_of,
+)
 
 # The solver's own tolerance of optimality; bounds are not widened, which would let the cost fall below the least.
 EXACT = {"tol": 1e-10, "bound_relax_factor": 0.0, "max_iter": 1000}
+# The most iterations of a further start.
+OF_A_START = 300
 # The most jumps of controls that elements are cut at.
 CUTS = 8
 # From a solution on another mesh, the barrier of Ipopt starts here.
@@ -26,7 +38,7 @@ WARM = {"mu_init": 1e-6}
 
 def steer(
     system: System,
-    controls: Mapping[str, ArrayLike],
+    controls: Mapping[str, ArrayLike | Callable] | Callable,
     start: tuple[PyTree, PyTree],
     end: tuple[PyTree, PyTree] | Callable,
     cost: Callable | None = None,
@@ -36,7 +48,8 @@ def steer(
     t_a: ArrayLike = 0.0,
     end_cost: Callable | None = None,
     bounds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
-    guess: Callable | None = None,
+    guess: Callable | Steering | None = None,
+    starts: int = 1,
     interpolation: str = "smooth",
     elements: int = 8,
     most: int = 64,
@@ -61,7 +74,8 @@ def steer(
     **Main arguments:**
 
     - `system`: a `System`; holonomic constraints and velocity constraints are kept.
-    - `controls`: by name, a first guess of each, a number or an array, for all times.
+    - `controls`: by name, a first guess of each: a number or an array, for all times; a function of t; or a pair
+      (times, values), linear in between. Or one function of t that returns them all, as `lj.steer(...).controls`.
     - `start`, `end`: (q, v), each like the coordinates; NaN stands for a number that is free, None for all of q or of
       v. `end` may be a function `end(t, q, v, params)` that returns what has to vanish.
     - `cost(t, q, v, u, params)` -> scalar, per unit of time; `u` is a dict of the controls.
@@ -75,12 +89,15 @@ def steer(
       a pair (low, high), infinite where there is none. Coordinates are held to them at Lobatto's points of each
       element, controls and velocities at Gauss's; a control is cut off at its bounds in between.
     - `guess(t)` -> q, a path to start from, in place of the straight line; times of a free end run to the geometric
-      mean of its limits.
+      mean of its limits. Or an earlier `Steering`, of other ends, times or parameters: its path, stretched to the time
+      and moved to the ends, and its controls, unless those given depend on time.
+    - `starts`: how many starts: the guess, and others with random waves on its path and controls, some of which wait
+      first. All are solved on the first elements, and the least cost is refined; `tried` of the answer has the others.
     - `interpolation`: between the knots a control is a polynomial through Gauss's points ("smooth"), "linear" from knot
       to knot, or "constant".
     - `elements`, `most`: how many elements of the time to begin with, and the most. All are halved until the cost
-      changes by less than `tol` of it. Where a control goes from one bound to the other in an element, that is cut in
-      two at a time that is sought with the rest.
+      changes by less than `tol` of it; where `most` ends this before, the status says so. Where a control goes from one
+      bound to the other in an element, that is cut in two at a time that is sought with the rest.
     - `degree`: of q on an element; the error of a smooth motion is of order 2 `degree` in their length.
     - `with_control(params, u)`: as in `lj.rollout`.
     - `outputs`: at how many times the motion is integrated for, with the tolerance `rtol`.
@@ -96,33 +113,67 @@ def steer(
     - `RuntimeError` if the solver finds no motion, with the condition that is violated most.
     - `ImportError` without casadi, an extra: `pip install "lagjax[steer]"`.
 
-    Found is a local minimum, the one near the guess. It needs float64, and is called from Python alone: derivatives by
-    parameters are those of the motion with the plan held, from `lj.integrate(found.system, q0, v0, found.params, ...)`.
+    Found is a local minimum, the one near the guess, or the least of those near `starts`. It needs float64, and is
+    called from Python alone: derivatives by parameters are those of the motion with the plan held, from
+    `lj.integrate(found.system, q0, v0, found.params, ...)`.
 
     Source: Betts, *Practical Methods for Optimal Control*, ch. 4; Leyendecker et al. (2010).
     """
     times, options = (t_a, t_b), (degree, interpolation)
-    counts = ("elements", elements, 1), ("most", most, 1), ("degree", degree, 1), ("outputs", outputs, 2)
+    counts = (
+        ("elements", elements, 1), ("most", most, 1), ("degree", degree, 1), ("outputs", outputs, 2),
+        ("starts", starts, 1),
+    )  # fmt: skip
+    controls, controls_at = split_controls(controls, t_a)
     question = asked(system, controls, start, end, cost, params, times, end_cost, bounds, with_control, options, counts)
     motion = SteeredMotion(outputs, rtol, max(most, elements) + CUTS, throw)
+    plan = first_plan(question, guess, controls_at)
     import_casadi()
     ahead = compile_ahead(question, motion)
     try:
-        layout, solved, change, iterations = _searched(question, Mesh.even(elements), guess, most, tol)
+        layout, solved, accuracy, iterations, tried = _searched(question, elements, plan, starts, most, tol)
     finally:
         ahead.join()
     if throw and not is_found(solved):
         raise RuntimeError(failure_in_words(question, layout, solved, _limits_of_rows(question, layout)))
-    return steering_of(question, layout, solved, motion, change, iterations)
+    return steering_of(question, layout, solved, motion, accuracy, iterations, tried)
 
 
 def _searched(
-    question: Question, mesh: Mesh, guess: Callable | None, most: int, tol: float
-) -> tuple[Layout, SolverAnswer, float, int]:
-    """The solution on the last mesh, by how much the cost changed from the mesh before, and all iterations."""
+    question: Question, elements: int, plan: FirstPlan, starts: int, most: int, tol: float
+) -> tuple[Layout, SolverAnswer, Accuracy, int, str]:
+    """The solution on the last mesh, how much its cost changed there, all iterations, and what was tried."""
+    mesh = Mesh.even(elements)
     layout = Layout(question.plant, mesh.count)
-    solved = _solve(question, layout, mesh, _first(question, layout, mesh, guess), {})
-    iterations, change = solved.iterations, np.inf
+    solved = _solve(question, layout, mesh, unknowns(question, layout, mesh, plan), {})
+    found, plans = [(plan, solved)], []
+    if starts > 1:
+        plans = random_plans(question, plan, starts - 1, solved.x[layout.places["controls"]])
+    for other in plans:
+        x = unknowns(question, layout, mesh, other)
+        found.append((other, _solve(question, layout, mesh, x, {"max_iter": OF_A_START})))
+    iterations = sum(answer.iterations for _, answer in found)
+    tried = "; ".join(f"{plan.name}: {_in_words(answer)}" for plan, answer in found)
+    # The least one on few elements need not be one on many: the next ones follow.
+    ordered = sorted((x for _, x in found if is_found(x)), key=lambda x: x.cost) or [solved]
+    for coarse in ordered:
+        layout, fine, accuracy, more = _refined(question, mesh, layout, coarse, most, tol)
+        iterations += more
+        if is_found(fine):
+            break
+        layout = Layout(question.plant, mesh.count)
+    return layout, fine, accuracy, iterations, tried
+
+
+def _in_words(answer: SolverAnswer) -> str:
+    return f"cost {answer.cost:.9g}" if is_found(answer) else STATUS.get(answer.status, answer.status)
+
+
+def _refined(
+    question: Question, mesh: Mesh, layout: Layout, solved: SolverAnswer, most: int, tol: float
+) -> tuple[Layout, SolverAnswer, Accuracy, int]:
+    """A solution on ever finer meshes, until its cost no longer changes."""
+    iterations, change = 0, np.inf
     while is_found(solved):
         # Where a control jumps is looked for once: afterwards the bound of two elements is there.
         jumps = [] if mesh.jumps else jumps_of(layout, solved.x, *question.limits["controls"])[:CUTS]
@@ -135,31 +186,14 @@ def _searched(
         if not is_found(solved):
             solved = _solve(question, layout, mesh, x, {})
         iterations, change = iterations + solved.iterations, abs(solved.cost - coarse.cost)
-        if not jumps and change <= tol * abs(solved.cost):
+        if not jumps and change <= _allowed(solved, tol):
             break
-    return layout, solved, change, iterations
+    return layout, solved, Accuracy(change, bool(change <= _allowed(solved, tol)), tol), iterations
 
 
-def _first(question: Question, layout: Layout, mesh: Mesh, guess: Callable | None) -> np.ndarray:
-    """Unknowns to start from: the guess, or a straight line."""
-    plant, at, (low, high) = question.plant, layout.places, question.t_b
-    x, t_a = np.zeros(layout.size), question.t_a
-    t_b = t_a + np.sqrt((low - t_a) * (high - t_a))
-    x[at["end"]], x[at["parts"]] = t_b, mesh.parts
-    shares = mesh.parts[:-1, None] + np.diff(mesh.parts)[:, None] * plant.rule.nodes[:-1]
-    shares = np.append(shares.ravel(), 1.0)
-    first, last = (end.q for end in question.ends)
-    # A free number is what it is at the other end.
-    first, last = np.where(np.isnan(first), np.nan_to_num(last), first), np.where(np.isnan(last), first, last)
-    last = np.where(np.isnan(last), first, last)
-    path = first + shares[:, None] * (last - first)
-    if guess is not None:
-        path = np.stack([coordinates.vector(guess(t)) for t in t_a + shares * (t_b - t_a)])
-    x[at["q"]] = np.clip(path, *question.limits["q"])
-    slopes = (path[1] - path[0]) / shares[1], (path[-1] - path[-2]) / (1 - shares[-2])
-    x[at["v"]] = np.stack(slopes) / (t_b - t_a)
-    x[at["controls"]] = np.clip(question.controls, *question.limits["controls"])
-    return x
+def _allowed(solved: SolverAnswer, tol: float) -> float:
+    # A cost of zero is so to the solver's own tolerance.
+    return tol * max(abs(solved.cost), EXACT["tol"])
 
 
 def _limits_of(question: Question, layout: Layout, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

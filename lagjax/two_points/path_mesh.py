@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from numpy.polynomial import legendre
 
-from lagjax.jaxtools import compiled, once
+from lagjax.jaxtools import compiled, numpy_of, once
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import lagrange, rule_of_degree
@@ -67,12 +67,23 @@ def states(ends: Ends, path: Path, t: Float[Array, " T"]) -> tuple[Float[Array, 
     return y, slope / (h * path.duration(ends))[:, None]
 
 
+def positions(ends: Ends, path: Path, t: Float[Array, " T"]) -> Float[Array, "T n"]:
+    """The positions alone, in NumPy where all is known."""
+    xp, n = numpy_of((ends, path, t)), ends.x_a.size
+    y, parts, x_a = (xp.asarray(x) for x in (path.y[..., :n], path.parts, ends.x_a))
+    before = xp.concatenate([x_a[None], y[:-1, -1]])
+    nodes = xp.concatenate([before[:, None], y], axis=1)
+    part = (xp.asarray(t) - xp.asarray(ends.t_a)) / xp.asarray(path.duration(ends))
+    i = xp.clip(xp.searchsorted(parts, part, side="right") - 1, 0, len(parts) - 2)
+    return xp.einsum("tj,tjn->tn", _basis(y.shape[1], (part - parts[i]) / xp.diff(parts)[i]), nodes[i])
+
+
 def _basis(s: int, at: Float[Array, " T"]) -> Float[Array, "T s+1"]:
     """Lagrange's polynomials of an element's nodes at points of it."""
-    nodes = rule_of_degree(s).nodes
+    nodes, xp = rule_of_degree(s).nodes, numpy_of(at)
     apart = nodes[:, None] - nodes[None] + np.eye(s + 1)
-    factors = jnp.where(np.eye(s + 1, dtype=bool)[None], 1.0, (at[:, None, None] - nodes[None, None]) / apart[None])
-    return jnp.prod(factors, axis=2).astype(at.dtype)
+    factors = xp.where(np.eye(s + 1, dtype=bool)[None], 1.0, (at[:, None, None] - nodes[None, None]) / apart[None])
+    return xp.prod(factors, axis=2).astype(at.dtype)
 
 
 def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:

@@ -9,7 +9,8 @@ and the least J from δx is δxᵀ S δx, by δu = -K δx with K = R⁻¹ (Bᵀ 
     Aᵀ S + S A - (S B + N) R⁻¹ (Bᵀ S + Nᵀ) + Q = 0
 
 A and B are derivatives of the accelerations, Q, R and N halves of second derivatives of the cost. On holonomic
-constraints δq and δv are the displacements that these allow, T η and T ω with Tᵀ T = 1; at rest T does not change.
+constraints δq and δv are the displacements that these allow, T η and T ω with Tᵀ T = 1; at rest T does not change. A
+slope of the cost along their normals then has a part in Q (`linear_quadratic.py`).
 
 Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.4; SciPy's `solve_continuous_are`.
 """
@@ -99,7 +100,7 @@ def lqr(
       anew.
     - `state`: the equilibrium (q, v), at rest; or a `Trajectory`, as `lj.steer(...).trajectory`.
     - `cost(t, q, v, u, params)` -> scalar, per unit of time: least at the equilibrium. Its second derivatives there, or
-      along the trajectory, are the weights.
+      along the trajectory, are the weights; on constraints those along what these allow, which bends.
     - `t`: the time at which everything is taken; a trajectory has its own.
     - `end_cost(t, q, v, params)` -> scalar: its second derivatives are the weights of the trajectory's end.
     - `with_control`: as in `lj.rollout`.

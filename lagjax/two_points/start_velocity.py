@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
@@ -102,6 +103,35 @@ def missed(model: Model, ends: Ends, outputs: int, rtol, z: Float[Array, " z"]) 
     """ρ; the last m rows are what v_a misses of the constraints."""
     motion = shoot.motion(model, ends, _aim(model, ends, z), outputs, rtol, throw=False, estimate_error=False)
     return _misses(model, ends, z, *shoot.last_of(motion))
+
+
+@compiled
+def _sizes_of_rows(model: Model, ends: Ends, z: Float[Array, " z"], sizes: Array, speeds: Array, q, v):
+    """What each row of ρ changes by along a motion of these sizes and speeds."""
+
+    def rows(x: Array, u: Array, u_a: Array) -> Array:
+        return _misses(model, ends, jnp.concatenate([u_a, z[model.n :]]), model.tree(x), model.tree(u))
+
+    x, u = model.vectors(q, v)
+    by_x, by_u, by_start = jax.jacfwd(rows, argnums=(0, 1, 2))(x, u, z[: model.n])
+    found = jnp.abs(by_x) @ sizes + (jnp.abs(by_u) + jnp.abs(by_start)) @ speeds
+    return jnp.where(found > 0, found, 1.0)
+
+
+def misses_of(model: Model, ends: Ends, found: "FoundVelocity", trajectory: Trajectory) -> Float[Array, ""]:
+    """By how much a motion misses what is asked, in units of what that changes by along it; without derivatives."""
+    model, ends, found, trajectory = stop_gradient((model, ends, found, trajectory))
+    x, u = (
+        jnp.concatenate([jnp.reshape(y, (len(trajectory.t), -1)) for y in jax.tree.leaves(tree)], axis=1)
+        for tree in (trajectory.q, trajectory.v)
+    )
+    z, last = jnp.concatenate(found.aim), shoot.last_of(trajectory)
+    time = shoot.duration(ends, found.aim)
+    moved = jnp.maximum(jnp.max(jnp.abs(x - x[:1]), axis=0), jnp.max(jnp.abs(u), axis=0) * time)
+    still = jnp.max(moved) <= 0
+    moved = jnp.where(still, 1.0, jnp.maximum(moved, 1e-3 * jnp.max(moved)))
+    sizes = _sizes_of_rows(model, ends, z, moved, moved / time, *last)
+    return jnp.max(jnp.abs(_misses(model, ends, z, *last)) / sizes)
 
 
 def _step(jacobian: Float[Array, "r z"], rho: Float[Array, " r"]) -> Float[Array, " z"]:

@@ -60,12 +60,15 @@ class Steering(eqx.Module):
 
     - `controls`: `controls(t)` is a dict of the controls at a time; `controls.knots`, `controls.rows` are the numbers.
     - `trajectory`: the motion by `lj.integrate`, from the start found, under these controls.
-    - `cost`: that of the program; `cost_change`: by how much it changed when the elements were halved last.
+    - `cost`: that of the program, on its elements; `cost_change`: by how much it changed when they were halved last,
+      infinite where they were not.
     - `defect`: the largest distance of the integrated end from the end that was asked, in the units of each number;
       `defects`: by name, the integrated number less the asked one.
     - `system`, `params`: the system with its plan, which `lj.integrate` and all else take.
     - `t_b`: the time of the end, `[t]`.
-    - `status`: what the solver says, in words; `success`, `iterations` (of all meshes), `elements` (of the last).
+    - `status`: what the solver says, in words, and whether `tol` was reached on the last elements; `success`: whether a
+      motion that meets the end was found. `iterations` (of all meshes), `elements` (of the last).
+    - `tried`: what each start led to on the first elements, in words.
     """
 
     controls: Plan
@@ -80,6 +83,7 @@ class Steering(eqx.Module):
     success: bool
     iterations: int
     elements: int
+    tried: str = ""
 
     @property
     def defect(self) -> float:
@@ -106,14 +110,37 @@ class Steering(eqx.Module):
         worst = max(self.defects, key=lambda name: abs(self.defects[name]), default=None)
         rows = [
             ("status", self.status),
-            ("cost", f"{self.cost:.12g}, which changed by {self.cost_change:.2g} from half as many elements"),
+            ("cost", f"{self.cost:.12g}{self._change_in_words()}"),
             ("end", f"t = {self.t_b:.12g}"),
             ("defect", "nothing asked" if worst is None else f"{self.defect:.2g}, of {worst}: integrated less asked"),
             ("controls", ", ".join(coordinates.names(self.controls.example))),
             ("elements", f"{self.elements}, {self.iterations} iterations on all meshes"),
         ]
+        rows += [("tried", self.tried)] if "; " in self.tried else []
         width = max(len(name) for name, _ in rows)
         return "\n".join(["Steering", *(f"  {name.ljust(width)}  {text}" for name, text in rows)])
+
+    def _change_in_words(self) -> str:
+        if not np.isfinite(self.cost_change):
+            return ", on these elements alone"
+        return f", which changed by {self.cost_change:.2g} from the elements before"
+
+
+class Accuracy(NamedTuple):
+    """By how much the cost changed on the last mesh, whether that is below `tol` of it, and `tol`."""
+
+    change: float
+    reached: bool
+    tol: float
+
+    def in_words(self, cost: float) -> str:
+        """What there is to say beside the status."""
+        if self.reached:
+            return ""
+        if not np.isfinite(self.change):
+            return "; on one mesh alone, so that its error is not known: a larger `most` halves the elements"
+        part = self.change / abs(cost) if cost else np.inf
+        return f"; tol={self.tol:.0e} was not reached: the cost changed by {part:.1e} of it on the last elements"
 
 
 class SteeredMotion(NamedTuple):
@@ -126,8 +153,9 @@ class SteeredMotion(NamedTuple):
 
 
 def steering_of(
-    question: Question, layout: Layout, solved: SolverAnswer, motion: SteeredMotion, change: float, iterations: int
-) -> Steering:
+    question: Question, layout: Layout, solved: SolverAnswer, motion: SteeredMotion, accuracy: Accuracy,
+    iterations: int, tried: str,
+) -> Steering:  # fmt: skip
     """The integrated motion under the controls that were found, beside what was asked."""
     plant, at = question.plant, layout.places
     t_a, t_b = question.t_a, float(solved.x[at["end"]][0])
@@ -139,6 +167,9 @@ def steering_of(
     trajectory = _integrated(question, system, params, (q, v), t_b, motion)
     defects = _defects(question, trajectory)
     status, success = STATUS.get(solved.status, solved.status), is_found(solved)
+    if len(tried.split("; ")) > 1:
+        status = status.replace("near the guess", f"of {len(tried.split('; '))} starts")
+    status += accuracy.in_words(solved.cost) if success else ""
     path = solved.x[at["q"]]
     size = max(float(np.max(np.ptp(path, axis=0))), float(np.max(np.abs(path[-1]))))
     worst = max((abs(x) for name, x in defects.items() if name in question.names["q"]), default=0.0)
@@ -152,8 +183,9 @@ def steering_of(
                 "Fix: guess=lambda t: q, a path along which the motion could go; elements=32."
             )
     return Steering(
-        plan, trajectory, solved.cost, change, defects, system, params, t_b, status, success, iterations, layout.count
-    )
+        plan, trajectory, solved.cost, accuracy.change, defects, system, params, t_b, status, success, iterations,
+        layout.count, tried,
+    )  # fmt: skip
 
 
 def _integrated(

@@ -10,8 +10,8 @@ S = Y X⁻¹ for solutions of Hamilton's equations of the deviations, which are 
     Ẋ = (A - B R⁻¹ Nᵀ) X - B R⁻¹ Bᵀ Y,    Ẏ = -(Q - N R⁻¹ Nᵀ) X - (A - B R⁻¹ Nᵀ)ᵀ Y
 
 They are solved by Gauss's collocation, of order 2s for s points, from each element's end, X = 1, Y = S, to its start.
-Constraints need nothing more: what they allow is kept by the accelerations that A and B are derivatives of, and so the
-other directions do not enter.
+What constraints allow is kept by the accelerations that A and B are derivatives of, and so the other directions do not
+enter; the weights have what a deviation bends by on them (`linear_quadratic.py`).
 
 Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.3; Hairer, Lubich & Wanner, *Geometric Numerical
 Integration*, §II.1.3 (Gauss's collocation).
@@ -31,7 +31,7 @@ from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled
 from lagjax.system import OF_STATE, Call, coordinates, traced_call
 from lagjax.two_points.elements import Rule, integrals, rule_of_degree
-from lagjax.two_points.linear_quadratic import check_weights, linear
+from lagjax.two_points.linear_quadratic import bent, check_weights, linear
 from lagjax.two_points.plan import Plan, plan_of
 from lagjax.two_points.question import Controlled, check_number, velocity_name
 
@@ -96,7 +96,7 @@ def about_trajectory(
     """The regulator about a motion, on elements halved until S at its start no longer changes."""
     names = coordinates.names(given.state.q)
     names = (*names, *(velocity_name(name) for name in names))
-    end = _end_weights(given, trajectory, end_cost)
+    end = _end_weights(given, controls, trajectory, end_cost)
     first, last = float(trajectory.t[0]), float(trajectory.end.t)
     knots = np.unique(np.clip([first, *np.asarray(getattr(controls, "knots", ())), last], first, last))
     knots = _divided(knots, max(1, -(-FIRST // (len(knots) - 1))))
@@ -196,12 +196,26 @@ def _derivatives(given: Controlled, cost: Callable, t: Array, x: Array, u: Array
     return jax.vmap(at)(t, x, u, w)
 
 
-def _end_weights(given: Controlled, trajectory: Trajectory, end_cost: Callable | None) -> np.ndarray:
+def _end_weights(
+    given: Controlled, controls: Callable, trajectory: Trajectory, end_cost: Callable | None
+) -> np.ndarray:
     """F."""
-    n, end, p = given.form.n, trajectory.end, given.state.params
+    n, end = given.form.n, trajectory.end
     if end_cost is None:
         return np.zeros((2 * n, 2 * n))
     call = traced_call(Call("end_cost", end_cost, OF_STATE), given.state._asdict(), check_number)
     y = jnp.concatenate([coordinates.flatten(end.q)[0], coordinates.flatten(end.v)[0]])
-    form = given.form
-    return np.asarray(jax.jit(jax.hessian(lambda y: call(end.t, form.tree(y[:n]), form.tree(y[n:]), p)))(y)) / 2
+    w = jnp.asarray(coordinates.vector(controls(end.t)))
+    now = eqx.tree_at(lambda given: given.state.t, given, jnp.asarray(end.t))
+    return np.asarray(_of_end(now, call, y, w)) / 2
+
+
+@compiled
+def _of_end(given: Controlled, cost: Callable, y: Array, w: Array) -> Float[Array, "m m"]:
+    form, s, n = given.form, given.state, given.form.n
+
+    def of_state(y: Array) -> Array:
+        return cost(s.t, form.tree(y[:n]), form.tree(y[n:]), s.params)
+
+    found = jax.hessian(of_state)(y)
+    return found + bent(given, y[:n], y[n:], w, jax.grad(of_state)(y)) if form.m else found

@@ -19,14 +19,16 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from lagjax.integrate import integrate
-from lagjax.jaxtools import compiled
+from lagjax.jaxtools import compiled, is_traced
 from lagjax.mechanics import accelerations_at
 from lagjax.numerics import dense
-from lagjax.system import Model, State, System, check_system, coordinates, prepare
+from lagjax.system import Model, State, System, check_system, constraints, coordinates, prepare
 from lagjax.two_points.elements import integrals, rule_of_degree
-from lagjax.two_points.geodesic import Geodesic, LineElement
+from lagjax.two_points.geodesic import Geodesic, of_metric, tolerance_in
 
 POINTS, ELEMENTS = 6, 64
+# So much of a vector may be across a constraint, and of a path off it, as parts of their sizes.
+OFF = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-4}
 
 
 def parallel_transport(
@@ -60,11 +62,13 @@ def parallel_transport(
 
     **Returns:** w at the end, like the coordinates; differentiable in both modes.
 
-    **Raises:** `TypeError`, `ValueError` for arguments of the wrong kind or shape.
+    **Raises:** `TypeError`, `ValueError` for arguments of the wrong kind or shape; a w that is not tangent to a
+    constraint, a path that leaves one; forces and velocity constraints. Under `jit` and `vmap` w at the end is NaN
+    where it is not tangent, or the path is off.
 
     Source: do Carmo, *Riemannian Geometry*, §2.2.
     """
-    system = metric if isinstance(metric, System) else System(LineElement(metric))
+    system = of_metric(metric)
     check_system(system, w, params, states=False)
     if not isinstance(path, Geodesic) and not callable(path):
         raise TypeError(
@@ -84,7 +88,7 @@ def parallel_transport(
     if isinstance(path, Geodesic):
         # The first output is the start.
         ts = np.concatenate([t_a[None], t])
-        motion = integrate(system, start, path.connection.start_velocity, s.params, ts=ts, rtol=1e-12)
+        motion = integrate(system, start, path.connection.start_velocity, s.params, ts=ts, rtol=tolerance_in(s))
         x, u = (jax.vmap(model.vector)(y)[1:] for y in (motion.q, motion.v))
     else:
 
@@ -92,7 +96,54 @@ def parallel_transport(
             return jax.jvp(lambda t: model.vector(coordinates.as_floats(path(t))), (t,), (jnp.ones_like(t),))
 
         x, u = jax.vmap(at)(t)
-    return model.tree(_carried(model, t, x, u, jnp.asarray(h, dtype), model.vector(s.v)))
+    w, x_a = model.vector(s.v), model.vector(s.q)
+    carried = _carried(model, t, x, u, jnp.asarray(h, dtype), w)
+    if not model.m:
+        return model.tree(carried)
+    bound = OFF.get(np.dtype(dtype), 1e-4)
+    across, away = _off(model, jnp.asarray(t_a, dtype), x_a, w, t, x)
+    if is_traced((across, away)):
+        well = jnp.all(across < bound) & jnp.all(away < bound)
+        return model.tree(jnp.where(well, carried, jnp.nan))
+    _check(model, np.asarray(across), np.asarray(away), t, bound)
+    return model.tree(carried)
+
+
+def _check(model: Model, across: np.ndarray, away: np.ndarray, t: np.ndarray, bound: float):
+    """Raise for a vector that is not tangent, and a path that leaves the constraints."""
+    worst = int(np.argmax(np.where(np.isfinite(across), across, np.inf)))
+    if not across[worst] < bound:
+        raise ValueError(
+            f"w is not tangent to the constraint '{model.equation_names[worst]}': {across[worst]:.3g} of it is not.\n"
+            "Usual cause: a vector in space that points off the surface.\n"
+            "Fix: _, w = lj.consistent_state(system, t_a, q, w, params), its part along the constraints."
+        )
+    at, worst = np.unravel_index(np.argmax(np.where(np.isfinite(away), away, np.inf)), away.shape)
+    if not away[at, worst] < bound:
+        raise ValueError(
+            f"the path is off the constraint '{model.equation_names[worst]}' at t = {float(t[at]):.6g}, by "
+            f"{away[at, worst]:.3g} of the distance from the origin.\n"
+            "Usual cause: a path beside the surface, as a straight line between two of its points.\n"
+            "Fix: path=lj.geodesic(system, a, b, params), or a function of t that stays on it."
+        )
+
+
+@compiled
+def _off(model: Model, t_a: Array, x_a: Float[Array, " n"], w: Array, t: Float[Array, " T"], x: Float[Array, "T n"]):
+    """How much of w is across each constraint (m,), and how far the path is from it (T, m), as parts of their sizes."""
+
+    def rows(t: Array, x: Array) -> tuple[Array, Array]:
+        slope = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
+        return slope, jnp.sqrt(jnp.sum(slope**2, axis=1))
+
+    def away(t: Array, x: Array) -> Array:
+        return jnp.abs(constraints.position_residual(model, t, x)) / (rows(t, x)[1] * largest)
+
+    largest = jnp.maximum(jnp.max(jnp.abs(x)), jnp.finfo(x.dtype).tiny)
+    slope, size = rows(t_a, x_a)
+    length = jnp.sqrt(jnp.sum(w**2))
+    across = jnp.abs(slope @ w) / (size * jnp.where(length > 0, length, 1.0))
+    return across, jax.vmap(away)(t, x)
 
 
 @compiled

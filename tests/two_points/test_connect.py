@@ -4,8 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ellipe, ellipkm1
 
 import lagjax as lj
+from lagjax.two_points.answer import is_same
+from lagjax.two_points.result import Connection
 
 PARAMS = {"g": 9.81, "k": 0.3}
 thrown = lj.System(
@@ -110,3 +113,76 @@ def test_refused_constraints():
         lj.connect(
             lj.System(lambda t, q, v, params: 0.5 * v @ v, rod), np.array([1.0, 0.0]), np.array([1.0, 1.0]), 0.0, 1.0
         )
+
+
+swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
+
+
+@pytest.mark.exhaustive
+def test_over_the_top():
+    """A pendulum that swings once from 0 to 0 in 20, to within 4e-4 of its top: the start speed and the action of the
+    elliptic integrals, and the trajectory that is returned ends there. Twin: in 40 errors grow by 1e15, so that the
+    path is all that there is, which is said: not converged, no trajectory."""
+    found = lj.connect(swing, 0.0, 0.0, 0.0, 20.0, starts=lambda t: 3.14 * jnp.sqrt(jnp.sin(jnp.pi * t / 20)))
+    # 2 K(k) = 20 by Newton's method from k' = 4 exp(-10); S = 8 E - 2 K - 4 k'² K.
+    beside = 4 * np.exp(-10.0)
+    for _ in range(3):
+        beside *= np.exp(ellipkm1(beside**2) - 10)
+    speed, action = 2 * np.sqrt(1 - beside**2), 8 * ellipe(1 - beside**2) - 20 - 40 * beside**2
+    assert bool(found.converged) and found.kind == "minimum" and found.missed < 1e-6
+    assert abs(abs(found.start_velocity) - speed) < 1e-12 and abs(found.action - action) < 1e-10
+    assert found.trajectory is not None and abs(found.trajectory.q[-1]) < 1e-6
+    with pytest.warns(lj.ConnectWarning, match="a path was found .* and no motion that follows it: motions from its"):
+        longer = lj.connect(swing, 0.0, 0.0, 0.0, 40.0, starts=lambda t: 3.14 * jnp.sqrt(jnp.sin(jnp.pi * t / 40)))
+    assert not bool(longer.converged) and longer.trajectory is None and longer.kind.startswith("a path alone: motions")
+    assert abs(longer.action + 32) < 1e-9 and abs(abs(longer.start_velocity) - 2) < 1e-9
+
+
+@pytest.mark.exhaustive
+def test_ways_down():
+    """From rest, a saddle of index six, the swing of least action is found on both sides.
+
+    Twin: the line alone is rest.
+    """
+    found = lj.connect(swing, 0.0, 0.0, 0.0, 20.0, starts=2)
+    assert abs(found.action + 12.0000000659569) < 1e-9 and found.kind == "minimum"
+    assert found.start_velocity * found.others[0].start_velocity < 0 and found.others[0].kind == "minimum"
+    rest = lj.connect(swing, 0.0, 0.0, 0.0, 20.0)
+    assert rest.kind == "saddle of index 6" and abs(rest.action - 20) < 1e-12
+
+
+def handed_out(**changes):
+    """A connection by hand."""
+    zero, numbers = np.zeros(()), {"action": np.ones(()), "index": np.zeros((), int), "amplification": np.ones(())}
+    fields = {
+        "t": np.linspace(0.0, 1.0, 3), "q": np.linspace(0.0, 1.0, 3), "v": np.ones(3), "multipliers": {},
+        "trajectory": None, "start_velocity": zero + 1, "end_velocity": zero + 1, "duration": zero + 1,
+        "missed": zero, "mesh_error": zero, "converged": np.asarray(True), "conjugate_times": None,
+    }  # fmt: skip
+    return Connection(**{**fields, **numbers, **changes})
+
+
+@pytest.mark.parametrize(
+    "changes, kind",
+    [
+        ({}, "minimum"),
+        ({"index": np.array(2)}, "saddle of index 2"),
+        ({"converged": np.array(False)}, "not found"),
+        ({"converged": np.array(False), "why_not_variational": "there is a force"}, "not found"),
+        ({"converged": np.array(False), "alone": "motions miss the end"}, "a path alone: motions miss the end"),
+        ({"mesh_error": np.array(1e-3)}, "not resolved: the elements follow the path to 1e-03"),
+        ({"amplification": np.array(1e14)}, "degenerate: ends are conjugate"),
+    ],
+)
+def test_kinds(changes, kind):
+    """What is said of an answer is decided by what it holds."""
+    assert handed_out(**changes).kind == kind
+
+
+def test_the_same_answer():
+    """Answers are the same that start alike and stay together. Twins: another start; alike at first, and then apart."""
+    one = handed_out()
+    assert is_same(one, handed_out(start_velocity=np.array(1 + 1e-9)))
+    assert not is_same(one, handed_out(start_velocity=np.array(1 + 1e-3)))
+    assert not is_same(one, handed_out(q=np.array([0.0, 0.7, 1.0])))
+    assert not is_same(one, handed_out(v=np.array([1.0, 1.0, -1.0])))

@@ -6,6 +6,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.two_points import mesh, optimal_control
+from lagjax.two_points.first_plan import split_controls
+from lagjax.two_points.steering import Accuracy
 
 cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
 
@@ -174,10 +176,13 @@ def test_questions_that_are_wrong():
         ({"end": (jnp.zeros(2), 0.0)}, "the start has"),
         ({"elements": 0}, "elements=0 must be a whole number of at least 1"),
         ({"interpolation": "cubic"}, "'smooth', 'linear' and 'constant'"),
+        ({"starts": 0}, "starts=0 must be a whole number of at least 1"),
         ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
     ):
         with pytest.raises(ValueError, match=words):
             pushed(**options)
+    with pytest.raises(TypeError, match="guess is a function of t or an earlier Steering, not dict"):
+        pushed(guess={"q": 1.0})
     with pytest.raises(TypeError, match="neither q nor v"):
         pushed(start=(None, None))
     with pytest.raises(ValueError, match="nothing in the system reads the control 'brake'"):
@@ -188,6 +193,86 @@ def test_questions_that_are_wrong():
                      force=lambda t, q, v, p: p["push"] * q)  # fmt: skip
     with pytest.raises(ValueError, match="the start is off the constraint 'ring' by 3"):
         lj.steer(ring, {"push": 0.0}, (jnp.array([2.0, 0.0]), jnp.zeros(2)), (None, None), energy, t_b=1.0)
+
+
+@pytest.mark.slow
+def test_guesses_in_time_and_earlier_answers():
+    """From controls in time, as a function, as times and values and as a plan, and from an earlier answer to another
+    end in another time, the least cost is that of the closed form, 12 x² / T³, and nearer answers take fewer steps."""
+    found = pushed()
+    in_time = ({"push": lambda t: 6 - 12 * t}, {"push": (np.array([0.0, 1.0]), np.array([6.0, -6.0]))}, found.controls)
+    for controls in in_time:
+        again = lj.steer(cart, controls, (0.0, 0.0), (1.0, 0.0), energy, t_b=1.0, guess=lambda t: 3 * t**2 - 2 * t**3)
+        assert abs(again.cost - 12) < 1e-9 and again.iterations <= found.iterations
+    farther = pushed(end=(2.0, 0.0), t_b=1.5, guess=found)
+    assert abs(farther.cost - 12 * 4 / 1.5**3) < 1e-8 and farther.tried.startswith("the earlier answer: cost")
+    several = pushed(starts=3)
+    assert abs(several.cost - 12) < 1e-9 and several.tried.count("cost 12") == 3 and "random start 2" in repr(several)
+
+
+@pytest.mark.slow
+def test_a_tolerance_that_was_not_reached():
+    """Bryson and Denham's problem at a bound of 0.01, least 8 / 9 l: on 64 elements it is off by more than `tol`, which
+    the status says. Twin: a tolerance that was reached is not spoken of."""
+    given = {"start": (0.0, 1.0), "end": (0.0, -1.0), "bounds": {"q": (-jnp.inf, 0.01)}}
+    found = pushed(**given)
+    assert abs(found.cost / (8 / 9 / 0.01) - 1) > 1e-6 and found.success
+    assert "tol=1e-06 was not reached: the cost changed by" in found.status and found.status in repr(found)
+    assert pushed(**given, tol=0.1).status == "least cost near the guess found"
+    assert "on one mesh alone" in pushed(elements=2, most=2).status
+
+
+@pytest.mark.exhaustive
+def test_waiting_is_free():
+    """A cart-pole swung up at least effort, at rest at both ends: of eight starts the least in 4 s costs no more than
+    that in 3 s. Twin: from the straight line alone it does."""
+
+    def light_cart(t, q, v, p):
+        kinetic = 0.6 * v["x"] ** 2 + 0.1 * v["x"] * v["th"] * jnp.cos(q["th"]) + 0.025 * v["th"] ** 2
+        return kinetic + 0.981 * jnp.cos(q["th"])
+
+    system = lj.System(light_cart, force=lambda t, q, v, p: {"x": p["push"], "th": 0.0})
+    rest, up = {"x": 0.0, "th": 0.0}, {"x": 0.0, "th": jnp.pi}
+    bounds = {"push": (-10.0, 10.0), "x": (-1.0, 1.0)}
+
+    def swung(end, **options):
+        return lj.steer(
+            system, {"push": 0.0}, (rest, rest), (up, rest), energy, t_b=end, bounds=bounds, **options
+        )  # fmt: skip
+
+    shorter, line, best = swung(3.0), swung(4.0), swung(4.0, starts=8)
+    assert best.cost < shorter.cost < line.cost and best.defect < 1e-4
+    assert swung(4.0, guess=shorter).cost < shorter.cost
+
+
+def test_guesses_of_controls():
+    """Numbers stay numbers; functions and pairs are known at all times; what is no pair is refused in words."""
+    constant, in_time = split_controls({"push": 1.0}, 0.0)
+    assert constant == {"push": 1.0} and in_time is None
+    pair = np.array([0.0, 2.0]), np.array([[0.0, 1.0], [4.0, 1.0]])
+    constant, in_time = split_controls({"push": lambda t: 3 * t, "turn": pair, "held": 5.0}, 0.5)
+    assert in_time is not None and constant["push"] == 1.5 and constant["held"] == 5.0
+    np.testing.assert_allclose(in_time(1.5)["turn"], [3.0, 1.0])
+    assert in_time(1.0)["push"] == 3.0
+    with pytest.raises(
+        ValueError, match=r"the guess of the control 'push' is a pair of \(2,\) times and \(3,\) values"
+    ):
+        split_controls({"push": (np.array([0.0, 1.0]), np.zeros(3))}, 0.0)
+
+
+@pytest.mark.parametrize(
+    "accuracy, words",
+    [
+        ((1e-9, True, 1e-6), ""),
+        ((2e-3, False, 1e-6), "; tol=1e-06 was not reached: the cost changed by 1.0e-03 of it on the last elements"),
+        ((np.inf, False, 1e-6), "; on one mesh alone"),
+    ],
+)
+def test_what_is_said_of_a_tolerance(accuracy, words):
+    """By the change of a cost of two."""
+    assert Accuracy(*accuracy).in_words(2.0).startswith(words) and bool(words) == bool(
+        Accuracy(*accuracy).in_words(2.0)
+    )
 
 
 def test_meshes():

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_are
 
 import lagjax as lj
 
@@ -97,3 +98,26 @@ def test_an_upright_pole():
     assert abs(spent / (one.cost_to_go[0, 0] * 1e-6) - 1) < 1e-3 and abs(motion.q["angle"][-1]) < 1e-6
     fallen = lj.integrate(angle, lean, zero, {**cart, "push": 0.0}, ts=[0.0, 3.0])
     assert abs(fallen.q["angle"][-1]) > 1.0
+
+
+@pytest.mark.slow
+def test_a_cost_that_slopes_across_a_constraint():
+    """A pendulum on a rod, hanging and upright, with 10 (1 ∓ y): on the rod that is 10 (1 - cos), whose curvature the
+    second derivatives in the plane lack. Gains are those of the angle, by SciPy. Twin: without it they are others."""
+    rod = lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1)
+    pendulum = lj.System(
+        lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 9.81 * q["y"],
+        {"rod": rod},
+        force=lambda t, q, v, p: {"x": -q["y"] * p["u"], "y": q["x"] * p["u"]},
+    )
+    for sign, y in ((1, -1.0), (-1, 1.0)):
+        at = {"x": 0.0, "y": y}, {"x": 0.0, "y": 0.0}
+        found = lj.lqr(
+            pendulum, {"u": 0.0}, at,
+            lambda t, q, v, u, p, sign=sign: 10 * (1 + sign * q["y"]) + v["x"] ** 2 + v["y"] ** 2 + u["u"] ** 2,
+        )  # fmt: skip
+        assert isinstance(found, lj.LQR)
+        a, b = np.array([[0.0, 1.0], [-sign * 9.81, 0.0]]), np.array([[0.0], [1.0]])
+        s, bare = (solve_continuous_are(a, b, np.diag([w, 1.0]), np.eye(1)) for w in (5.0, 0.0))
+        np.testing.assert_allclose(np.abs(found.gain[0, [0, 2]]), s[1], rtol=1e-9)
+        assert np.max(np.abs(s[1] - bare[1])) > 0.03

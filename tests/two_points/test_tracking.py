@@ -76,8 +76,9 @@ def test_riccati():
 
 @pytest.mark.exhaustive
 def test_on_a_constraint():
-    """A point that turns on a circle, by its angle and by its place on a rod: with |q|² + |v|², which is (1 + Ω²) δθ² +
-    δω² along the circle, the pushes and the cost to go are the same. Twin: without Ω² they are others."""
+    """A point that turns on a circle, by its angle and by its place on a rod: |q|² + |v|² + 3 (1 + y), which is
+    1 + ω² + 3 (1 + sin θ) on the circle, has the same pushes and cost to go, and so has y as an end's cost. Twin:
+    with the second derivatives of |q|² in the plane they are others."""
     turn, ts = 1.5, np.linspace(0.0, 2.0, 9)
     angle = lj.System(lambda t, q, v, p: 0.5 * v**2, force=lambda t, q, v, p: p["push"] + 0.0 * v)
     rod = lj.System(
@@ -94,15 +95,22 @@ def test_on_a_constraint():
         return {"push": 0.0}
 
     one, bare = (
-        lj.lqr(angle, none, by_angle, lambda t, q, v, u, p, w=w: w * q**2 + v**2 + u["push"] ** 2)
-        for w in (1 + turn**2, 1.0)
-    )
-    other = lj.lqr(rod, none, by_place, lambda t, q, v, u, p: q @ q + v @ v + u["push"] ** 2)
+        lj.lqr(
+            angle, none, by_angle,
+            lambda t, q, v, u, p, w=w: w * q**2 + v**2 + 3 * (1 + jnp.sin(q)) + u["push"] ** 2,
+            end_cost=lambda t, q, v, p: -jnp.sin(q),
+        )
+        for w in (0.0, 1.0)
+    )  # fmt: skip
+    other = lj.lqr(
+        rod, none, by_place, lambda t, q, v, u, p: q @ q + v @ v + 3 * (1 + q[1]) + u["push"] ** 2,
+        end_cost=lambda t, q, v, p: -q[1],
+    )  # fmt: skip
     for t in (0.0, 0.7):
         along, out = np.array([-np.sin(turn * t), np.cos(turn * t)]), np.array([np.cos(turn * t), np.sin(turn * t)])
         # The columns: a turned place, with the velocity that turns with it, and a faster turn.
         moved = np.stack([np.concatenate([along, -turn * out]), np.concatenate([np.zeros(2), along])], axis=1)
-        np.testing.assert_allclose(other.gain(t) @ moved, one.gain(t), atol=1e-7)
+        np.testing.assert_allclose(other.gain(t) @ moved, one.gain(t), atol=1e-6)
         if not t:
             np.testing.assert_allclose(moved.T @ other.cost_to_go @ moved, one.cost_to_go, atol=1e-10)
     assert np.max(np.abs(one.gain(0.0) - bare.gain(0.0))) > 0.1
