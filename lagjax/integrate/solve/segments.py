@@ -99,9 +99,9 @@ class Phase(NamedTuple):
         """Whether legs end at instants of sampled controls, too."""
         return self.meeting is not None and bool(self.meeting.laws.sampled)
 
-    def with_tolerance(self, rtol: Float[Array, ""]) -> "Phase":
-        """The same in a motion of this tolerance."""
-        return self if self.meeting is None else self._replace(meeting=self.meeting.with_tolerance(rtol))
+    def in_motion(self, *motion: Any) -> "Phase":
+        """The same in a motion of this tolerance, over these times from this start (`Meeting.in_motion`)."""
+        return self if self.meeting is None else self._replace(meeting=self.meeting.in_motion(*motion))
 
     def until(self, modes: "Modes | None", ts: Array, params: PyTree) -> Float[Array, ""]:
         """The next instant."""
@@ -160,7 +160,7 @@ def solved_in_legs(
     hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases, settings: Settings, adjoint: Any
 ):
     """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
-    phases = [phase.with_tolerance(settings.rtol[0]) for phase in phases]
+    phases = [phase.in_motion(settings.rtol[0], ts, q0, v0, params) for phase in phases]
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
     def next_legs(way: PhaseWay) -> PhaseWay:
@@ -268,7 +268,10 @@ def _leg(
     # Lanes in other phases stand still.
     times = jnp.where(in_phase, jnp.minimum(ahead, until), way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
-    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
+    forced = None if phase.meeting is None else phase.meeting.forced
+    found = apart(
+        solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far, forced
+    )
     result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
     after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
     rows, known = {name: found[name] for name in ROWS}, (ts > way.t) & (ts <= end.t)

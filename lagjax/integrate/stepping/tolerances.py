@@ -11,6 +11,9 @@ all there is at rest when a force sets in. To this is added only the round-off f
 plane leaves the third dimension at round-off, which no step can follow. Sizes are compared as √M_ii q_i and √M_ii v_i,
 which have the same unit for all coordinates. If everything is zero at the start, the size is a part of what the
 acceleration there yields in the whole time, or, if that is zero too, the acceleration of the step.
+
+Where forces a and -a cancel, as those of contacts do at rest, ε a is left: a step of length h makes velocities ε a h of
+it, and ways ε a h², whatever the sizes are. `Forced` are such a.
 """
 
 from collections.abc import Callable
@@ -49,6 +52,22 @@ class Tolerances(NamedTuple):
     atol: Float[Array, " 2"]
 
 
+class Forced(NamedTuple):
+    """The accelerations, of forces that may cancel, at times over the motion."""
+
+    t: Float[Array, " K"]
+    a: Float[Array, "K n"]
+
+    def near(self, t: Float[Array, ""]) -> Float[Array, " n"]:
+        """The larger ones of the times beside t: a force that passes zero is none for an instant only."""
+        at = jnp.clip(jnp.searchsorted(self.t, t, side="right"), 1, self.t.size - 1)
+        return jnp.maximum(self.a[at - 1], self.a[at])
+
+    def left_over(self, a: Float[Array, " n"], h: Float[Array, ""]) -> Float[Array, "2 n"]:
+        """What the round-off of accelerations makes of coordinates and velocities in a time h."""
+        return rounding(a * jnp.stack([h**2, h])[:, None])
+
+
 class Scales(NamedTuple):
     """The size of a motion as told by its start; rows are coordinates and velocities.
 
@@ -56,6 +75,7 @@ class Scales(NamedTuple):
     - `reach`: the largest of √M_ii times the numbers.
     - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
     - `unknown`: whether all of this is zero, since nothing accelerates at the start either.
+    - `forced`: the accelerations of forces that cancel, where they are known.
     """
 
     root_mass: Float[Array, "1 n"]
@@ -64,9 +84,12 @@ class Scales(NamedTuple):
     time: Float[Array, ""]
     first: Float[Array, "2 n"]
     unknown: Bool[Array, ""]
+    forced: Forced | None = None
 
 
-def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=None) -> Tolerances:
+def tolerances_at(
+    start, ts: Array, settings: Settings, sizes_so_far=None, a=None, forced: Forced | None = None
+) -> Tolerances:
     """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
@@ -78,7 +101,10 @@ def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=Non
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
-    return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
+    atol = settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])
+    if forced is not None:
+        atol = atol + jnp.max(forced.left_over(jnp.max(forced.a, axis=0), span), axis=1)
+    return Tolerances(settings.rtol, stop_gradient(atol))
 
 
 def span_of(ts: Array):
@@ -192,7 +218,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
     ):  # fmt: skip
         """Whether to keep a step, and the next one."""
         state, largest = controller_state
-        weighed, now = self._weighed(t1 - t0, y0, y1_candidate, y_error, largest)
+        weighed, now = self._weighed(t0, t1, y0, y1_candidate, y_error, largest)
         keep, *rest, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, weighed, error_order, state
         )
@@ -201,10 +227,10 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _weighed(self, h: Array, y0: PyTree, y1: PyTree, error, largest):
+    def _weighed(self, t0: Array, t1: Array, y0: PyTree, y1: PyTree, error, largest):
         """The error in the controller's units, and the largest numbers including this step."""
         error, unravel = ravel_pytree(error)
-        before, after, h = stop_gradient((_rows(*y0), _rows(*y1), h))
+        before, after, t0, h = stop_gradient((_rows(*y0), _rows(*y1), t0, t1 - t0))
         size = jnp.maximum(jnp.abs(before), jnp.abs(after))
         if largest is None:
             allowed = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._capped_angles(size)
@@ -212,6 +238,8 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         else:
             now = jnp.maximum(size, largest)
             allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
+            if (forced := self.scales.forced) is not None:
+                allowed = allowed + forced.left_over(forced.near(t0), h)
         # Where nothing is allowed nothing may be off: zero stays zero.
         weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)
         return unravel(error * weights.ravel()), now

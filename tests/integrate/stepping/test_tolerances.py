@@ -111,7 +111,7 @@ def weighed(size, error, mass, sizes_so_far):
     scales = scales_of(mass, *size, jnp.zeros(2), 1.0)
     largest = jnp.maximum(scales.first, sizes_so_far)
     weighing = PerCoordinateTolerance(pid, Tolerances(both, both), scales._replace(first=largest), (False, False))
-    found, _ = weighing._weighed(jnp.asarray(1.0), (*size,), (*size,), (*error,), largest)
+    found, _ = weighing._weighed(jnp.asarray(0.0), jnp.asarray(1.0), (*size,), (*size,), (*error,), largest)
     return jnp.stack(found).reshape(2, 2) / (1e-9 * (1 + jnp.abs(size)))
 
 
