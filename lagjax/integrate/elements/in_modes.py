@@ -82,16 +82,18 @@ class WithElements(eqx.Module):
 class OneGuard(eqx.Module):
     """The guards of all modes as one: the least of them, each in units of its slack.
 
-    Guards are followed one by one, so that many of them would take long to compile.
+    Guards are followed one by one, so that many of them would take long to compile. One that rests, at zero within half
+    of its slack, is far from its end: else the least of all would be that, until another one is as near to zero.
     """
 
     laws: Laws
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        slack = self.laws.slack(given)
+        slack, last = self.laws.slack(given), self.laws.last(t, q, v, multipliers, given)
         size = jnp.where(slack > 0, slack, 1.0)
-        return jnp.min((self.laws.last(t, q, v, multipliers, given) + slack) / size)
+        far = 1 / jnp.finfo(last.dtype).eps
+        return jnp.min(jnp.where(self.laws.rests(last, given), far, (last + slack) / size))
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:

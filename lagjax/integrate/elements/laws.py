@@ -258,12 +258,21 @@ class Laws(eqx.Module):
             holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
             slack = given.slack[slice(*law.at)]
             slides = law.speeds(slips) - 2 * slack if law.plane else mode * slips
-            rests = lengths(slack, law.partners) - lengths(slips, law.partners)
-            moves = jnp.where(mode == FREE, 2.0, jnp.where(mode == LEANS, rests, slides))
+            slow, far = lengths(slack, law.partners), 1 / jnp.finfo(t.dtype).eps
+            rests = slow - lengths(slips, law.partners)
+            rests = jnp.where(rests > slow / 2, far, rests)
+            moves = jnp.where(mode == FREE, far, jnp.where(mode == LEANS, rests, slides))
             found.append(jnp.where(mode == STICKS, holds, moves))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
+
+    def rests(self, last: Float[Array, " k"], given: InModes) -> Bool[Array, " k"]:
+        """Which guards are zero within round-off, by half of their slack, and so far from the end of their modes."""
+        slack, (normals, slips) = self.slack(given), self.count
+        in_planes = jnp.zeros(self.guarded, bool).at[normals : normals + slips].set(self.in_planes)
+        slides = in_planes & (given.modes[: self.guarded] == 1)
+        return (jnp.abs(last) <= slack / 2) & (slack > 0) & ~slides
 
     def slack(self, given: InModes) -> Float[Array, " k"]:
         """How far below zero the guard of each mode may be: its slack, or the size of that where it is a vector."""

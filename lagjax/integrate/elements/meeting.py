@@ -305,7 +305,7 @@ class Meeting(eqx.Module):
         # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
         slid = (jnp.abs(modes) == 1).at[:normals].set(False)
         before = jnp.where(slid, STILL_BELOW / CLOSED_BELOW * slack, 0.0)
-        # What was held is still; and what slides, where its guard ends that, as near to zero as the time of that is known.
+        # What was held is still; and what slides, where its guard ends that, as near to zero as its time is known.
         still = laws.holds(modes) | slid & fired & ~self._in_planes
         reached = jnp.where(still, 2 * jnp.abs(self._velocities(at)), 0.0)
         velocity = jnp.maximum(jnp.maximum(_round_offs(STILL_BELOW, scale[:, 1]), before), reached)

@@ -172,9 +172,9 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
     first_order = equations.model.form.first_order
     without_mass = np.zeros(equations.model.n, bool) if first_order is None else first_order.mask(equations.model.n)
     at_start = mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))
-    scales = scales_of(*at_start, without_mass & ~without_mass.all()) if settings.by_size else None
+    scales = scales_of(*at_start, without_mass & ~without_mass.all(), forced) if settings.by_size else None
     if scales is not None and sizes_so_far is not None:
-        scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far), forced=forced)
+        scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps
     lengths = [settings.max_step, *([] if settings.dt0 is None else [settings.dt0])]
     against = {

@@ -41,6 +41,8 @@ FIRST = 0.1
 LIGHT = 1e-6
 # A coordinate at rest at zero counts as at least this part of the extent of all others when a force sets in.
 OF_OTHERS = 1e-6
+# A motion starts at rest below so many round-offs of its forces: guards of contacts end modes at hundreds of them.
+AT_REST = 1e3
 # For a start from zero: parts of the coordinates and velocities that its acceleration yields in the whole time.
 FROM_NOTHING = 1e-6, 1e-3
 
@@ -112,7 +114,9 @@ def span_of(ts: Array):
     return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
-def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np.bool = np.False_) -> Scales:
+def scales_of(
+    mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np.bool = np.False_, forced: Forced | None = None
+) -> Scales:
     """The scales of a motion, from its first state and the accelerations there, which need not be finite.
 
     `without_mass` (n,): the coordinates of first order, in units of their own: they set no scale for others, and the
@@ -122,6 +126,11 @@ def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
         jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
     )
+    if forced is not None:
+        # What the round-off of forces that cancel makes in the whole time says nothing.
+        most = jnp.max(forced.a, axis=0)
+        least = jnp.concatenate([forced.left_over(most, span), rounding(most)[None]])
+        sizes = jnp.where(sizes <= AT_REST * least, 0.0, sizes)
     root_mass = jnp.where(without_mass, 0.0, root_mass)
     heaviest = jnp.max(root_mass)
     over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
@@ -138,7 +147,7 @@ def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np
     reach = jnp.stack([of_q, of_v])[:, None]
     least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
     first = jnp.where(nothing & ~without_mass, least, sizes[:2])
-    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
+    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0), forced)
 
 
 def shared(scales: Scales, sizes) -> Float[Array, "2 n"]:
