@@ -66,6 +66,7 @@ class ContactProblem(NamedTuple):
     - `slides` (k_T,): 1 or -1 where the sliding is given, or in a plane its direction, and with it λ_T = -slides μ N;
       else 0.
     - `partners` (k_T,): for each tangential force the other component of its plane; itself, along a line.
+    - `both` (k_T,): whether the normal force presses from both sides: then it counts by its size.
     """
 
     matrix: Float[Array, "k k"]
@@ -76,6 +77,7 @@ class ContactProblem(NamedTuple):
     coefficient: Float[Array, " kT"]
     slides: Float[Array, " kT"]
     partners: np.ndarray
+    both: np.ndarray | bool = False
 
     @property
     def given(self) -> Bool[Array, " kT"]:
@@ -94,7 +96,7 @@ class ContactProblem(NamedTuple):
         count = self.may_push.size
         z = forces - self.step * (self.matrix @ forces + self.free)
         normal = jnp.where(self.may_push, jnp.maximum(z[:count], 0.0), 0.0)
-        most = self.coefficient * jnp.maximum(self.normal_forces(jnp.concatenate([normal, forces[count:]])), 0.0)
+        most = self.most(jnp.concatenate([normal, forces[count:]]))
         size = lengths(z[count:], self.partners)
         within = z[count:] * jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0)
         return jnp.concatenate([normal, jnp.where(self.given, -self.slides * most, within)])
@@ -102,6 +104,16 @@ class ContactProblem(NamedTuple):
     def normal_forces(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
         """N of each tangential force."""
         return self.constant + self.of_forces @ forces
+
+    def most(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
+        """μ N of each tangential force, with |N| where that presses from both sides."""
+        found = self.normal_forces(forces)
+        return self.coefficient * jnp.where(self.both, jnp.abs(found), jnp.maximum(found, 0.0))
+
+    def on_sides_of(self, forces: Float[Array, " k"]) -> "ContactProblem":
+        """The same with normal forces above zero, where those of these forces are below."""
+        sign = jnp.where(self.both & (self.normal_forces(forces) < 0), -1.0, 1.0)
+        return self._replace(of_forces=sign[:, None] * self.of_forces, constant=sign * self.constant)
 
 
 class Forces(NamedTuple):
@@ -113,7 +125,7 @@ class Forces(NamedTuple):
 
 def solved(problem: ContactProblem) -> Forces:
     """The forces of contacts that are solved together; the first derivative is that of the solution's own case."""
-    still = stop_gradient(problem)._replace(partners=problem.partners)
+    still = stop_gradient(problem)._replace(partners=problem.partners, both=problem.both)
 
     def residual(problem: ContactProblem, forces: Array) -> Array:
         return forces - problem.projected(forces)

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.complementarity import directions
 from lagjax.integrate.elements.compliant import Compliant
-from lagjax.integrate.elements.laws import CLOSED, LEANS, STICKS, Laws, Tangent
+from lagjax.integrate.elements.laws import CLOSED, STICKS, Laws, Tangent
 from lagjax.integrate.elements.laws_of_elements import laws_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.system import (
@@ -29,6 +28,9 @@ from lagjax.system import (
     takes_of,
     traced_system,
 )
+
+# A guard that rests leaves that at so many slacks.
+RESTS_UP_TO = 1e3
 
 
 class Masked(eqx.Module):
@@ -66,24 +68,16 @@ class WithElements(eqx.Module):
         for law in self.compliant:
             forces[law.name], found[law.name] = law.push(t, q, v, given)
         for law in self.tangents:
-            mode = given.modes[slice(*law.at)]
-            side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
-            speed = law.speeds(slip) if law.plane else side * slip
-            side = side * slip / speed if law.plane else side
-            leans, pressed = mode == LEANS, law.normal_forces(t, q, v, forces, params)
-            mu = jnp.where(leans, law.sticking(speed, params), law.kinetic(speed, params))
-            held = directions(given.slack[slice(*law.at)].astype(t.dtype), law.partners)
-            against = jnp.where(leans, -held, side)
-            found[law.name] = back(-against * mu * pressed)[0]
+            found[law.name] = back(law.friction(t, q, slip, v, forces, given))[0]
         return found
 
 
 class OneGuard(eqx.Module):
     """The guards of all modes as one: the least of them, each in units of its slack.
 
-    Guards are followed one by one, so that many of them would take long to compile. One that rests, at zero within half
-    of its slack, is far from its end: else the least of all would be that, until another one is as near to zero.
+    Guards are followed one by one, so that many of them would take long to compile. One that rests at zero counts as
+    far from its end: else the least of all would be that, until another one is as near to zero.
     """
 
     laws: Laws
@@ -92,8 +86,10 @@ class OneGuard(eqx.Module):
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
         slack, last = self.laws.slack(given), self.laws.last(t, q, v, multipliers, given)
         size = jnp.where(slack > 0, slack, 1.0)
-        far = 1 / jnp.finfo(last.dtype).eps
-        return jnp.min(jnp.where(self.laws.rests(last, given), far, (last + slack) / size))
+        values = (last + slack) / size
+        # Smoothly, for those that begin to press.
+        away = 1 / (jnp.finfo(last.dtype).eps * (1 + (last / (RESTS_UP_TO * size)) ** 2))
+        return jnp.min(jnp.where(self.laws.rests(given) & (values > 0.5), values + away, values))
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:
@@ -117,6 +113,7 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
     force = WithElements(plain.force, tangents, compliant) if tangents or compliant else always.force
     masked = replace(always, constraints=constraints, force=force)
     guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
+    guarded += [law.side[1] for law in tangents if law.side]
     count = max(guarded, default=0) + len(sampled)
     # The order of the stacked equations is known only with their shapes.
     given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))

@@ -69,21 +69,27 @@ class AtMeeting(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws."""
+    """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws; `presses`: whether
+    normal forces that press from one side are above zero."""
 
     v: PyTree[Float[Array, "..."]]
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     found: Bool[Array, ""]
+    presses: Bool[Array, ""]
 
 
 class Decided(NamedTuple):
-    """Which modes follow from the forces; `onto`: the velocities that contacts get; NaN, what they have."""
+    """Which modes follow from the forces; `onto`: the velocities that contacts get; NaN, what they have; `sides`: those
+    from which normal forces press, with `of_sides`, the slack of these."""
 
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     onto: Float[Array, " k"]
     found: Bool[Array, ""]
+    presses: Bool[Array, ""]
+    sides: Int[Array, " ks"]
+    of_sides: Float[Array, " ks"]
 
 
 class Rows(NamedTuple):
@@ -175,7 +181,7 @@ class ContactForces(NamedTuple):
         It begins against its friction, or as nothing holds it.
         """
         problem, normals = self.problem, self.problem.may_push.size
-        most = problem.coefficient * jnp.maximum(problem.normal_forces(self.forces), 0.0)
+        most = problem.most(self.forces)
         # The force of friction is larger than its acceleration, and so says more about the direction.
         begins = directions(jnp.where(most > 0, -self.forces[normals:], self.a[normals:]), problem.partners)
         moves = lengths(self.a[normals:], problem.partners) > self.no_acceleration[normals:]
@@ -235,11 +241,11 @@ class Meeting(eqx.Module):
         at = at._replace(given=given)
         decided = self._decided(*stop_gradient((at, rows, contacts)))
         u = at.u + self._onto(at, rows, decided.onto) @ rows.response
-        after = self.laws.in_rows(given, decided.modes)
+        after = self.laws.in_rows(given, decided.modes, decided.sides)
         # The rates of states are those of the new velocities.
         u = resolved(at.model.of(after), t, at.x, u)
-        slack = jnp.concatenate([decided.slack, reach, jnp.zeros(len(self.laws.sampled), u.dtype)])
-        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found)
+        slack = jnp.concatenate([decided.slack, reach, decided.of_sides, jnp.zeros(len(self.laws.sampled), u.dtype)])
+        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found, decided.presses)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
         """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
@@ -297,7 +303,7 @@ class Meeting(eqx.Module):
         if self.forced is not None:
             forced, span = rows @ self.forced.near(t), self.forced.t[-1] - self.forced.t[0]
             drift = _round_offs(CLOSED_BELOW, rows @ jnp.max(self.forced.a, axis=0) * span**2)
-        modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, at.given.slack, fired))
+        modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, jnp.abs(at.given.slack), fired))
         gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
         closed = (modes == CLOSED)[:normals] | fired[:normals]
         zero = jnp.maximum(_round_offs(4 * CLOSED_BELOW, scale[:normals, 0]), slack[:normals])
@@ -392,7 +398,10 @@ class Meeting(eqx.Module):
         moving, resting = (self._coefficients(at, slips, sticking) for sticking in (False, True))
         mu = jnp.where(lengths(slides, self.laws.partners) > 0, moving, resting)
         free = rows.jacobian @ a - every.gamma[mine]
-        problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
+        both = np.concatenate(
+            [np.zeros(0, bool), *(np.full(law.at[1] - law.at[0], law.both) for law in self.laws.tangents)]
+        )
+        problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners, both)
         return problem, HeldRows(rows.jacobian, held, multipliers, rows.of_constraints)
 
     def _contact_forces(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> ContactForces:
@@ -407,7 +416,7 @@ class Meeting(eqx.Module):
         def solution(bound: AtBound, forces: Forces) -> ContactForces:
             no_force = _no_force(problem, forces.forces, contacts)
             least = part * no_force
-            least = jnp.where(let_go, LET_GO * at.given.slack[: let_go.size], least)
+            least = jnp.where(let_go, LET_GO * jnp.abs(at.given.slack[: let_go.size]), least)
             a = problem.matrix @ forces.forces + problem.free
             return ContactForces(problem, bound, forces.forces, a, no_force, least / problem.step, forces.found)
 
@@ -430,7 +439,8 @@ class Meeting(eqx.Module):
         """The modes after a meeting, by the forces at accelerations."""
         laws, (normals, _) = self.laws, self.laws.count
         if not laws.rows:
-            return Decided(at.given.modes[:0], at.u[:0], at.u[:0], jnp.asarray(True))
+            no_modes, nothing, yes = at.given.modes[:0], at.u[:0], jnp.asarray(True)
+            return Decided(no_modes, nothing, nothing, yes, yes, no_modes, nothing)
         solution = self._contact_forces(at, rows, contacts)
         sides = solution.sides()
         modes = self._modes(at, solution)
@@ -451,7 +461,18 @@ class Meeting(eqx.Module):
         nearest = jnp.where(solution.bound.lifted, contacts.gap + contacts.drift[:normals], contacts.gap)
         nearest = jnp.where(solution.problem.may_push, jnp.maximum(nearest, contacts.below), nearest)
         slack = jnp.where(holds, solution.no_force, jnp.concatenate([nearest, slowest]))
-        return Decided(modes, slack, jnp.where(holds, 0.0, onto), solution.found)
+        # By its sign, that a guard rests.
+        unloaded = holds[:normals] & (solution.forces[:normals] <= solution.no_force[:normals])
+        rests = jnp.concatenate([unloaded | solution.bound.lifted, jnp.zeros(holds.size - normals, bool)])
+        slack = jnp.where(rests, -slack, slack)
+        # Of each normal force, not of both components of a plane.
+        found, places = solution.problem.normal_forces(solution.forces), np.zeros(0, int)
+        places = np.concatenate([places, *(np.arange(*law.at, 1 + law.plane) - normals for law in laws.sided)])
+        both, pressed, of_sides = solution.problem.both[places], found[places], solution.no_force[normals:][places]
+        presses = jnp.all(both | (pressed >= -of_sides / 2))
+        sides = jnp.where(both & (pressed < 0), -1, 1).astype(modes.dtype)
+        onto = jnp.where(holds, 0.0, onto)
+        return Decided(modes, slack, onto, solution.found, presses, sides, of_sides)
 
     def _onto(self, at: AtMeeting, rows: Rows, wanted: Float[Array, " k"]) -> Float[Array, " k"]:
         """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""

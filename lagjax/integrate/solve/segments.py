@@ -222,7 +222,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     if phase.meeting is not None:
         q0, met = phase.meeting.first(ts[0], q0, v0, params)
         v0, modes = met.v, Modes(met.modes, met.slack)
-        multipliers = multipliers | phase.meeting.laws.forces(ts[0], q0, v0, phase.given(params, modes))
+        multipliers = multipliers | phase.meeting.laws.acting(ts[0], q0, v0, multipliers, phase.given(params, modes))
     of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
     rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
     switches = switches_before_any(hybrid, q0, v0, None if phase.meeting is None else phase.meeting.laws)
@@ -230,7 +230,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
     if met is not None:
-        exists, refused = met.found, RESULTS.no_contact_forces
+        exists, refused = met.found & met.presses, _obeyed(met, RESULTS.no_contact_forces)
     known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
     start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
@@ -276,8 +276,11 @@ def _leg(
     after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
     rows, known = {name: found[name] for name in ROWS}, (ts > way.t) & (ts <= end.t)
     if phase.meeting is not None:
-        forces = jax.vmap(partial(phase.meeting.laws.forces, given=params))
-        rows["multipliers"] = rows["multipliers"] | forces(times, rows["q"], rows["v"])
+        laws = phase.meeting.laws
+        every = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (times, *rows.values()), tuple(end))
+        acting = jax.vmap(partial(laws.acting, given=params))(*every)
+        rows["multipliers"] = rows["multipliers"] | {name: x[:-1] for name, x in acting.items()}
+        end = end._replace(multipliers=end.multipliers | {name: x[-1] for name, x in acting.items()})
     instant = in_phase & jnp.isfinite(until) & (result == RESULTS.successful)
     if phase.guards is not None and phase.switches or phase.has_instants:
         count, terminal = len(phase.switches), () if phase.guards is None else phase.guards.terminal
@@ -299,8 +302,8 @@ def _leg(
         end = where(invalid, Snapshot(way.t, way.q, way.v, unknown(end.multipliers)), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
         if after.found is not None:
-            result = RESULTS.where(onward & ~after.found, RESULTS.no_contact_forces, result)
-            onward = onward & after.found
+            result = RESULTS.where(onward, _obeyed(after, result), result)
+            onward = onward & after.found & after.presses
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[place], rows)
@@ -328,6 +331,12 @@ def _leg(
     )  # fmt: skip
     # Outputs and switches are those of before in the other lanes.
     return where(in_phase, further, way)._replace(rows=further.rows, switches=further.switches)
+
+
+def _obeyed(met: Any, otherwise: Any):
+    """The result of a meeting, of `Met` or `After`, in which a law is broken; `otherwise` if none is."""
+    result = RESULTS.where(met.found, otherwise, RESULTS.no_contact_forces)
+    return RESULTS.where(met.presses, result, RESULTS.normal_below_zero)
 
 
 class PhaseEnding(NamedTuple):
@@ -399,6 +408,7 @@ class After(NamedTuple):
     rests: Bool[Array, ""]
     modes: Modes | None = None
     found: Bool[Array, ""] | None = None
+    presses: Bool[Array, ""] | None = None
 
 
 def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array):
@@ -412,7 +422,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         sizes = jnp.maximum(sizes_so_far, sizes_of(end.q, end.v))
         q, met, number = phase.meeting(end, params, sizes, instant)
         first = jnp.zeros_like(first)
-        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
+        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found, met.presses)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
