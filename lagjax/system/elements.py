@@ -67,8 +67,9 @@ class Friction(eqx.Module):
         static: Callable | ArrayLike | None = None,
     ):
         _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
-        for role, number in (("coefficient", coefficient), ("static", static)):
-            _check_not_negative(role, number)
+        for role, number in (("coefficient", coefficient), ("static", static), ("normal", normal)):
+            if not isinstance(number, str):
+                _check_not_negative(role, number)
         self.sliding, self.coefficient, self.static = sliding, _number(coefficient), _number(static)
         self.normal = normal if isinstance(normal, str) else _number(normal)
 
@@ -125,7 +126,8 @@ class Contact(eqx.Module):
     ):
         _check_function("gap", gap, "(t, q, params)", 'q["y"]')
         _check_pair(friction, sliding)
-        for role, number in (("restitution", restitution), ("friction", friction), ("static", static)):
+        numbers = {"restitution": restitution, "friction": friction, "static": static, "slower_than": slower_than}
+        for role, number in numbers.items():
             _check_not_negative(role, number)
         self.gap, self.restitution, self.sliding = gap, _number(restitution), sliding
         self.friction, self.static = _number(friction), _number(static)
@@ -274,6 +276,8 @@ class SampledControl(eqx.Module):
     def __init__(self, controller: Callable, every: Callable | ArrayLike, offset: Callable | ArrayLike = 0.0):
         _check_function("controller", controller, "(t, q, v, params)", '-params["gain"] * v["x"]')
         _check_above_zero("every", every, "a rate, 1 / every, in place of the time between two instants")
+        if not (callable(offset) or isinstance(offset, Tracer) or np.all(np.isfinite(np.asarray(offset)))):
+            raise ValueError(f"offset = {offset} is no time.\nFix: offset=0.0, the first instant.")
         self.controller, self.every, self.offset = controller, _number(every), _number(offset)
 
     def __repr__(self):
@@ -393,11 +397,20 @@ def _check_above_zero(role: str, number, cause: str):
 def _check_not_negative(role: str, number):
     if number is None or callable(number) or isinstance(number, Tracer):
         return
-    if np.any(np.asarray(number) < 0):
+    given = np.asarray(number)
+    if np.any(np.isnan(given)):
+        raise ValueError(f"{role} = {number} is no number.\nUsual cause: a division by zero.\nFix: a number.")
+    if np.any(given < 0):
         raise ValueError(
             f"{role} = {number} is below zero.\n"
             "Usual cause: a sign that the law has already (friction acts against the sliding velocity by itself).\n"
-            f"Fix: {role}={abs(np.asarray(number))}."
+            f"Fix: {role}={abs(given)}."
+        )
+    if role == "restitution" and np.any(given > 1):
+        raise ValueError(
+            f"restitution = {number} is above 1: the impact would give energy.\n"
+            "Usual cause: the square of a speed in place of the speed, a percentage; a bumper that kicks.\n"
+            f"Fix: restitution={np.minimum(1 / given, 1.0)}; for a kick, lj.Hybrid with a reset."
         )
 
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.coefficients import coefficient
+from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
 from lagjax.integrate.elements.complementarity import directions, lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
@@ -265,6 +265,41 @@ class Laws(eqx.Module):
         rest = [PRESSED] * springs + [1] * self.two_sides + [0] * len(self.sampled)
         return {words: jnp.array([CLOSED] * gaps + [mode] * slips + rest, int) for words, mode in ALL_CLOSED.items()}
 
+    def numbers(self, t: Array, params: PyTree) -> list[tuple[str, Array, Array]]:
+        """Numbers that laws bound, and that depend on parameters alone: what each is, and whether it may be that.
+
+        Coefficients that depend on a speed are looked at where they are used (`Meeting.met`).
+        """
+        found = []
+
+        def bounded(role: str, law: Any, least: float = 0.0, most: float = np.inf, above: bool = False):
+            if law is None or callable(law) and takes_of_coefficient(law) != ("params",):
+                return
+            value = jnp.asarray(law(params) if callable(law) else law, t.dtype)
+            found.append((role, value, (value > least if above else value >= least) & (value <= most)))
+
+        for law in self.normals:
+            bounded(f"the restitution of '{law.name}'", law.restitution, most=at_most_one(t.dtype))
+            bounded(f"slower_than of '{law.name}'", law.slower_than)
+        for law in self.tangents:
+            bounded(f"the coefficient of '{law.name}'", law.coefficient)
+            bounded(f"the static coefficient of '{law.name}'", law.static)
+            if law.normal is not None and not callable(law.normal):
+                bounded(f"the normal force of '{law.name}'", law.normal)
+        for law in self.compliant:
+            bounded(f"the stiffness of '{law.name}'", law.stiffness, above=True)
+            bounded(f"the damping of '{law.name}'", law.damping)
+        for law in self.sampled:
+            largest = float(np.finfo(t.dtype).max)
+            bounded(f"every of '{law.name}'", law.every, most=largest, above=True)
+            bounded(f"offset of '{law.name}'", law.offset, -largest, largest)
+        return found
+
+    def allow(self, t: Array, params: PyTree) -> Bool[Array, ""]:
+        """Whether all `numbers` are what laws allow."""
+        found = [jnp.all(allowed) for _, _, allowed in self.numbers(t, params)]
+        return jnp.all(jnp.stack([jnp.asarray(True), *found]))
+
     def in_numbers(self, state: State) -> dict[str, Array]:
         """What the laws are besides the functions of the system, by role, at a state."""
         found = {}
@@ -366,7 +401,10 @@ class Laws(eqx.Module):
         # While JAX traces something else, numbers that it does not trace can still be counted.
         with jax.ensure_compile_time_eval():
             ends = jnp.asarray(ts[0]), jnp.asarray(ts[-1])
+            # What no clock has is refused at the start of the motion.
+            runs = [law.instant(1, ends[1], params) > law.instant(0, ends[1], params) for law in self.sampled]
             counted = [law.first(ends[1], params) - law.first(ends[0], params) for law in self.sampled]
+            counted = [jnp.where(ticks, count, 0) for ticks, count in zip(runs, counted)]
         return 0 if is_traced(counted) else sum(map(int, counted))
 
     def next_instant(self, modes: Int[Array, " k"], ts: Float[Array, " T"], params: PyTree) -> Float[Array, ""]:
@@ -380,6 +418,11 @@ class Laws(eqx.Module):
             t = t + stop_gradient(jnp.where(jnp.any(near), output - t, 0.0))
             found = jnp.where((t < ts[-1]) & (t < found), t, found)
         return found
+
+
+def at_most_one(dtype) -> float:
+    """The largest restitution, one but for round-off."""
+    return 1 + 64 * float(jnp.finfo(dtype).eps)
 
 
 def _places(at: tuple[int, int] | None) -> list[tuple[int, int]]:

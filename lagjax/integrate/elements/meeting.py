@@ -70,13 +70,14 @@ class AtMeeting(NamedTuple):
 
 class Met(NamedTuple):
     """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws; `presses`: whether
-    normal forces that press from one side are above zero."""
+    normal forces that press from one side are above zero; `allowed`: whether coefficients are what they may be."""
 
     v: PyTree[Float[Array, "..."]]
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     found: Bool[Array, ""]
     presses: Bool[Array, ""]
+    allowed: Bool[Array, ""]
 
 
 class Decided(NamedTuple):
@@ -88,6 +89,7 @@ class Decided(NamedTuple):
     onto: Float[Array, " k"]
     found: Bool[Array, ""]
     presses: Bool[Array, ""]
+    allowed: Bool[Array, ""]
     sides: Int[Array, " ks"]
     of_sides: Float[Array, " ks"]
 
@@ -235,8 +237,10 @@ class Meeting(eqx.Module):
         rows = self._rows(at)
         sizes = rows.sizes(sizes)
         contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes))
+        allowed = jnp.asarray(True)
         if impacts and self.laws.normals:
-            at = at._replace(u=at.u + self._struck(at, rows, contacts.closed).impulses() @ rows.response)
+            struck = self._struck(at, rows, contacts.closed)
+            at, allowed = at._replace(u=at.u + struck.impulses() @ rows.response), struck.allowed()
         given, reach = self.laws.pressed(*at.state[:3], given, fired, sizes)
         at = at._replace(given=given)
         decided = self._decided(*stop_gradient((at, rows, contacts)))
@@ -245,7 +249,8 @@ class Meeting(eqx.Module):
         # The rates of states are those of the new velocities.
         u = resolved(at.model.of(after), t, at.x, u)
         slack = jnp.concatenate([decided.slack, reach, decided.of_sides, jnp.zeros(len(self.laws.sampled), u.dtype)])
-        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found, decided.presses)
+        allowed = allowed & decided.allowed
+        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found, decided.presses, allowed)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
         """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
@@ -440,7 +445,7 @@ class Meeting(eqx.Module):
         laws, (normals, _) = self.laws, self.laws.count
         if not laws.rows:
             no_modes, nothing, yes = at.given.modes[:0], at.u[:0], jnp.asarray(True)
-            return Decided(no_modes, nothing, nothing, yes, yes, no_modes, nothing)
+            return Decided(no_modes, nothing, nothing, yes, yes, yes, no_modes, nothing)
         solution = self._contact_forces(at, rows, contacts)
         sides = solution.sides()
         modes = self._modes(at, solution)
@@ -472,7 +477,8 @@ class Meeting(eqx.Module):
         presses = jnp.all(both | (pressed >= -of_sides / 2))
         sides = jnp.where(both & (pressed < 0), -1, 1).astype(modes.dtype)
         onto = jnp.where(holds, 0.0, onto)
-        return Decided(modes, slack, onto, solution.found, presses, sides, of_sides)
+        allowed = jnp.all(solution.problem.coefficient >= 0)
+        return Decided(modes, slack, onto, solution.found, presses, allowed, sides, of_sides)
 
     def _onto(self, at: AtMeeting, rows: Rows, wanted: Float[Array, " k"]) -> Float[Array, " k"]:
         """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""

@@ -230,7 +230,10 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
     if met is not None:
-        exists, refused = met.found & met.presses, _obeyed(met, RESULTS.no_contact_forces)
+        met = met._replace(allowed=met.allowed & phase.meeting.laws.allow(ts[0], params))
+        exists, refused = met.found & met.presses & met.allowed, _obeyed(met, RESULTS.no_contact_forces)
+        known = all_finite((q0, v0))
+        exists, refused = exists & known, RESULTS.where(known, refused, RESULTS.start_not_finite)
     known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
     start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
@@ -303,7 +306,7 @@ def _leg(
         events = {name: x.none_where(invalid) for name, x in events.items()}
         if after.found is not None:
             result = RESULTS.where(onward, _obeyed(after, result), result)
-            onward = onward & after.found & after.presses
+            onward = onward & after.found & after.presses & after.allowed
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[place], rows)
@@ -336,7 +339,8 @@ def _leg(
 def _obeyed(met: Any, otherwise: Any):
     """The result of a meeting, of `Met` or `After`, in which a law is broken; `otherwise` if none is."""
     result = RESULTS.where(met.found, otherwise, RESULTS.no_contact_forces)
-    return RESULTS.where(met.presses, result, RESULTS.normal_below_zero)
+    result = RESULTS.where(met.presses, result, RESULTS.normal_below_zero)
+    return RESULTS.where(met.allowed, result, RESULTS.element_refused)
 
 
 class PhaseEnding(NamedTuple):
@@ -409,6 +413,7 @@ class After(NamedTuple):
     modes: Modes | None = None
     found: Bool[Array, ""] | None = None
     presses: Bool[Array, ""] | None = None
+    allowed: Bool[Array, ""] | None = None
 
 
 def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array):
@@ -422,7 +427,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         sizes = jnp.maximum(sizes_so_far, sizes_of(end.q, end.v))
         q, met, number = phase.meeting(end, params, sizes, instant)
         first = jnp.zeros_like(first)
-        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found, met.presses)
+        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found, met.presses, met.allowed)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]
