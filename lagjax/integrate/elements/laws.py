@@ -336,10 +336,8 @@ class Laws(eqx.Module):
             holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
             slack = given.slack[slice(*law.at)]
             slides = law.speeds(slips) - 2 * slack if law.plane else mode * slips
-            slow, far = lengths(slack, law.partners), 1 / jnp.finfo(t.dtype).eps
-            rests = slow - lengths(slips, law.partners)
-            rests = jnp.where(rests > slow / 2, far, rests)
-            moves = jnp.where(mode == FREE, far, jnp.where(mode == LEANS, rests, slides))
+            rests = lengths(slack, law.partners) - lengths(slips, law.partners)
+            moves = jnp.where(mode == FREE, 2.0, jnp.where(mode == LEANS, rests, slides))
             found.append(jnp.where(mode == STICKS, holds, moves))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
@@ -348,9 +346,11 @@ class Laws(eqx.Module):
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
 
     def rests(self, given: InModes) -> Bool[Array, " k"]:
-        """Which guards rest at zero, within round-off: of gaps that nothing presses, or that others hold."""
-        gaps = jnp.zeros(self.guarded, bool).at[: self.count[0]].set(True)
-        return gaps & (given.slack[: self.guarded] < 0)
+        """Which guards rest: of gaps that nothing presses or others hold, and of what is free or held by others."""
+        modes, (gaps, slips) = given.modes[: self.guarded], self.count
+        place = np.arange(self.guarded)
+        of_slips = (place >= gaps) & (place < gaps + slips)
+        return jnp.where(place < gaps, given.slack[: self.guarded] < 0, of_slips & ((modes == FREE) | (modes == LEANS)))
 
     def slack(self, given: InModes) -> Float[Array, " k"]:
         """How far below zero the guard of each mode may be: its slack, or the size of that where it is a vector,

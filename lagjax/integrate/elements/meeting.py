@@ -76,8 +76,8 @@ class Met(NamedTuple):
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     found: Bool[Array, ""]
-    presses: Bool[Array, ""]
-    allowed: Bool[Array, ""]
+    presses: Bool[Array, ""] | bool = True
+    allowed: Bool[Array, ""] | bool = True
 
 
 class Decided(NamedTuple):
