@@ -29,7 +29,7 @@ from lagjax.integrate.elements.complementarity import ContactProblem, Forces, di
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
 from lagjax.integrate.elements.redundant import AtBound, HeldRows, within_laws
-from lagjax.integrate.stepping.tolerances import Forced
+from lagjax.integrate.stepping.tolerances import AT_REST, FROM_NOTHING, Forced, rounding
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -120,13 +120,17 @@ class Rows(NamedTuple):
         of_rows = lax.fori_loop(0, own.size, next_to_next, jnp.abs(self.jacobian) @ jnp.abs(a))
         return jnp.maximum(jnp.abs(a), jnp.max(jnp.abs(self.response) * (step * of_rows)[:, None], axis=0))
 
-    def sizes(self, known: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+    def sizes(self, known: Float[Array, "2 n"], a: Float[Array, " n"], span: Float[Array, ""]) -> Float[Array, "2 n"]:
         """How large coordinates and velocities become, where all share one size, measured in √M_ii times them.
 
-        A motion that is at rest now, at x, has velocities of the size √(a x).
+        A motion that is at rest now, at x, has velocities of the size √(a x). What rests at zero, but for the round-off
+        of accelerations `a` in the time `span`, has the size that a motion from there is given (`tolerances.py`).
         """
         x, u = jnp.max(self.root_mass[None] * known, axis=1)
-        u = jnp.maximum(u, jnp.sqrt(x * jnp.max(self.root_mass * jnp.abs(self.acceleration))))
+        forced = jnp.max(self.root_mass * a)
+        way = forced * span**2
+        x = jnp.where(x <= AT_REST * rounding(way), FROM_NOTHING[0] * way, x)
+        u = jnp.maximum(u, jnp.sqrt(x * jnp.maximum(jnp.max(self.root_mass * jnp.abs(self.acceleration)), forced)))
         least = LIGHT * jnp.max(self.root_mass)
         heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
         return jnp.stack([x, u])[:, None] / heavy[None]
@@ -235,7 +239,8 @@ class Meeting(eqx.Module):
         coordinates and velocities of the motion. Without `impacts` gaps that close stay open."""
         at = self._at(t, q, v, given)
         rows = self._rows(at)
-        sizes = rows.sizes(sizes)
+        forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
+        sizes = rows.sizes(sizes, forced, span)
         contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes))
         allowed = jnp.asarray(True)
         if impacts and self.laws.normals:
@@ -306,12 +311,15 @@ class Meeting(eqx.Module):
         laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
         scale, forced, drift = rows @ sizes.T, jnp.zeros(len(rows), t.dtype), jnp.zeros(len(rows), t.dtype)
         if self.forced is not None:
-            forced, span = rows @ self.forced.near(t), self.forced.t[-1] - self.forced.t[0]
+            a, span = self.forced.around(t)
+            forced = rows @ a
             drift = _round_offs(CLOSED_BELOW, rows @ jnp.max(self.forced.a, axis=0) * span**2)
         modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, jnp.abs(at.given.slack), fired))
         gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
         closed = (modes == CLOSED)[:normals] | fired[:normals]
-        zero = jnp.maximum(_round_offs(4 * CLOSED_BELOW, scale[:normals, 0]), slack[:normals])
+        # Also what forces close before the clock moves.
+        at_once = jnp.finfo(t.dtype).eps * drift[:normals]
+        zero = jnp.maximum(jnp.maximum(_round_offs(4 * CLOSED_BELOW, scale[:normals, 0]), slack[:normals]), at_once)
         closed = closed | (jnp.abs(gaps) <= zero)
         # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
         slid = (jnp.abs(modes) == 1).at[:normals].set(False)

@@ -65,6 +65,10 @@ class Forced(NamedTuple):
         at = jnp.clip(jnp.searchsorted(self.t, t, side="right"), 1, self.t.size - 1)
         return jnp.maximum(self.a[at - 1], self.a[at])
 
+    def around(self, t: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """Those, and the time that the motion takes."""
+        return self.near(t), self.t[-1] - self.t[0]
+
     def left_over(self, a: Float[Array, " n"], h: Float[Array, ""]) -> Float[Array, "2 n"]:
         """What the round-off of accelerations makes of coordinates and velocities in a time h."""
         return rounding(a * jnp.stack([h**2, h])[:, None])

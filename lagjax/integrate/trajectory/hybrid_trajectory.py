@@ -15,12 +15,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import mode_in_words
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
 from lagjax.system import Hybrid, InModes, Model, UnknownSystem, known_system, model_of
 
+# What is struck jumps by more than so many round-offs of the velocities in the motion.
+STRUCK = 1000
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
 
@@ -92,10 +95,19 @@ class Switches(eqx.Module):
         way = int(self.way[k])
         if self.kinds[way] == "control":
             return "acts"
-        after = self.mode_in_words(way, int(np.asarray(self.modes)[k, way]))
-        impulses = jax.tree.leaves(self.impulse)
-        struck = self.kinds[way] == "gap" and any(np.any(np.asarray(x)[k]) for x in impulses)
-        return f"is struck, then {after}" if struck else after
+        mode = int(np.asarray(self.modes)[k, way])
+        after = self.mode_in_words(way, mode)
+        if self.kinds[way] == "sliding velocity" and abs(mode) == 1:
+            after += " forward" if mode > 0 else " back"
+        return f"is struck, then {after}" if self.kinds[way] == "gap" and self._strikes(k, way) else after
+
+    def _strikes(self, k: int, way: int) -> bool:
+        """Whether velocities jump by more than round-off at switch k, where a gap that was open ends its mode."""
+        if k and int(np.asarray(self.modes)[k - 1, way]):
+            return False
+        before, after = (columns(np, x, rows=np.size(self.t))[: int(self.count)] for x in (self.v, self.v_after))
+        jump, size = np.max(np.abs(after[k] - before[k])), np.max(np.abs([before, after]))
+        return bool(jump > STRUCK * np.finfo(before.dtype).eps * size)
 
     def mode_in_words(self, way: int, mode: int) -> str:
         """A mode in a word; `way`: its place among the modes."""
