@@ -29,9 +29,6 @@ from lagjax.system import (
     traced_system,
 )
 
-# A guard that rests leaves that at so many slacks.
-RESTS_UP_TO = 1e3
-
 
 class Masked(eqx.Module):
     """A gap, or a sliding velocity, as the residual of a constraint: zero where it does not hold."""
@@ -86,10 +83,8 @@ class OneGuard(eqx.Module):
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
         slack, last = self.laws.slack(given), self.laws.last(t, q, v, multipliers, given)
         size = jnp.where(slack > 0, slack, 1.0)
-        values = (last + slack) / size
-        # Smoothly, for those that begin to press.
-        away = 1 / (jnp.finfo(last.dtype).eps * (1 + (last / (RESTS_UP_TO * size)) ** 2))
-        return jnp.min(jnp.where(self.laws.rests(given) & (values > 0.5), values + away, values))
+        values, far = (last + slack) / size, 1 / jnp.finfo(last.dtype).eps
+        return jnp.min(jnp.where(self.laws.rests(given) & (values > 0.5), jnp.maximum(values, far), values))
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:

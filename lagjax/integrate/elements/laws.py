@@ -346,7 +346,7 @@ class Laws(eqx.Module):
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
 
     def rests(self, given: InModes) -> Bool[Array, " k"]:
-        """Which guards rest: of gaps that nothing presses or others hold, and of what is free or held by others."""
+        """Which guards rest: of gaps at zero that others hold, and of what is free or held by others."""
         modes, (gaps, slips) = given.modes[: self.guarded], self.count
         place = np.arange(self.guarded)
         of_slips = (place >= gaps) & (place < gaps + slips)

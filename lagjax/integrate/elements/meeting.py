@@ -475,8 +475,7 @@ class Meeting(eqx.Module):
         nearest = jnp.where(solution.problem.may_push, jnp.maximum(nearest, contacts.below), nearest)
         slack = jnp.where(holds, solution.no_force, jnp.concatenate([nearest, slowest]))
         # By its sign, that a guard rests.
-        unloaded = holds[:normals] & (solution.forces[:normals] <= solution.no_force[:normals])
-        rests = jnp.concatenate([unloaded | solution.bound.lifted, jnp.zeros(holds.size - normals, bool)])
+        rests = jnp.concatenate([solution.bound.lifted, jnp.zeros(holds.size - normals, bool)])
         slack = jnp.where(rests, -slack, slack)
         # Of each normal force, not of both components of a plane.
         found, places = solution.problem.normal_forces(solution.forces), np.zeros(0, int)
