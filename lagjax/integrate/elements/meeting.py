@@ -112,10 +112,10 @@ class Rows(NamedTuple):
         """The accelerations by single forces, of those that give `a` and of contacts that pass them on to others."""
         own = jnp.diag(self.matrix)
         step = 1 / jnp.where(own > 0, own, jnp.inf)
-        part = jnp.abs(self.matrix) * step
+        part = jnp.abs(self.matrix) * step[None]
 
         def next_to_next(_, found: Array) -> Array:
-            return jnp.maximum(found, jnp.max(part * found, axis=1))
+            return jnp.maximum(found, jnp.max(part * found[None], axis=1))
 
         of_rows = lax.fori_loop(0, own.size, next_to_next, jnp.abs(self.jacobian) @ jnp.abs(a))
         return jnp.maximum(jnp.abs(a), jnp.max(jnp.abs(self.response) * (step * of_rows)[:, None], axis=0))

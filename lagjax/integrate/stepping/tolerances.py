@@ -71,7 +71,7 @@ class Forced(NamedTuple):
 
     def left_over(self, a: Float[Array, " n"], h: Float[Array, ""]) -> Float[Array, "2 n"]:
         """What the round-off of accelerations makes of coordinates and velocities in a time h."""
-        return rounding(a * jnp.stack([h**2, h])[:, None])
+        return rounding(a[None] * jnp.stack([h**2, h])[:, None])
 
 
 class Scales(NamedTuple):
