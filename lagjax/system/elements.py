@@ -42,11 +42,15 @@ class Friction(eqx.Module):
     - `coefficient`: μ of sliding: a number, a function of `params`, or `mu(speed, params)` (Stribeck's law), with the
       speed |s|.
     - `normal`: the normal force N: a number, a function of (t, q, v, params), or the name of a constraint whose
-      multiplier it is, above zero where it presses, or of a contact among the elements.
+      multiplier it is, or of a contact among the elements.
     - `static`: μ of sticking, a number or a function of `params`; by default `coefficient`, at speed zero.
 
+    A multiplier presses from both sides, as the wire of a bead does: the force is μ |λ|. What a function returns presses
+    from one side, and where it falls below zero the motion ends.
+
     **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force; `ValueError`
-    for a sliding velocity of another shape.
+    for a sliding velocity of another shape, and for numbers below zero, and NaN, also from params, by `lj.integrate`;
+    `RuntimeError`, by `lj.integrate`, for a normal force from a function that falls below zero.
 
     Sliding in a plane ends at 3e-8 of the velocities in the motion (1e-4 in float32), where s/|s| is lost in round-off:
     its time is early by as much of them over μ N, and the place of rest by the square.
@@ -102,8 +106,9 @@ class Contact(eqx.Module):
     - `slower_than`: a contact that opens more slowly than this after an impact stays closed, `[gap]/[t]`: this ends
       infinitely many impacts in finite time. The part of the motion left out is of the size of its square.
 
-    **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a restitution below
-    zero, and for friction without a sliding velocity.
+    **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a restitution that is
+    not 0 to 1, friction below zero, and NaN, also from params, by `lj.integrate`; and for friction without a sliding
+    velocity.
 
     Source: Glocker, *Set-Valued Force Laws*, §6 (Newton's law of impact).
     """
@@ -264,7 +269,8 @@ class SampledControl(eqx.Module):
     continued from there. An instant is a switch of the motion (`traj.switches`): `lj.Elements(most_switches=)` makes
     room for them, and `lj.integrate` for those that it can count, if `every`, `offset` and `ts` are numbers.
 
-    **Raises:** `TypeError` for a controller that is no function; `ValueError` for `every` that is not above zero.
+    **Raises:** `TypeError` for a controller that is no function; `ValueError` for `every` that is not above zero,
+    also from params, by `lj.integrate`.
 
     Source: Åström & Wittenmark, *Computer-Controlled Systems*, §2.3 (zero-order hold).
     """

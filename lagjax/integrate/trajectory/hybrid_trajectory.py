@@ -37,7 +37,8 @@ class Switches(eqx.Module):
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      and `kinds` what they are modes of: a "gap", a "sliding velocity", a "spring" or a "control".
+      and `kinds` what they are modes of: a "gap", a "sliding velocity" (or one "in a plane"), a "spring", the "side" from
+      which a normal force presses, or a "control".
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -122,8 +123,8 @@ class HybridTrajectory(Trajectory):
     - `switches`: the `Switches`.
     - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
       `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
-      gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a sampled control the number of its
-      next instant.
+      gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a normal force of either sign 1 or
+      -1, the side from which it presses; of a sampled control the number of its next instant.
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint, and of `at(t)`
       between outputs while others hold what would slide (mode 3): which friction is at its bound is known at outputs.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
