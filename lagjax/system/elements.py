@@ -45,7 +45,7 @@ class Friction(eqx.Module):
       multiplier it is, or of a contact among the elements.
     - `static`: μ of sticking, a number or a function of `params`; by default `coefficient`, at speed zero.
 
-    A multiplier presses from both sides, as the wire of a bead does: the force is μ |λ|. What a function returns presses
+    A multiplier presses from both sides, as the wire of a bead does: the force is μ |λ|. A function is a normal force
     from one side, and where it falls below zero the motion ends.
 
     **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force; `ValueError`

@@ -37,7 +37,7 @@ class Switches(eqx.Module):
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      and `kinds` what they are modes of: a "gap", a "sliding velocity" (or one "in a plane"), a "spring", the "side" from
+      and `kinds` what they are modes of: a "gap", a "sliding velocity" (or one "in a plane"), a "spring", a "side" from
       which a normal force presses, or a "control".
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
