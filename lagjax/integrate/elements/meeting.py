@@ -29,7 +29,7 @@ from lagjax.integrate.elements.complementarity import ContactProblem, Forces, di
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
 from lagjax.integrate.elements.redundant import AtBound, HeldRows, within_laws
-from lagjax.integrate.stepping.tolerances import AT_REST, FROM_NOTHING, Forced, rounding
+from lagjax.integrate.stepping.tolerances import FROM_NOTHING, Forced, rounding
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -129,7 +129,7 @@ class Rows(NamedTuple):
         x, u = jnp.max(self.root_mass[None] * known, axis=1)
         forced = jnp.max(self.root_mass * a)
         way = forced * span**2
-        x = jnp.where(x <= AT_REST * rounding(way), FROM_NOTHING[0] * way, x)
+        x = jnp.where(x <= rounding(way), FROM_NOTHING[0] * way, x)
         u = jnp.maximum(u, jnp.sqrt(x * jnp.maximum(jnp.max(self.root_mass * jnp.abs(self.acceleration)), forced)))
         least = LIGHT * jnp.max(self.root_mass)
         heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))

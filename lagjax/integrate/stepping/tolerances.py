@@ -41,7 +41,7 @@ FIRST = 0.1
 LIGHT = 1e-6
 # A coordinate at rest at zero counts as at least this part of the extent of all others when a force sets in.
 OF_OTHERS = 1e-6
-# A motion starts at rest below so many round-offs of its forces: guards of contacts end modes at hundreds of them.
+# Nothing accelerates below so many round-offs of the forces: guards of contacts end modes at hundreds of them.
 AT_REST = 1e3
 # For a start from zero: parts of the coordinates and velocities that its acceleration yields in the whole time.
 FROM_NOTHING = 1e-6, 1e-3
@@ -105,12 +105,12 @@ def tolerances_at(
         return Tolerances(settings.rtol, settings.atol)
     sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
+    if forced is not None:
+        way = jnp.max(forced.a) * span**2
+        of_q = jnp.where(of_q <= rounding(way), FROM_NOTHING[0] * way, of_q)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
-    atol = settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])
-    if forced is not None:
-        atol = atol + jnp.max(forced.left_over(jnp.max(forced.a, axis=0), span), axis=1)
-    return Tolerances(settings.rtol, stop_gradient(atol))
+    return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
 
 
 def span_of(ts: Array):
@@ -133,8 +133,8 @@ def scales_of(
     if forced is not None:
         # What the round-off of forces that cancel makes in the whole time says nothing.
         most = jnp.max(forced.a, axis=0)
-        least = jnp.concatenate([forced.left_over(most, span), rounding(most)[None]])
-        sizes = jnp.where(sizes <= AT_REST * least, 0.0, sizes)
+        least = jnp.concatenate([forced.left_over(most, span), AT_REST * rounding(most)[None]])
+        sizes = jnp.where(sizes <= least, 0.0, sizes)
     root_mass = jnp.where(without_mass, 0.0, root_mass)
     heaviest = jnp.max(root_mass)
     over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))

@@ -92,9 +92,8 @@ def test_a_normal_force_that_holds_from_both_sides():
     traj = moved(bead, *start, ts=np.array([0.0, 0.3, 0.45]))
     energies = 0.5 * np.sum(np.asarray(traj.v) ** 2, axis=1) + G * np.asarray(traj.q)[:, 1]
     np.testing.assert_allclose(energies[1:], on_a_wire(0.2), rtol=1e-7)
-    assert traj.switches.ways == ("rub", "rub normal") and "rub normal presses from the other side" in repr(
-        traj.switches
-    )
+    assert traj.switches.ways == ("rub", "rub normal") and "rub normal presses" in repr(traj.switches)
+    assert np.asarray(traj.modes)[:, 1].tolist() == [-1, -1, 1]
     pressed = np.asarray(traj.multipliers["wire"])
     np.testing.assert_allclose(traj.multipliers["rub"], 0.2 * np.abs(pressed), rtol=1e-12)
     assert pressed[0] * pressed[-1] < 0 and np.ptp(energies) > 0.1
