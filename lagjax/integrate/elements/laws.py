@@ -376,12 +376,12 @@ class Laws(eqx.Module):
         return {law.name: jnp.reshape(law.forces(t, q, v, given), law.shape) for law in self.compliant}
 
     def acting(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> dict[str, Array]:
-        """The forces of elements by name, besides those of gaps: F of what is compliant, and friction in all modes."""
+        """The forces of elements by name, besides those of gaps: F of what is compliant, and friction."""
         found = self.forces(t, q, v, given)
         for law in self.tangents:
-            sticks, holds = given.modes[slice(*law.at)] == STICKS, multipliers[law.name]
+            slides, holds = jnp.abs(given.modes[slice(*law.at)]) == 1, multipliers[law.name]
             rubs = law.friction(t, q, law.slips(t, q, v, given.params), v, multipliers | found, given)
-            found[law.name] = jnp.where(sticks, jnp.ravel(holds), rubs).reshape(jnp.shape(holds))
+            found[law.name] = jnp.where(slides, rubs, jnp.ravel(holds)).reshape(jnp.shape(holds))
         return found
 
     def acted(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> tuple[PyTree, InModes]:

@@ -240,8 +240,8 @@ class Meeting(eqx.Module):
         at = self._at(t, q, v, given)
         rows = self._rows(at)
         forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
-        sizes = rows.sizes(sizes, forced, span)
-        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes))
+        moved, sizes = rows.sizes(sizes, 0.0 * forced, span)[1], rows.sizes(sizes, forced, span)
+        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes, moved))
         allowed = jnp.asarray(True)
         if impacts and self.laws.normals:
             struck = self._struck(at, rows, contacts.closed)
@@ -306,8 +306,16 @@ class Meeting(eqx.Module):
         """The rates of gaps, and sliding velocities."""
         return constraints.velocity_residual(*at[:4])[self._places(at.model)[0]]
 
-    def _as_found(self, at: AtMeeting, fired: Bool[Array, " k"], rows: Array, sizes: Float[Array, "2 n"]) -> AsFound:
-        """The contacts before an impact; `rows` (k, n): |A|; `sizes`: of coordinates and velocities."""
+    def _as_found(
+        self,
+        at: AtMeeting,
+        fired: Bool[Array, " k"],
+        rows: Array,
+        sizes: Float[Array, "2 n"],
+        moved: Float[Array, " n"],
+    ) -> AsFound:
+        """The contacts before an impact; `rows` (k, n): |A|; `sizes`: of coordinates and velocities; `moved`: of
+        velocities, zero where nothing has moved."""
         laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
         scale, forced, drift = rows @ sizes.T, jnp.zeros(len(rows), t.dtype), jnp.zeros(len(rows), t.dtype)
         if self.forced is not None:
@@ -329,7 +337,7 @@ class Meeting(eqx.Module):
         reached = jnp.where(still, 2 * jnp.abs(self._velocities(at)), 0.0)
         velocity = jnp.maximum(jnp.maximum(_round_offs(STILL_BELOW, scale[:, 1]), before), reached)
         part = self._ends_at(t.dtype)
-        ends = part * lengths(scale[normals:, 1], laws.partners)
+        ends = part * lengths((rows @ moved)[normals:], laws.partners)
         # Also where nothing has moved yet.
         return AsFound(
             closed, fired, scale, forced, drift, velocity, jnp.where(ends > 0, ends, part), jnp.maximum(-gaps, 0.0)

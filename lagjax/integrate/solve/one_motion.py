@@ -386,8 +386,8 @@ def _absolute(states, scales, settings: Settings):
     found = rounding(shared(scales, jnp.stack(sizes)))
     if (forced := scales.forced) is None:
         return found
-    left = forced.left_over(jnp.max(forced.a, axis=0), forced.t[-1] - forced.t[0])
-    return jnp.where(jnp.stack(sizes) <= left, jnp.maximum(found, left), found)
+    # A motion that is continued from an output knows of its forces by this.
+    return found + forced.left_over(jnp.max(forced.a, axis=0), forced.t[-1] - forced.t[0])
 
 
 def _scaled_error(equations: Equations, t: Array, q: PyTree, v: PyTree, stats: dict[str, Array], settings: Settings):
