@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax.integrate.arguments import REFUSED
+from lagjax.integrate.arguments import REFUSED, check_finite
 from lagjax.integrate.trajectory.results import RESULTS, is_among, message
 from lagjax.mechanics import consistent_state, describe, explain_failure, listed
 from lagjax.system import Holonomic, State, System, constraints, coordinates, model_of
@@ -55,6 +55,10 @@ def of_elements(trajectory, start: State) -> Exception:
     # A motion that does not begin has no end.
     begun = count or all(np.all(np.isfinite(x)) for x in jax.tree.leaves((end.q, end.v)))
     s = State(end.t, end.q, end.v, trajectory.params) if begun else start._replace(params=trajectory.params)
+    if is_among(result, [RESULTS.element_refused]):
+        return _refused(laws, s)
+    if is_among(result, [RESULTS.normal_below_zero]):
+        return _lifted(laws, s)
     if is_among(result, [RESULTS.too_many_switches]):
         return _against_constraints(laws, user, s) or RuntimeError(
             f"there were {count} changes of modes until {when}, the last ones of {listed(last)}, and that is all there "
@@ -73,10 +77,49 @@ def of_elements(trajectory, start: State) -> Exception:
             "Fix: a smaller friction, or a contact with a spring and a damper in place of a rigid one."
         )
     if is_among(result, REFUSED):
+        check_finite(s)
         state = coordinates.as_arrays(s, s.t.dtype)
         if reason := explain_failure(model_of(replace(user, elements=None), *state), state):
             return ValueError(reason)
     return RuntimeError(f"at {when}: {message(result)}")
+
+
+def _refused(laws, s: State) -> Exception:
+    """The error of numbers that no law allows."""
+    t, q, v, params = coordinates.as_arrays(s, s.t.dtype)
+    found = [(role, np.asarray(value)) for role, value, allowed in laws.numbers(t, params) if not np.all(allowed)]
+    if not found:
+        # Those that depend on speeds.
+        for law in laws.normals:
+            rates = jax.jvp(lambda t, q, law=law: law.gaps(t, q, params), (t, q), (jnp.ones_like(t), v))[1]
+            e = np.asarray(law.returned(jnp.maximum(-rates, 0.0), params))
+            found += [(f"the restitution of '{law.name}'", e)] * (not np.all((e >= 0) & (e <= 1)))
+        for law in laws.tangents:
+            mu = np.asarray(law.kinetic(jnp.abs(law.slips(t, q, v, params)), params))
+            found += [(f"the coefficient of '{law.name}'", mu)] * (not np.all(mu >= 0))
+    said = ", ".join(f"{role} is {value}" for role, value in found)
+    above = any(role.startswith(("every", "the stiffness")) for role, _ in found)
+    return ValueError(
+        f"{said}: friction, stiffness and damping are not below zero, a restitution is 0 to 1, and a stiffness and the "
+        "time between instants are above zero.\n"
+        "Usual cause: a number in params, or from a function of them, that is NaN or has another sign or unit.\n"
+        f"Fix: {'jnp.exp(p)' if above else 'jnp.abs(p)'} in the function of the element, or another value in params."
+    )
+
+
+def _lifted(laws, s: State) -> Exception:
+    """The error of a normal force, a function of the state, that fell below zero."""
+    t, q, v, params = coordinates.as_arrays(s, s.t.dtype)
+    found = {law.name: law.normal_forces(t, q, v, {}, params) for law in laws.sided if not law.both}
+    least = {name: float(jnp.min(force)) for name, force in found.items()}
+    name = min(least, key=lambda name: least[name])
+    return RuntimeError(
+        f"the normal force of '{name}' falls below zero at t = {float(s.t):.9g}: {least[name]:.3g}. A surface that "
+        "presses from one side does not hold the body there any more, and friction is not defined.\n"
+        "Usual cause: a lift above the weight; a normal force with the other sign.\n"
+        "Fix: lj.Contact(gap, friction=, sliding=), which lets go; normal='name' of a lj.Holonomic, whose multiplier "
+        "presses from both sides, or jnp.abs(N) in the function, for a guide that does."
+    )
 
 
 def at_contacts(laws, user: System, s: State) -> AtContacts:

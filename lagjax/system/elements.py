@@ -42,11 +42,15 @@ class Friction(eqx.Module):
     - `coefficient`: μ of sliding: a number, a function of `params`, or `mu(speed, params)` (Stribeck's law), with the
       speed |s|.
     - `normal`: the normal force N: a number, a function of (t, q, v, params), or the name of a constraint whose
-      multiplier it is, above zero where it presses, or of a contact among the elements.
+      multiplier it is, or of a contact among the elements.
     - `static`: μ of sticking, a number or a function of `params`; by default `coefficient`, at speed zero.
 
+    A multiplier presses from both sides, as the wire of a bead does: the force is μ |λ|. A function is a normal force
+    from one side, and where it falls below zero the motion ends.
+
     **Raises:** `TypeError` for a sliding velocity that is no function, or another kind of normal force; `ValueError`
-    for a sliding velocity of another shape.
+    for a sliding velocity of another shape, and for numbers below zero, and NaN, also from params, by `lj.integrate`;
+    `RuntimeError`, by `lj.integrate`, for a normal force from a function that falls below zero.
 
     Sliding in a plane ends at 3e-8 of the velocities in the motion (1e-4 in float32), where s/|s| is lost in round-off:
     its time is early by as much of them over μ N, and the place of rest by the square.
@@ -67,8 +71,9 @@ class Friction(eqx.Module):
         static: Callable | ArrayLike | None = None,
     ):
         _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
-        for role, number in (("coefficient", coefficient), ("static", static)):
-            _check_not_negative(role, number)
+        for role, number in (("coefficient", coefficient), ("static", static), ("normal", normal)):
+            if not isinstance(number, str):
+                _check_not_negative(role, number)
         self.sliding, self.coefficient, self.static = sliding, _number(coefficient), _number(static)
         self.normal = normal if isinstance(normal, str) else _number(normal)
 
@@ -101,8 +106,9 @@ class Contact(eqx.Module):
     - `slower_than`: a contact that opens more slowly than this after an impact stays closed, `[gap]/[t]`: this ends
       infinitely many impacts in finite time. The part of the motion left out is of the size of its square.
 
-    **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a restitution below
-    zero, and for friction without a sliding velocity.
+    **Raises:** `TypeError` for a gap or a sliding velocity that is no function; `ValueError` for a restitution that is
+    not 0 to 1, friction below zero, and NaN, also from params, by `lj.integrate`; and for friction without a sliding
+    velocity.
 
     Source: Glocker, *Set-Valued Force Laws*, §6 (Newton's law of impact).
     """
@@ -125,7 +131,8 @@ class Contact(eqx.Module):
     ):
         _check_function("gap", gap, "(t, q, params)", 'q["y"]')
         _check_pair(friction, sliding)
-        for role, number in (("restitution", restitution), ("friction", friction), ("static", static)):
+        numbers = {"restitution": restitution, "friction": friction, "static": static, "slower_than": slower_than}
+        for role, number in numbers.items():
             _check_not_negative(role, number)
         self.gap, self.restitution, self.sliding = gap, _number(restitution), sliding
         self.friction, self.static = _number(friction), _number(static)
@@ -262,7 +269,8 @@ class SampledControl(eqx.Module):
     continued from there. An instant is a switch of the motion (`traj.switches`): `lj.Elements(most_switches=)` makes
     room for them, and `lj.integrate` for those that it can count, if `every`, `offset` and `ts` are numbers.
 
-    **Raises:** `TypeError` for a controller that is no function; `ValueError` for `every` that is not above zero.
+    **Raises:** `TypeError` for a controller that is no function; `ValueError` for `every` that is not above zero,
+    also from params, by `lj.integrate`.
 
     Source: Åström & Wittenmark, *Computer-Controlled Systems*, §2.3 (zero-order hold).
     """
@@ -274,6 +282,8 @@ class SampledControl(eqx.Module):
     def __init__(self, controller: Callable, every: Callable | ArrayLike, offset: Callable | ArrayLike = 0.0):
         _check_function("controller", controller, "(t, q, v, params)", '-params["gain"] * v["x"]')
         _check_above_zero("every", every, "a rate, 1 / every, in place of the time between two instants")
+        if not (callable(offset) or isinstance(offset, Tracer) or np.all(np.isfinite(np.asarray(offset)))):
+            raise ValueError(f"offset = {offset} is no time.\nFix: offset=0.0, the first instant.")
         self.controller, self.every, self.offset = controller, _number(every), _number(offset)
 
     def __repr__(self):
@@ -393,11 +403,20 @@ def _check_above_zero(role: str, number, cause: str):
 def _check_not_negative(role: str, number):
     if number is None or callable(number) or isinstance(number, Tracer):
         return
-    if np.any(np.asarray(number) < 0):
+    given = np.asarray(number)
+    if np.any(np.isnan(given)):
+        raise ValueError(f"{role} = {number} is no number.\nUsual cause: a division by zero.\nFix: a number.")
+    if np.any(given < 0):
         raise ValueError(
             f"{role} = {number} is below zero.\n"
             "Usual cause: a sign that the law has already (friction acts against the sliding velocity by itself).\n"
-            f"Fix: {role}={abs(np.asarray(number))}."
+            f"Fix: {role}={abs(given)}."
+        )
+    if role == "restitution" and np.any(given > 1):
+        raise ValueError(
+            f"restitution = {number} is above 1: the impact would give energy.\n"
+            "Usual cause: the square of a speed in place of the speed, a percentage; a bumper that kicks.\n"
+            f"Fix: restitution={np.minimum(1 / given, 1.0)}; for a kick, lj.Hybrid with a reset."
         )
 
 

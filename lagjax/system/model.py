@@ -103,7 +103,7 @@ class InModes(NamedTuple):
 
     - `modes` (k,): of each element's law, as in `integrate/elements/laws.py`.
     - `off` (m,): which of the stacked constraint equations do not hold now; their multipliers are zero.
-    - `slack` (k,): how far the guard of each mode may be below zero by round-off.
+    - `slack` (k,): how far the guard of each mode may be below zero by round-off, and by its sign more of some modes.
     """
 
     params: PyTree

@@ -18,6 +18,12 @@ def test_bad_elements():
     """Signs, kinds and gaps in what is given."""
     with pytest.raises(ValueError, match="restitution = -0.5 is below zero"):
         lj.Contact(above, restitution=-0.5)
+    with pytest.raises(ValueError, match=r"(?s)restitution = 1.5 is above 1.*Fix: restitution=0.66"):
+        lj.Contact(above, restitution=1.5)
+    with pytest.raises(ValueError, match="normal = -1.0 is below zero"):
+        lj.Friction(sliding, 0.5, -1.0)
+    with pytest.raises(ValueError, match="coefficient = nan is no number"):
+        lj.Friction(sliding, np.nan, 1.0)
     with pytest.raises(ValueError, match="friction is given, but sliding is not"):
         lj.Contact(above, friction=0.3)
     with pytest.raises(TypeError, match="gap must be a function"):
@@ -47,6 +53,10 @@ def test_bad_springs_and_controls():
         lj.CompliantContact(above, 1.0, sliding=sliding)
     with pytest.raises(ValueError, match=r"(?s)every = 0.0 is not above zero.*Fix: every=1.0"):
         lj.SampledControl(sliding, 0.0)
+    with pytest.raises(ValueError, match="every = nan is not above zero"):
+        lj.SampledControl(sliding, np.nan)
+    with pytest.raises(ValueError, match="offset = inf is no time"):
+        lj.SampledControl(sliding, 1.0, np.inf)
     with pytest.raises(TypeError, match="controller must be a function"):
         lj.SampledControl(1.0, 0.1)  # pyright: ignore
     servo = lj.SampledControl(lambda t, q, v, p: -v["x"], 0.1)

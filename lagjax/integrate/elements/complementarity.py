@@ -27,6 +27,8 @@ SWEEPS, STEPS = 30, 30
 # A root is found where the residual is below this part of the forces; singular values below this part of the largest
 # count as zero.
 SMALL = {np.dtype("float64"): 1e-11, np.dtype("float32"): 1e-4}
+# And not improved where it is below so many round-offs, or does not fall to this part.
+EXACT, FALLS_TO = 4, 0.25
 DEPENDENT = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
@@ -64,6 +66,7 @@ class ContactProblem(NamedTuple):
     - `slides` (k_T,): 1 or -1 where the sliding is given, or in a plane its direction, and with it λ_T = -slides μ N;
       else 0.
     - `partners` (k_T,): for each tangential force the other component of its plane; itself, along a line.
+    - `both` (k_T,): whether the normal force presses from both sides: then it counts by its size.
     """
 
     matrix: Float[Array, "k k"]
@@ -74,6 +77,7 @@ class ContactProblem(NamedTuple):
     coefficient: Float[Array, " kT"]
     slides: Float[Array, " kT"]
     partners: np.ndarray
+    both: np.ndarray | bool = False
 
     @property
     def given(self) -> Bool[Array, " kT"]:
@@ -92,7 +96,7 @@ class ContactProblem(NamedTuple):
         count = self.may_push.size
         z = forces - self.step * (self.matrix @ forces + self.free)
         normal = jnp.where(self.may_push, jnp.maximum(z[:count], 0.0), 0.0)
-        most = self.coefficient * jnp.maximum(self.normal_forces(jnp.concatenate([normal, forces[count:]])), 0.0)
+        most = self.most(jnp.concatenate([normal, forces[count:]]))
         size = lengths(z[count:], self.partners)
         within = z[count:] * jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0)
         return jnp.concatenate([normal, jnp.where(self.given, -self.slides * most, within)])
@@ -100,6 +104,16 @@ class ContactProblem(NamedTuple):
     def normal_forces(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
         """N of each tangential force."""
         return self.constant + self.of_forces @ forces
+
+    def most(self, forces: Float[Array, " k"]) -> Float[Array, " kT"]:
+        """μ N of each tangential force, with |N| where that presses from both sides."""
+        found = self.normal_forces(forces)
+        return self.coefficient * jnp.where(self.both, jnp.abs(found), jnp.maximum(found, 0.0))
+
+    def on_sides_of(self, forces: Float[Array, " k"]) -> "ContactProblem":
+        """The same with normal forces above zero, where those of these forces are below."""
+        sign = jnp.where(self.both & (self.normal_forces(forces) < 0), -1.0, 1.0)
+        return self._replace(of_forces=sign[:, None] * self.of_forces, constant=sign * self.constant)
 
 
 class Forces(NamedTuple):
@@ -111,7 +125,7 @@ class Forces(NamedTuple):
 
 def solved(problem: ContactProblem) -> Forces:
     """The forces of contacts that are solved together; the first derivative is that of the solution's own case."""
-    still = stop_gradient(problem)._replace(partners=problem.partners)
+    still = stop_gradient(problem)._replace(partners=problem.partners, both=problem.both)
 
     def residual(problem: ContactProblem, forces: Array) -> Array:
         return forces - problem.projected(forces)
@@ -129,15 +143,22 @@ def solved(problem: ContactProblem) -> Forces:
         return jnp.max(jnp.abs(residual(still, forces))) / jnp.where(size > 0, size, 1.0)
 
     def newton(state: tuple) -> tuple:
-        forces, _, _, count = state
+        forces, left, _, _, count = state
         slope = inverse(forces)
-        return forces - slope @ residual(still, forces), error(forces), slope, count + 1
+        return forces - slope @ residual(still, forces), error(forces), left, slope, count + 1
+
+    def goes_on(state: tuple) -> Array:
+        # What breaks a law by little more than round-off is in another case: so it is not left at what is small.
+        _, left, before, _, count = state
+        done = (left <= small) & ((left <= EXACT * jnp.finfo(near.dtype).eps) | ~(left <= FALLS_TO * before))
+        return ~done & (count < STEPS)
 
     first = jnp.zeros_like(still.free), jnp.asarray(True), jnp.asarray(0)
     near, *_ = lax.while_loop(lambda s: s[1] & (s[2] < SWEEPS), sweep, first)
-    start = near, jnp.full_like(near[0], jnp.inf), jnp.zeros_like(still.matrix), jnp.asarray(0)
+    unknown = jnp.full_like(near[0], jnp.inf)
+    start = near, unknown, unknown, jnp.zeros_like(still.matrix), jnp.asarray(0)
     small = SMALL[near.dtype]
     # The last step starts at a solution: its matrix is that of the solution's own case.
-    forces, left, slope, _ = lax.while_loop(lambda s: ~(s[1] <= small) & (s[3] < STEPS), newton, start)
+    forces, left, _, slope, _ = lax.while_loop(goes_on, newton, start)
     forces = stop_gradient(forces)
     return Forces(forces - stop_gradient(slope) @ residual(problem, forces), left <= small)

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.complementarity import DEPENDENT, ContactProblem, solved
-from lagjax.integrate.elements.laws import Laws
+from lagjax.integrate.elements.laws import Laws, at_most_one
 from lagjax.jaxtools import stop_gradient
 
 # Impacts one after the other, at most: so many for each pair of gaps, and a few more.
@@ -60,6 +60,11 @@ class Struck(eqx.Module):
         impulses, _ = lax.scan(next_impact, jnp.zeros_like(self.before), None, length=most)
         stopped = self._together(self.before + self.matrix @ impulses, jnp.zeros_like(self.still))
         return impulses + stopped
+
+    def allowed(self) -> Bool[Array, ""]:
+        """Whether the restitutions at these speeds are 0 to 1."""
+        e = stop_gradient(self._restitution(self._closing(self.before)))
+        return jnp.all(~self._closes(self.before) | (e >= 0) & (e <= at_most_one(e.dtype)))
 
     def _closes(self, c: Float[Array, " k"]) -> Bool[Array, " kN"]:
         return self.closed & (stop_gradient(c[: self.still.size]) < -self.still)

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.complementarity import directions
 from lagjax.integrate.elements.compliant import Compliant
-from lagjax.integrate.elements.laws import CLOSED, LEANS, STICKS, Laws, Tangent
+from lagjax.integrate.elements.laws import CLOSED, STICKS, Laws, Tangent
 from lagjax.integrate.elements.laws_of_elements import laws_of
 from lagjax.integrate.jumps.find import OfParams
 from lagjax.system import (
@@ -66,32 +65,26 @@ class WithElements(eqx.Module):
         for law in self.compliant:
             forces[law.name], found[law.name] = law.push(t, q, v, given)
         for law in self.tangents:
-            mode = given.modes[slice(*law.at)]
-            side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
             slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
-            speed = law.speeds(slip) if law.plane else side * slip
-            side = side * slip / speed if law.plane else side
-            leans, pressed = mode == LEANS, law.normal_forces(t, q, v, forces, params)
-            mu = jnp.where(leans, law.sticking(speed, params), law.kinetic(speed, params))
-            held = directions(given.slack[slice(*law.at)].astype(t.dtype), law.partners)
-            against = jnp.where(leans, -held, side)
-            found[law.name] = back(-against * mu * pressed)[0]
+            found[law.name] = back(law.friction(t, q, slip, v, forces, given))[0]
         return found
 
 
 class OneGuard(eqx.Module):
     """The guards of all modes as one: the least of them, each in units of its slack.
 
-    Guards are followed one by one, so that many of them would take long to compile.
+    Guards are followed one by one, so that many of them would take long to compile. One that rests at zero counts as
+    far from its end: else the least of all would be that, until another one is as near to zero.
     """
 
     laws: Laws
     takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
 
     def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
-        slack = self.laws.slack(given)
+        slack, last = self.laws.slack(given), self.laws.last(t, q, v, multipliers, given)
         size = jnp.where(slack > 0, slack, 1.0)
-        return jnp.min((self.laws.last(t, q, v, multipliers, given) + slack) / size)
+        values, far = (last + slack) / size, 1 / jnp.finfo(last.dtype).eps
+        return jnp.min(jnp.where(self.laws.rests(given) & (values > 0.5), jnp.maximum(values, far), values))
 
 
 def in_modes(system: System, start: State) -> tuple[System, Laws]:
@@ -115,6 +108,7 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
     force = WithElements(plain.force, tangents, compliant) if tangents or compliant else always.force
     masked = replace(always, constraints=constraints, force=force)
     guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
+    guarded += [law.side[1] for law in tangents if law.side]
     count = max(guarded, default=0) + len(sampled)
     # The order of the stacked equations is known only with their shapes.
     given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))

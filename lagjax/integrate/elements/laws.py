@@ -14,6 +14,9 @@ The guard of a mode is above zero as long as it lasts:
     open: the gap        closed: λ_N        slides: ± the sliding velocity, or |s| - δ        sticks: μ N - |λ_T|
     held by others: δ - |s|        apart: -m            pressed: m
 
+A normal force that is a multiplier of a constraint presses from either side (1, -1), with friction μ |λ|: the guard is
+± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion.
+
 Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
 """
 
@@ -26,8 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.coefficients import coefficient
-from lagjax.integrate.elements.complementarity import lengths
+from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
+from lagjax.integrate.elements.complementarity import directions, lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, mode_in_words
@@ -61,7 +64,8 @@ class Tangent(eqx.Module):
     """The sliding velocities of an element, and its friction; `name`: that of the constraint while it sticks.
 
     `source`: the constraint or contact whose multiplier is the normal force; if empty, `normal` is that. `plane`:
-    whether each two of the sliding velocities are components in a plane, with one normal force.
+    whether each two of the sliding velocities are components in a plane, with one normal force. `both`: whether that
+    presses from both sides; `side`: the places of these among the modes; None for those of contacts, and numbers.
     """
 
     name: str = eqx.field(static=True)
@@ -72,6 +76,14 @@ class Tangent(eqx.Module):
     source: str = eqx.field(static=True)
     at: tuple[int, int] = eqx.field(static=True)
     plane: bool = eqx.field(static=True)
+    both: bool = eqx.field(static=True, default=False)
+    side: tuple[int, int] | None = eqx.field(static=True, default=None)
+
+    def sides(self, modes: Int[Array, " k"]) -> Int[Array, " k"] | int:
+        """The side from which each sliding velocity is pressed."""
+        if self.side is None or not self.both:
+            return 1
+        return jnp.repeat(modes[slice(*self.side)], 1 + self.plane)
 
     @property
     def partners(self) -> np.ndarray:
@@ -94,6 +106,17 @@ class Tangent(eqx.Module):
         else:
             found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
         return jnp.repeat(jnp.ravel(jnp.asarray(found, t.dtype)), 2 if self.plane else 1)
+
+    def friction(self, t: Array, q: PyTree, slip: Array, v: PyTree, forces: dict, given: InModes) -> Float[Array, " k"]:
+        """The force along each sliding velocity, `slip`, while it slides or others hold it; else zero."""
+        params, mode = given.params, given.modes[slice(*self.at)]
+        side = jnp.where(jnp.abs(mode) == 1, mode, 0).astype(t.dtype)
+        speed = self.speeds(slip) if self.plane else side * slip
+        side = side * slip / speed if self.plane else side
+        leans, pressed = mode == LEANS, self.normal_forces(t, q, v, forces, params) * self.sides(given.modes)
+        mu = jnp.where(leans, self.sticking(speed, params), self.kinetic(speed, params))
+        held = directions(given.slack[slice(*self.at)].astype(t.dtype), self.partners)
+        return jnp.where(leans, held, -side) * mu * pressed
 
     def kinetic(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """μ while it slides with this speed."""
@@ -133,15 +156,26 @@ class Laws(eqx.Module):
     @property
     def guarded(self) -> int:
         """The number of modes that have guards."""
-        return self.compliant[-1].at[1] if self.compliant else len(self.rows)
+        return len(self.rows) + sum(law.at[1] - law.at[0] for law in self.compliant) + self.two_sides
+
+    @property
+    def sided(self) -> tuple[Tangent, ...]:
+        """What slides under normal forces that may fall below zero."""
+        return tuple(law for law in self.tangents if law.side is not None)
+
+    @property
+    def two_sides(self) -> int:
+        """The number of normal forces that may fall below zero."""
+        return sum(law.side[1] - law.side[0] for law in self.sided if law.side)
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """What each mode is one of."""
         gaps, slips = self.count
-        springs, controls = self.guarded - gaps - slips, len(self.sampled)
-        many = {"gap": gaps, "sliding velocity": slips, "spring": springs, "control": controls}
-        return tuple(kind for kind, count in many.items() for _ in range(count))
+        springs = self.guarded - gaps - slips - self.two_sides
+        sliding = ["sliding velocity" + " in a plane" * bool(x) for x in self.in_planes]
+        last = ["spring"] * springs + ["side"] * self.two_sides + ["control"] * len(self.sampled)
+        return *["gap"] * gaps, *sliding, *last
 
     @property
     def is_sampled(self) -> np.ndarray:
@@ -156,7 +190,10 @@ class Laws(eqx.Module):
             for law in (*self.normals, *self.tangents, *self.compliant)
             for i in range(law.at[1] - law.at[0])
         )
-        return guarded + tuple(law.name for law in self.sampled)
+        sides = tuple(
+            f"{law.name} normal" + (f"[{i}]" if n > 1 else "") for law in self.sided for i, n in _places(law.side)
+        )
+        return guarded + sides + tuple(law.name for law in self.sampled)
 
     @property
     def partners(self) -> np.ndarray:
@@ -179,7 +216,8 @@ class Laws(eqx.Module):
             for _ in range(law.at[1] - law.at[0])
         ]
         springs = [law.name for law in self.compliant for _ in range(law.at[1] - law.at[0])]
-        return *gaps, *slips, *springs, *(law.name for law in self.sampled)
+        sides = [law.name for law in self.sided for _ in _places(law.side)]
+        return *gaps, *slips, *springs, *sides, *(law.name for law in self.sampled)
 
     def modes_in_words(self, modes) -> list[str]:
         """Each of these modes in a word."""
@@ -207,20 +245,60 @@ class Laws(eqx.Module):
         off = off.at[..., np.array(self.rows, int)].set(~self.holds(modes))
         return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
 
-    def in_rows(self, given: InModes, modes: Int[Array, " kNT"]) -> InModes:
-        """The same with these modes of normals and tangents."""
-        return self.given(given.params, jnp.concatenate([modes, given.modes[len(self.rows) :]]))
+    def in_rows(self, given: InModes, modes: Int[Array, " kNT"], sides: Int[Array, " ks"] | None = None) -> InModes:
+        """The same with these modes of normals and tangents; and, if given, from these sides."""
+        every = jnp.concatenate([modes, given.modes[len(self.rows) :]])
+        if sides is not None:
+            every = every.at[self.guarded - self.two_sides : self.guarded].set(sides)
+        return self.given(given.params, every)
 
     def at_first(self, t: Array, params: PyTree) -> InModes:
         """The parameters at the start of a motion, with all gaps open."""
         instants = [jnp.reshape(law.first(t, params), 1) for law in self.sampled]
-        return self.given(params, jnp.concatenate([jnp.zeros(self.guarded, int), *instants]))
+        first = jnp.zeros(self.guarded, int).at[self.guarded - self.two_sides :].set(1)
+        return self.given(params, jnp.concatenate([first, *instants]))
 
     def all_closed(self) -> dict[str, Int[Array, " k"]]:
         """All gaps closed, by whether what can slide sticks or slides."""
         gaps, slips = self.count
-        rest = [PRESSED] * (self.guarded - gaps - slips) + [0] * len(self.sampled)
+        springs = self.guarded - gaps - slips - self.two_sides
+        rest = [PRESSED] * springs + [1] * self.two_sides + [0] * len(self.sampled)
         return {words: jnp.array([CLOSED] * gaps + [mode] * slips + rest, int) for words, mode in ALL_CLOSED.items()}
+
+    def numbers(self, t: Array, params: PyTree) -> list[tuple[str, Array, Array]]:
+        """Numbers that laws bound, and that depend on parameters alone: what each is, and whether it may be that.
+
+        Coefficients that depend on a speed are looked at where they are used (`Meeting.met`).
+        """
+        found = []
+
+        def bounded(role: str, law: Any, least: float = 0.0, most: float = np.inf, above: bool = False):
+            if law is None or callable(law) and takes_of_coefficient(law) != ("params",):
+                return
+            value = jnp.asarray(law(params) if callable(law) else law, t.dtype)
+            found.append((role, value, (value > least if above else value >= least) & (value <= most)))
+
+        for law in self.normals:
+            bounded(f"the restitution of '{law.name}'", law.restitution, most=at_most_one(t.dtype))
+            bounded(f"slower_than of '{law.name}'", law.slower_than)
+        for law in self.tangents:
+            bounded(f"the coefficient of '{law.name}'", law.coefficient)
+            bounded(f"the static coefficient of '{law.name}'", law.static)
+            if law.normal is not None and not callable(law.normal):
+                bounded(f"the normal force of '{law.name}'", law.normal)
+        for law in self.compliant:
+            bounded(f"the stiffness of '{law.name}'", law.stiffness, above=True)
+            bounded(f"the damping of '{law.name}'", law.damping)
+        for law in self.sampled:
+            largest = float(np.finfo(t.dtype).max)
+            bounded(f"every of '{law.name}'", law.every, most=largest, above=True)
+            bounded(f"offset of '{law.name}'", law.offset, -largest, largest)
+        return found
+
+    def allow(self, t: Array, params: PyTree) -> Bool[Array, ""]:
+        """Whether all `numbers` are what laws allow."""
+        found = [jnp.all(allowed) for _, _, allowed in self.numbers(t, params)]
+        return jnp.all(jnp.stack([jnp.asarray(True), *found]))
 
     def in_numbers(self, state: State) -> dict[str, Array]:
         """What the laws are besides the functions of the system, by role, at a state."""
@@ -254,7 +332,7 @@ class Laws(eqx.Module):
             found.append(jnp.where(given.modes[slice(*law.at)] == CLOSED, force, law.gaps(t, q, params)))
         for law in self.tangents:
             mode, slips = given.modes[slice(*law.at)], law.slips(t, q, v, params)
-            most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params)
+            most = law.sticking(slips, params) * law.normal_forces(t, q, v, forces, params) * law.sides(given.modes)
             holds = most - lengths(jnp.ravel(multipliers[law.name]), law.partners)
             slack = given.slack[slice(*law.at)]
             slides = law.speeds(slips) - 2 * slack if law.plane else mode * slips
@@ -263,14 +341,24 @@ class Laws(eqx.Module):
             found.append(jnp.where(mode == STICKS, holds, moves))
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
+        for law in self.sided:
+            found.append(given.modes[slice(*law.side)] * law.normal_forces(t, q, v, forces, params)[:: 1 + law.plane])
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
 
+    def rests(self, given: InModes) -> Bool[Array, " k"]:
+        """Which guards rest: of gaps at zero that others hold, and of what is free or held by others."""
+        modes, (gaps, slips) = given.modes[: self.guarded], self.count
+        place = np.arange(self.guarded)
+        of_slips = (place >= gaps) & (place < gaps + slips)
+        return jnp.where(place < gaps, given.slack[: self.guarded] < 0, of_slips & ((modes == FREE) | (modes == LEANS)))
+
     def slack(self, given: InModes) -> Float[Array, " k"]:
-        """How far below zero the guard of each mode may be: its slack, or the size of that where it is a vector."""
+        """How far below zero the guard of each mode may be: its slack, or the size of that where it is a vector,
+        or says by its sign that the guard rests."""
         rows, (normals, _) = len(self.rows), self.count
         tangents = given.slack[normals:rows]
         size = jnp.where(given.modes[normals:rows] == LEANS, lengths(tangents, self.partners), tangents)
-        return given.slack.at[normals:rows].set(size)[: self.guarded]
+        return jnp.abs(given.slack).at[normals:rows].set(size)[: self.guarded]
 
     def pressed(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"]
@@ -286,6 +374,15 @@ class Laws(eqx.Module):
     def forces(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> dict[str, Array]:
         """F of what is compliant, by name."""
         return {law.name: jnp.reshape(law.forces(t, q, v, given), law.shape) for law in self.compliant}
+
+    def acting(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes) -> dict[str, Array]:
+        """The forces of elements by name, besides those of gaps: F of what is compliant, and friction."""
+        found = self.forces(t, q, v, given)
+        for law in self.tangents:
+            slides, holds = jnp.abs(given.modes[slice(*law.at)]) == 1, multipliers[law.name]
+            rubs = law.friction(t, q, law.slips(t, q, v, given.params), v, multipliers | found, given)
+            found[law.name] = jnp.where(slides, rubs, jnp.ravel(holds)).reshape(jnp.shape(holds))
+        return found
 
     def acted(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> tuple[PyTree, InModes]:
         """q and the modes after the instants at this time, if any."""
@@ -304,7 +401,10 @@ class Laws(eqx.Module):
         # While JAX traces something else, numbers that it does not trace can still be counted.
         with jax.ensure_compile_time_eval():
             ends = jnp.asarray(ts[0]), jnp.asarray(ts[-1])
+            # What no clock has is refused at the start of the motion.
+            runs = [law.instant(1, ends[1], params) > law.instant(0, ends[1], params) for law in self.sampled]
             counted = [law.first(ends[1], params) - law.first(ends[0], params) for law in self.sampled]
+            counted = [jnp.where(ticks, count, 0) for ticks, count in zip(runs, counted)]
         return 0 if is_traced(counted) else sum(map(int, counted))
 
     def next_instant(self, modes: Int[Array, " k"], ts: Float[Array, " T"], params: PyTree) -> Float[Array, ""]:
@@ -318,3 +418,14 @@ class Laws(eqx.Module):
             t = t + stop_gradient(jnp.where(jnp.any(near), output - t, 0.0))
             found = jnp.where((t < ts[-1]) & (t < found), t, found)
         return found
+
+
+def at_most_one(dtype) -> float:
+    """The largest restitution, one but for round-off."""
+    return 1 + 64 * float(jnp.finfo(dtype).eps)
+
+
+def _places(at: tuple[int, int] | None) -> list[tuple[int, int]]:
+    """The places within a law, each with how many there are."""
+    count = 0 if at is None else at[1] - at[0]
+    return [(i, count) for i in range(count)]

@@ -4,6 +4,7 @@ Modes are those of gaps first, then of sliding velocities, of springs, and of sa
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -42,7 +43,8 @@ def laws_of(elements: Elements, plain: System, start: State):
     of = ElementLaws(elements, plain, start)
     normals = of.normals()
     tangents, owners = of.tangents(normals)
-    return normals, tangents, owners, of.compliant(), of.sampled()
+    compliant = of.compliant()
+    return normals, of.sided(tangents), owners, compliant, of.sampled()
 
 
 class ElementLaws:
@@ -116,7 +118,18 @@ class ElementLaws:
         if own and key in self.elements:
             raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
         plane = jnp.shape(sliding.program.value) == (*shape, 2)
-        return Tangent(key, sliding, mu, static, normal, source, self.places(_size(sliding)), plane)
+        both = source in self.plain.constraints
+        return Tangent(key, sliding, mu, static, normal, source, self.places(_size(sliding)), plane, both)
+
+    def sided(self, tangents: tuple[Tangent, ...]) -> tuple[Tangent, ...]:
+        """The same with places for the sides from which they are pressed, where normal forces may fall below zero."""
+
+        def with_side(law: Tangent) -> Tangent:
+            if not (law.both or callable(law.normal)):
+                return law
+            return replace(law, side=self.places((law.at[1] - law.at[0]) // (1 + law.plane)))
+
+        return tuple(map(with_side, tangents))
 
     def normal_force(self, name: str, normal: Any) -> tuple[str, Any]:
         """The name of what presses, or the normal force itself."""

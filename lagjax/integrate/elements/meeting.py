@@ -22,12 +22,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.complementarity import ContactProblem, Forces, directions, lengths, pseudo_inverse
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
 from lagjax.integrate.elements.redundant import AtBound, HeldRows, within_laws
+from lagjax.integrate.stepping.tolerances import FROM_NOTHING, Forced, rounding
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -42,6 +44,8 @@ LIGHT = 1e-6
 NO_FORCE = 500
 # What has let go, by its slack, opens at least by this part of its own response to that.
 LET_GO = 0.01
+# Where in the time of a motion its forces are looked at: not evenly, since these may be periodic.
+LOOKED_AT = (0.0, 0.117, 0.241, 0.371, 0.487, 0.619, 0.743, 0.883, 1.0)
 # Sliding in a plane ends at so many tolerances of the velocities in the motion, or at so many round-offs of them: below
 # one tolerance steps jump over it, and the motion goes to and fro.
 ENDS_AT, ENDS_AT_ROUND_OFFS = 3.0, 1000
@@ -65,21 +69,29 @@ class AtMeeting(NamedTuple):
 
 
 class Met(NamedTuple):
-    """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws."""
+    """Velocities and modes after a meeting; `found`: whether there are forces that obey the laws; `presses`: whether
+    normal forces that press from one side are above zero; `allowed`: whether coefficients are what they may be."""
 
     v: PyTree[Float[Array, "..."]]
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     found: Bool[Array, ""]
+    presses: Bool[Array, ""] | bool = True
+    allowed: Bool[Array, ""] | bool = True
 
 
 class Decided(NamedTuple):
-    """Which modes follow from the forces; `onto`: the velocities that contacts get; NaN, what they have."""
+    """Which modes follow from the forces; `onto`: the velocities that contacts get; NaN, what they have; `sides`: those
+    from which normal forces press, with `of_sides`, the slack of these."""
 
     modes: Int[Array, " k"]
     slack: Float[Array, " k"]
     onto: Float[Array, " k"]
     found: Bool[Array, ""]
+    presses: Bool[Array, ""]
+    allowed: Bool[Array, ""]
+    sides: Int[Array, " ks"]
+    of_sides: Float[Array, " ks"]
 
 
 class Rows(NamedTuple):
@@ -96,13 +108,29 @@ class Rows(NamedTuple):
     root_mass: Float[Array, " n"]
     acceleration: Float[Array, " n"]
 
-    def sizes(self, known: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+    def passed_on(self, a: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The accelerations by single forces, of those that give `a` and of contacts that pass them on to others."""
+        own = jnp.diag(self.matrix)
+        step = 1 / jnp.where(own > 0, own, jnp.inf)
+        part = jnp.abs(self.matrix) * step[None]
+
+        def next_to_next(_, found: Array) -> Array:
+            return jnp.maximum(found, jnp.max(part * found[None], axis=1))
+
+        of_rows = lax.fori_loop(0, own.size, next_to_next, jnp.abs(self.jacobian) @ jnp.abs(a))
+        return jnp.maximum(jnp.abs(a), jnp.max(jnp.abs(self.response) * (step * of_rows)[:, None], axis=0))
+
+    def sizes(self, known: Float[Array, "2 n"], a: Float[Array, " n"], span: Float[Array, ""]) -> Float[Array, "2 n"]:
         """How large coordinates and velocities become, where all share one size, measured in √M_ii times them.
 
-        A motion that is at rest now, at x, has velocities of the size √(a x).
+        A motion that is at rest now, at x, has velocities of the size √(a x). What rests at zero, but for the round-off
+        of accelerations `a` in the time `span`, has the size that a motion from there is given (`tolerances.py`).
         """
         x, u = jnp.max(self.root_mass[None] * known, axis=1)
-        u = jnp.maximum(u, jnp.sqrt(x * jnp.max(self.root_mass * jnp.abs(self.acceleration))))
+        forced = jnp.max(self.root_mass * a)
+        way = forced * span**2
+        x = jnp.where(x <= rounding(way), FROM_NOTHING[0] * way, x)
+        u = jnp.maximum(u, jnp.sqrt(x * jnp.maximum(jnp.max(self.root_mass * jnp.abs(self.acceleration)), forced)))
         least = LIGHT * jnp.max(self.root_mass)
         heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
         return jnp.stack([x, u])[:, None] / heavy[None]
@@ -112,15 +140,20 @@ class AsFound(NamedTuple):
     """The contacts as a meeting finds them, and below which size what they are made of is zero.
 
     - `closed` (k_N,), `fired` (k,): which gaps are closed; which modes end.
-    - `scale` (k, 2): the sizes of gaps, or ways, and of velocities.
+    - `scale` (k, 2): the sizes of gaps, or ways, and of velocities; `forced` (k,): of the accelerations by forces that
+      may cancel; `drift` (k,): how far the round-off of these may take a gap in the whole motion.
     - `velocity` (k,): still is what is slower; `ends` (k_T,): the speed at which sliding in a plane ends.
+    - `below` (k_N,): how far gaps are below zero.
     """
 
     closed: Bool[Array, " kN"]
     fired: Bool[Array, " k"]
     scale: Float[Array, "k 2"]
+    forced: Float[Array, " k"]
+    drift: Float[Array, " k"]
     velocity: Float[Array, " k"]
     ends: Float[Array, " kT"]
+    below: Float[Array, " kN"]
 
     @property
     def gap(self) -> Float[Array, " kN"]:
@@ -154,7 +187,7 @@ class ContactForces(NamedTuple):
         It begins against its friction, or as nothing holds it.
         """
         problem, normals = self.problem, self.problem.may_push.size
-        most = problem.coefficient * jnp.maximum(problem.normal_forces(self.forces), 0.0)
+        most = problem.most(self.forces)
         # The force of friction is larger than its acceleration, and so says more about the direction.
         begins = directions(jnp.where(most > 0, -self.forces[normals:], self.a[normals:]), problem.partners)
         moves = lengths(self.a[normals:], problem.partners) > self.no_acceleration[normals:]
@@ -162,15 +195,24 @@ class ContactForces(NamedTuple):
 
 
 class Meeting(eqx.Module):
-    """Solves the contacts of a system in modes (`laws.py`) at one state; `rtol`: the tolerance of the motion."""
+    """Solves the contacts of a system in modes (`laws.py`) at one state; `rtol`, `forced`: those of the motion."""
 
     system: System
     laws: Laws
     rtol: Any = 1e-9
+    forced: Forced | None = None
 
-    def with_tolerance(self, rtol: Float[Array, ""]) -> "Meeting":
-        """The same in a motion of this tolerance."""
-        return Meeting(self.system, self.laws, stop_gradient(rtol))
+    def in_motion(self, rtol: Array, ts: Array, q: PyTree, v: PyTree, params: PyTree) -> "Meeting":
+        """The same in a motion of this tolerance, over these times from this start."""
+        rtol, ts, q, v, params = stop_gradient((rtol, ts, q, v, params))
+        if not self.laws.rows:
+            return Meeting(self.system, self.laws, rtol)
+        given = self.laws.at_first(ts[0], params)
+        times = ts[0] + np.array(LOOKED_AT, ts.dtype) * (ts[-1] - ts[0])
+        rows = self._rows(self._at(ts[0], q, v, given))
+        free = jax.vmap(lambda t: self._acceleration(self._at(t, q, v, given)))(times)
+        forced = Forced(times, jax.vmap(rows.passed_on)(jnp.nan_to_num(free, posinf=0.0, neginf=0.0)))
+        return Meeting(self.system, self.laws, rtol, stop_gradient(forced))
 
     def __call__(
         self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"], instant: Bool[Array, ""]
@@ -197,19 +239,23 @@ class Meeting(eqx.Module):
         coordinates and velocities of the motion. Without `impacts` gaps that close stay open."""
         at = self._at(t, q, v, given)
         rows = self._rows(at)
-        sizes = rows.sizes(sizes)
-        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian) @ sizes.T))
+        forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
+        moved, sizes = rows.sizes(sizes, 0.0 * forced, span)[1], rows.sizes(sizes, forced, span)
+        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes, moved))
+        allowed = jnp.asarray(True)
         if impacts and self.laws.normals:
-            at = at._replace(u=at.u + self._struck(at, rows, contacts.closed).impulses() @ rows.response)
+            struck = self._struck(at, rows, contacts.closed)
+            at, allowed = at._replace(u=at.u + struck.impulses() @ rows.response), struck.allowed()
         given, reach = self.laws.pressed(*at.state[:3], given, fired, sizes)
         at = at._replace(given=given)
         decided = self._decided(*stop_gradient((at, rows, contacts)))
         u = at.u + self._onto(at, rows, decided.onto) @ rows.response
-        after = self.laws.in_rows(given, decided.modes)
+        after = self.laws.in_rows(given, decided.modes, decided.sides)
         # The rates of states are those of the new velocities.
         u = resolved(at.model.of(after), t, at.x, u)
-        slack = jnp.concatenate([decided.slack, reach, jnp.zeros(len(self.laws.sampled), u.dtype)])
-        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found)
+        slack = jnp.concatenate([decided.slack, reach, decided.of_sides, jnp.zeros(len(self.laws.sampled), u.dtype)])
+        allowed = allowed & decided.allowed
+        return Met(at.model.tree(u), after.modes, stop_gradient(slack), decided.found, decided.presses, allowed)
 
     def first(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[PyTree, Met]:
         """q and the modes that fit the start of a motion; gaps that close are left to their guards."""
@@ -246,27 +292,56 @@ class Meeting(eqx.Module):
         response, added = jax.vmap(lambda load: solve_saddle_point(mass, held, load, still, independent))(loads)
         return Rows(jacobian, response[:-1], jacobian @ response[:-1].T, added[:-1], root_mass, response[-1])
 
+    def _acceleration(self, at: AtMeeting) -> Float[Array, " n"]:
+        """The acceleration with all gaps open."""
+        model, t, x, u, _ = at
+        held, linear = (
+            constraints.jacobian(model, t, x, u)[self._places(model)[1]],
+            mass_and_forcing(self._free(at), t, x, u),
+        )
+        still = jnp.zeros(len(held), x.dtype)
+        return solve_saddle_point(linear.mass, held, linear.forcing, still, independent_rows(held))[0]
+
     def _velocities(self, at: AtMeeting) -> Float[Array, " k"]:
         """The rates of gaps, and sliding velocities."""
         return constraints.velocity_residual(*at[:4])[self._places(at.model)[0]]
 
-    def _as_found(self, at: AtMeeting, fired: Bool[Array, " k"], scale: Float[Array, "k 2"]) -> AsFound:
-        """The contacts before an impact; `scale`: the sizes that coordinates and velocities give."""
+    def _as_found(
+        self,
+        at: AtMeeting,
+        fired: Bool[Array, " k"],
+        rows: Array,
+        sizes: Float[Array, "2 n"],
+        moved: Float[Array, " n"],
+    ) -> AsFound:
+        """The contacts before an impact; `rows` (k, n): |A|; `sizes`: of coordinates and velocities; `moved`: of
+        velocities, zero where nothing has moved."""
         laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
-        modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, at.given.slack, fired))
+        scale, forced, drift = rows @ sizes.T, jnp.zeros(len(rows), t.dtype), jnp.zeros(len(rows), t.dtype)
+        if self.forced is not None:
+            a, span = self.forced.around(t)
+            forced = rows @ a
+            drift = _round_offs(CLOSED_BELOW, rows @ jnp.max(self.forced.a, axis=0) * span**2)
+        modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, jnp.abs(at.given.slack), fired))
         gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
         closed = (modes == CLOSED)[:normals] | fired[:normals]
-        closed = closed | (jnp.abs(gaps) <= _round_offs(4 * CLOSED_BELOW, scale[:normals, 0]))
+        # Also what forces close before the clock moves.
+        at_once = jnp.finfo(t.dtype).eps * drift[:normals]
+        zero = jnp.maximum(jnp.maximum(_round_offs(4 * CLOSED_BELOW, scale[:normals, 0]), slack[:normals]), at_once)
+        closed = closed | (jnp.abs(gaps) <= zero)
         # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
         slid = (jnp.abs(modes) == 1).at[:normals].set(False)
         before = jnp.where(slid, STILL_BELOW / CLOSED_BELOW * slack, 0.0)
-        # What slides is still where its guard ends that: as near to zero as the time of that is known.
-        reached = jnp.where(slid & fired & ~self._in_planes, 2 * jnp.abs(self._velocities(at)), 0.0)
+        # What was held is still; and what slides, where its guard ends that, as near to zero as its time is known.
+        still = laws.holds(modes) | slid & fired & ~self._in_planes
+        reached = jnp.where(still, 2 * jnp.abs(self._velocities(at)), 0.0)
         velocity = jnp.maximum(jnp.maximum(_round_offs(STILL_BELOW, scale[:, 1]), before), reached)
         part = self._ends_at(t.dtype)
-        ends = part * lengths(scale[normals:, 1], laws.partners)
+        ends = part * lengths((rows @ moved)[normals:], laws.partners)
         # Also where nothing has moved yet.
-        return AsFound(closed, fired, scale, velocity, jnp.where(ends > 0, ends, part))
+        return AsFound(
+            closed, fired, scale, forced, drift, velocity, jnp.where(ends > 0, ends, part), jnp.maximum(-gaps, 0.0)
+        )
 
     def _ends_at(self, dtype) -> Float[Array, ""]:
         """At which part of the velocities in the motion sliding in a plane ends."""
@@ -344,7 +419,10 @@ class Meeting(eqx.Module):
         moving, resting = (self._coefficients(at, slips, sticking) for sticking in (False, True))
         mu = jnp.where(lengths(slides, self.laws.partners) > 0, moving, resting)
         free = rows.jacobian @ a - every.gamma[mine]
-        problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners)
+        both = np.concatenate(
+            [np.zeros(0, bool), *(np.full(law.at[1] - law.at[0], law.both) for law in self.laws.tangents)]
+        )
+        problem = ContactProblem(rows.matrix, free, touching, of_forces, constant, mu, slides, self.laws.partners, both)
         return problem, HeldRows(rows.jacobian, held, multipliers, rows.of_constraints)
 
     def _contact_forces(self, at: AtMeeting, rows: Rows, contacts: AsFound) -> ContactForces:
@@ -353,13 +431,13 @@ class Meeting(eqx.Module):
         # What has just let go, by its slack, is not closed where nothing pushes and nothing opens. It may open far more
         # slowly than by its own response, since others stay closed.
         let_go = contacts.fired & self.laws.holds(at.given.modes)
-        # What others hold lets go with them.
-        with_others = (at.given.modes[: let_go.size] == LEANS) & jnp.any(let_go)
+        # What it held, or what rests beside it, lets go with it.
+        part = jnp.where(jnp.any(let_go), LET_GO, 1.0)
 
         def solution(bound: AtBound, forces: Forces) -> ContactForces:
-            no_force = _no_force(problem, forces.forces, contacts.scale)
-            least = jnp.where(with_others, LET_GO * no_force, no_force)
-            least = jnp.where(let_go, LET_GO * at.given.slack[: let_go.size], least)
+            no_force = _no_force(problem, forces.forces, contacts)
+            least = part * no_force
+            least = jnp.where(let_go, LET_GO * jnp.abs(at.given.slack[: let_go.size]), least)
             a = problem.matrix @ forces.forces + problem.free
             return ContactForces(problem, bound, forces.forces, a, no_force, least / problem.step, forces.found)
 
@@ -382,7 +460,8 @@ class Meeting(eqx.Module):
         """The modes after a meeting, by the forces at accelerations."""
         laws, (normals, _) = self.laws, self.laws.count
         if not laws.rows:
-            return Decided(at.given.modes[:0], at.u[:0], at.u[:0], jnp.asarray(True))
+            no_modes, nothing, yes = at.given.modes[:0], at.u[:0], jnp.asarray(True)
+            return Decided(no_modes, nothing, nothing, yes, yes, yes, no_modes, nothing)
         solution = self._contact_forces(at, rows, contacts)
         sides = solution.sides()
         modes = self._modes(at, solution)
@@ -394,10 +473,27 @@ class Meeting(eqx.Module):
         released = (at.given.modes[normals : len(laws.rows)] == LEANS) & (jnp.abs(modes[normals:]) == 1)
         released = jnp.where(released & ~solution.problem.given, 0.0, jnp.nan)
         onto = jnp.concatenate([jnp.full(normals, jnp.nan), jnp.where(begins, 2 * ends * sides, released)])
-        slowest = jnp.where(laws.in_planes, ends, _round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]))
+        # A guard may begin as far below zero as it is: what rests is not zero, but its round-off.
+        slips = jnp.abs(self._velocities(at)[normals:])
+        slips = jnp.where(slips <= contacts.velocity[normals:], 2 * slips, 0.0)
+        slowest = jnp.maximum(_round_offs(CLOSED_BELOW, contacts.scale[normals:, 1]), slips)
+        slowest = jnp.where(laws.in_planes, ends, slowest)
         slowest = jnp.where(modes[normals:] == LEANS, contacts.ends * solution.bound.leans, slowest)
-        slack = jnp.where(holds, solution.no_force, jnp.concatenate([contacts.gap, slowest]))
-        return Decided(modes, slack, jnp.where(holds, 0.0, onto), solution.found)
+        nearest = jnp.where(solution.bound.lifted, contacts.gap + contacts.drift[:normals], contacts.gap)
+        nearest = jnp.where(solution.problem.may_push, jnp.maximum(nearest, contacts.below), nearest)
+        slack = jnp.where(holds, solution.no_force, jnp.concatenate([nearest, slowest]))
+        # By its sign, that a guard rests.
+        rests = jnp.concatenate([solution.bound.lifted, jnp.zeros(holds.size - normals, bool)])
+        slack = jnp.where(rests, -slack, slack)
+        # Of each normal force, not of both components of a plane.
+        found, places = solution.problem.normal_forces(solution.forces), np.zeros(0, int)
+        places = np.concatenate([places, *(np.arange(*law.at, 1 + law.plane) - normals for law in laws.sided)])
+        both, pressed, of_sides = solution.problem.both[places], found[places], solution.no_force[normals:][places]
+        presses = jnp.all(both | (pressed >= -of_sides / 2))
+        sides = jnp.where(both & (pressed < 0), -1, 1).astype(modes.dtype)
+        onto = jnp.where(holds, 0.0, onto)
+        allowed = jnp.all(solution.problem.coefficient >= 0)
+        return Decided(modes, slack, onto, solution.found, presses, allowed, sides, of_sides)
 
     def _onto(self, at: AtMeeting, rows: Rows, wanted: Float[Array, " k"]) -> Float[Array, " k"]:
         """The impulses that give contacts the velocities `wanted`; NaN where they keep theirs."""
@@ -414,11 +510,11 @@ def _round_offs(count: float, x: Array) -> Array:
     return count * jnp.finfo(x.dtype).eps * x
 
 
-def _no_force(problem: ContactProblem, forces: Float[Array, " k"], scale: Float[Array, "k 2"]) -> Float[Array, " k"]:
+def _no_force(problem: ContactProblem, forces: Float[Array, " k"], contacts: AsFound) -> Float[Array, " k"]:
     """Below which size a force is zero."""
-    normals = problem.may_push.size
+    normals, scale = problem.may_push.size, contacts.scale
     # The acceleration of a motion of this size and speed.
     faster = scale[:, 1] ** 2 / jnp.where(scale[:, 0] > 0, scale[:, 0], jnp.inf)
-    accelerations = jnp.abs(problem.free) + jnp.abs(problem.matrix) @ jnp.abs(forces) + faster
+    accelerations = jnp.abs(problem.free) + jnp.abs(problem.matrix) @ jnp.abs(forces) + faster + contacts.forced
     found = NO_FORCE * jnp.finfo(forces.dtype).eps * problem.step * accelerations
     return jnp.concatenate([found[:normals], lengths(found[normals:], problem.partners)])

@@ -67,8 +67,8 @@ class HeldRows(NamedTuple):
         at_zero = jnp.where(on, problem.step * problem.free, rubbed * pressed)
         at_zero = jnp.concatenate([at_zero, null @ jnp.concatenate([jnp.zeros(k, dtype), self.constant])])
         forces = -jnp.linalg.pinv(slope, rtol=small) @ at_zero
-        most = problem.coefficient * jnp.maximum(problem.normal_forces(forces), 0.0)
-        beyond = jnp.concatenate([-forces[:gaps], lengths(forces[gaps:], problem.partners) - most])
+        beyond = lengths(forces[gaps:], problem.partners) - problem.most(forces)
+        beyond = jnp.concatenate([-forces[:gaps], beyond])
         return forces, jnp.where(on & (jnp.diag(null)[:k] > small), beyond, 0.0)
 
 
@@ -96,7 +96,7 @@ def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tup
         bound, tried = before.next, before.next.on(problem)
         solution = solved(tried)
         on, no_force = holds(bound, solution)
-        shortest, beyond = held.excess(tried, on)
+        shortest, beyond = held.excess(tried.on_sides_of(solution.forces), on)
         worst = jnp.max(beyond - no_force / 2)
         here = (beyond - no_force / 2 == worst) & (worst > 0)
         leans = jnp.where(here[gaps:], directions(shortest[gaps:], problem.partners), bound.leans)

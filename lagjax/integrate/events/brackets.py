@@ -161,7 +161,9 @@ def pieces_of(begin: GuardValue, inner, off, end: GuardValue, h: Array, touches,
         rises = (three - two) * direction[i] >= bent
         if i == 0:
             # No polygon rises from a start on the guard at rate zero, as t³ has.
-            flat = (jnp.abs(one) <= begin.noise) & (third * jnp.abs(rate[0]) <= FLAT * jnp.abs(four))
+            flat = (jnp.abs(one) <= jnp.maximum(begin.noise, at_zero)) & (
+                third * jnp.abs(rate[0]) <= FLAT * jnp.abs(four)
+            )
             rises = rises | (flat & (sign[1] == direction[0]))
         monotone.append(same & rises)
         doubt.append(~(clear | monotone[i]))

@@ -26,6 +26,7 @@ from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
+from lagjax.integrate.solve.assembly import InElements
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
@@ -59,8 +60,9 @@ def trajectory_of(*problem) -> Trajectory:
     """Return the trajectory of (system, q0, v0, params, ts, guards, settings); a failure is recorded in its result.
 
     If nothing is traced, the equations are first assumed regular, which compiles in two thirds of the time and is
-    enough for most systems; if that fails, the robust solve is compiled too and used from then on. Equinox's wrapper of
-    `jit` takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
+    enough for most systems; if that fails, the robust solve is compiled too and used from then on. Where contacts may
+    hold more than there are coordinates it is the only one: numbers decide whether they do. Equinox's wrapper of `jit`
+    takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
     """
     if not is_eager():
         return _inside(*problem)
@@ -74,7 +76,7 @@ def trajectory_of(*problem) -> Trajectory:
         return hashable_partition((*motion, many, guards, settings))
 
     arrays, static = of(settings)
-    programs = program_of((_Programs, static), lambda: _Programs(static, len(ts)))
+    programs = program_of((_Programs, static), lambda: _Programs(static, len(ts), not _may_hold_too_much(*motion[:2])))
     try:
         found = programs.run(arrays, len(ts), shown)
         if not settings.repeated_up_to:
@@ -88,7 +90,7 @@ def _inside(*problem):
     """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
     *motion, settings = problem
     # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
-    regular = takes_for_regular() and settings.adjoint is None
+    regular = takes_for_regular() and settings.adjoint is None and not _may_hold_too_much(*motion[:2])
     settings = replace(settings, robust=not regular)
     found, settled = _trajectory_of(*motion, settings)
     if settings.repeated_up_to:
@@ -97,13 +99,19 @@ def _inside(*problem):
     return report_settled(found, settled) if regular else found
 
 
+def _may_hold_too_much(system: System, q0: PyTree) -> bool:
+    """Whether contacts and constraints may be more than coordinates, and so depend on each other."""
+    laws = system.laws if isinstance(system, InElements) else None
+    return laws is not None and laws.equations > sum(map(np.size, jtu.tree_leaves(q0)))
+
+
 class _Programs:
     """The compiled programs of one kind of motion: with the equations assumed regular (None once they turned out not to
     be), and with the robust solve. JAX keeps them as long as this object lives."""
 
-    def __init__(self, static: HashablePart, count: int):
+    def __init__(self, static: HashablePart, count: int, regular: bool):
         jit = partial(jax.jit, compiler_options=compiler_options())
-        self.regular: Callable | None = jit(partial(_of_arrays, static, False, count))
+        self.regular: Callable | None = jit(partial(_of_arrays, static, False, count)) if regular else None
         self.robust: Callable = jit(partial(_of_arrays, static, True, count))
         self._count, self._compiled = count, set()
 

@@ -99,9 +99,9 @@ class Phase(NamedTuple):
         """Whether legs end at instants of sampled controls, too."""
         return self.meeting is not None and bool(self.meeting.laws.sampled)
 
-    def with_tolerance(self, rtol: Float[Array, ""]) -> "Phase":
-        """The same in a motion of this tolerance."""
-        return self if self.meeting is None else self._replace(meeting=self.meeting.with_tolerance(rtol))
+    def in_motion(self, *motion: Any) -> "Phase":
+        """The same in a motion of this tolerance, over these times from this start (`Meeting.in_motion`)."""
+        return self if self.meeting is None else self._replace(meeting=self.meeting.in_motion(*motion))
 
     def until(self, modes: "Modes | None", ts: Array, params: PyTree) -> Float[Array, ""]:
         """The next instant."""
@@ -160,7 +160,7 @@ def solved_in_legs(
     hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases, settings: Settings, adjoint: Any
 ):
     """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
-    phases = [phase.with_tolerance(settings.rtol[0]) for phase in phases]
+    phases = [phase.in_motion(settings.rtol[0], ts, q0, v0, params) for phase in phases]
     first = _first_leg(hybrid, q0, v0, params, ts, phases[0], settings)
 
     def next_legs(way: PhaseWay) -> PhaseWay:
@@ -222,7 +222,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     if phase.meeting is not None:
         q0, met = phase.meeting.first(ts[0], q0, v0, params)
         v0, modes = met.v, Modes(met.modes, met.slack)
-        multipliers = multipliers | phase.meeting.laws.forces(ts[0], q0, v0, phase.given(params, modes))
+        multipliers = multipliers | phase.meeting.laws.acting(ts[0], q0, v0, multipliers, phase.given(params, modes))
     of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
     rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
     switches = switches_before_any(hybrid, q0, v0, None if phase.meeting is None else phase.meeting.laws)
@@ -230,7 +230,10 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
     if met is not None:
-        exists, refused = met.found, RESULTS.no_contact_forces
+        met = met._replace(allowed=met.allowed & phase.meeting.laws.allow(ts[0], params))
+        exists, refused = met.found & met.presses & met.allowed, _obeyed(met, RESULTS.no_contact_forces)
+        known = all_finite((q0, v0))
+        exists, refused = exists & known, RESULTS.where(known, refused, RESULTS.start_not_finite)
     known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
     start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
@@ -268,13 +271,19 @@ def _leg(
     # Lanes in other phases stand still.
     times = jnp.where(in_phase, jnp.minimum(ahead, until), way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
-    found = apart(solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far)
+    forced = None if phase.meeting is None else phase.meeting.forced
+    found = apart(
+        solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far, forced
+    )
     result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
     after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
     rows, known = {name: found[name] for name in ROWS}, (ts > way.t) & (ts <= end.t)
     if phase.meeting is not None:
-        forces = jax.vmap(partial(phase.meeting.laws.forces, given=params))
-        rows["multipliers"] = rows["multipliers"] | forces(times, rows["q"], rows["v"])
+        laws = phase.meeting.laws
+        every = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (times, *rows.values()), tuple(end))
+        acting = jax.vmap(partial(laws.acting, given=params))(*every)
+        rows["multipliers"] = rows["multipliers"] | {name: x[:-1] for name, x in acting.items()}
+        end = end._replace(multipliers=end.multipliers | {name: x[-1] for name, x in acting.items()})
     instant = in_phase & jnp.isfinite(until) & (result == RESULTS.successful)
     if phase.guards is not None and phase.switches or phase.has_instants:
         count, terminal = len(phase.switches), () if phase.guards is None else phase.guards.terminal
@@ -296,8 +305,8 @@ def _leg(
         end = where(invalid, Snapshot(way.t, way.q, way.v, unknown(end.multipliers)), end)
         events = {name: x.none_where(invalid) for name, x in events.items()}
         if after.found is not None:
-            result = RESULTS.where(onward & ~after.found, RESULTS.no_contact_forces, result)
-            onward = onward & after.found
+            result = RESULTS.where(onward, _obeyed(after, result), result)
+            onward = onward & after.found & after.presses & after.allowed
         broken = onward & ~all_finite((after.q, after.v))
         result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[place], rows)
@@ -325,6 +334,13 @@ def _leg(
     )  # fmt: skip
     # Outputs and switches are those of before in the other lanes.
     return where(in_phase, further, way)._replace(rows=further.rows, switches=further.switches)
+
+
+def _obeyed(met: Any, otherwise: Any):
+    """The result of a meeting, of `Met` or `After`, in which a law is broken; `otherwise` if none is."""
+    result = RESULTS.where(met.found, otherwise, RESULTS.no_contact_forces)
+    result = RESULTS.where(met.presses, result, RESULTS.normal_below_zero)
+    return RESULTS.where(met.allowed, result, RESULTS.element_refused)
 
 
 class PhaseEnding(NamedTuple):
@@ -396,6 +412,8 @@ class After(NamedTuple):
     rests: Bool[Array, ""]
     modes: Modes | None = None
     found: Bool[Array, ""] | None = None
+    presses: Bool[Array, ""] | None = None
+    allowed: Bool[Array, ""] | None = None
 
 
 def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array):
@@ -409,7 +427,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         sizes = jnp.maximum(sizes_so_far, sizes_of(end.q, end.v))
         q, met, number = phase.meeting(end, params, sizes, instant)
         first = jnp.zeros_like(first)
-        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found)
+        after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found, met.presses, met.allowed)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
     impulse = jax.tree.map(jnp.subtract, momentum(after.q, after.v, params), momentum(end.q, end.v, params))
     to = jnp.asarray(phase.targets)[first, after.rests.astype(int)]

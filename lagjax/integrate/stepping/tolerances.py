@@ -11,6 +11,9 @@ all there is at rest when a force sets in. To this is added only the round-off f
 plane leaves the third dimension at round-off, which no step can follow. Sizes are compared as √M_ii q_i and √M_ii v_i,
 which have the same unit for all coordinates. If everything is zero at the start, the size is a part of what the
 acceleration there yields in the whole time, or, if that is zero too, the acceleration of the step.
+
+Where forces a and -a cancel, as those of contacts do at rest, ε a is left: a step of length h makes velocities ε a h of
+it, and ways ε a h², whatever the sizes are. `Forced` are such a.
 """
 
 from collections.abc import Callable
@@ -38,6 +41,8 @@ FIRST = 0.1
 LIGHT = 1e-6
 # A coordinate at rest at zero counts as at least this part of the extent of all others when a force sets in.
 OF_OTHERS = 1e-6
+# Nothing accelerates below so many round-offs of the forces: guards of contacts end modes at hundreds of them.
+AT_REST = 1e3
 # For a start from zero: parts of the coordinates and velocities that its acceleration yields in the whole time.
 FROM_NOTHING = 1e-6, 1e-3
 
@@ -49,6 +54,26 @@ class Tolerances(NamedTuple):
     atol: Float[Array, " 2"]
 
 
+class Forced(NamedTuple):
+    """The accelerations, of forces that may cancel, at times over the motion."""
+
+    t: Float[Array, " K"]
+    a: Float[Array, "K n"]
+
+    def near(self, t: Float[Array, ""]) -> Float[Array, " n"]:
+        """The larger ones of the times beside t: a force that passes zero is none for an instant only."""
+        at = jnp.clip(jnp.searchsorted(self.t, t, side="right"), 1, self.t.size - 1)
+        return jnp.maximum(self.a[at - 1], self.a[at])
+
+    def around(self, t: Float[Array, ""]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """Those, and the time that the motion takes."""
+        return self.near(t), self.t[-1] - self.t[0]
+
+    def left_over(self, a: Float[Array, " n"], h: Float[Array, ""]) -> Float[Array, "2 n"]:
+        """What the round-off of accelerations makes of coordinates and velocities in a time h."""
+        return rounding(a[None] * jnp.stack([h**2, h])[:, None])
+
+
 class Scales(NamedTuple):
     """The size of a motion as told by its start; rows are coordinates and velocities.
 
@@ -56,6 +81,7 @@ class Scales(NamedTuple):
     - `reach`: the largest of √M_ii times the numbers.
     - `time`: the time in which they change. `first`: the sizes of the numbers; if all are zero, a substitute.
     - `unknown`: whether all of this is zero, since nothing accelerates at the start either.
+    - `forced`: the accelerations of forces that cancel, where they are known.
     """
 
     root_mass: Float[Array, "1 n"]
@@ -64,9 +90,12 @@ class Scales(NamedTuple):
     time: Float[Array, ""]
     first: Float[Array, "2 n"]
     unknown: Bool[Array, ""]
+    forced: Forced | None = None
 
 
-def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=None) -> Tolerances:
+def tolerances_at(
+    start, ts: Array, settings: Settings, sizes_so_far=None, a=None, forced: Forced | None = None
+) -> Tolerances:
     """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
@@ -76,6 +105,9 @@ def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=Non
         return Tolerances(settings.rtol, settings.atol)
     sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
+    if forced is not None:
+        way = jnp.max(forced.a) * span**2
+        of_q = jnp.where(of_q <= rounding(way), FROM_NOTHING[0] * way, of_q)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
     return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
@@ -86,7 +118,9 @@ def span_of(ts: Array):
     return jnp.maximum(jnp.abs(ts[-1] - ts[0]), jnp.finfo(ts.dtype).tiny)
 
 
-def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np.bool = np.False_) -> Scales:
+def scales_of(
+    mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np.bool = np.False_, forced: Forced | None = None
+) -> Scales:
     """The scales of a motion, from its first state and the accelerations there, which need not be finite.
 
     `without_mass` (n,): the coordinates of first order, in units of their own: they set no scale for others, and the
@@ -96,6 +130,11 @@ def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np
         jnp.sqrt(jnp.nan_to_num(mass[None], posinf=0.0)),
         jnp.abs(jnp.nan_to_num(_rows(q, v, a), posinf=0.0)),
     )
+    if forced is not None:
+        # What the round-off of forces that cancel makes in the whole time says nothing.
+        most = jnp.max(forced.a, axis=0)
+        least = jnp.concatenate([forced.left_over(most, span), AT_REST * rounding(most)[None]])
+        sizes = jnp.where(sizes <= least, 0.0, sizes)
     root_mass = jnp.where(without_mass, 0.0, root_mass)
     heaviest = jnp.max(root_mass)
     over_root_mass = 1 / jnp.maximum(root_mass, LIGHT * jnp.where(heaviest > 0, heaviest, 1.0))
@@ -112,7 +151,7 @@ def scales_of(mass, q: PyTree, v: PyTree, a, span, without_mass: np.ndarray | np
     reach = jnp.stack([of_q, of_v])[:, None]
     least = np.array(FROM_NOTHING, reach.dtype)[:, None] * reach * over_root_mass / DIED_OUT
     first = jnp.where(nothing & ~without_mass, least, sizes[:2])
-    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0))
+    return Scales(root_mass, over_root_mass, reach, time, first, nothing & (of_a == 0), forced)
 
 
 def shared(scales: Scales, sizes) -> Float[Array, "2 n"]:
@@ -192,7 +231,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
     ):  # fmt: skip
         """Whether to keep a step, and the next one."""
         state, largest = controller_state
-        weighed, now = self._weighed(t1 - t0, y0, y1_candidate, y_error, largest)
+        weighed, now = self._weighed(t0, t1, y0, y1_candidate, y_error, largest)
         keep, *rest, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, weighed, error_order, state
         )
@@ -201,10 +240,10 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _weighed(self, h: Array, y0: PyTree, y1: PyTree, error, largest):
+    def _weighed(self, t0: Array, t1: Array, y0: PyTree, y1: PyTree, error, largest):
         """The error in the controller's units, and the largest numbers including this step."""
         error, unravel = ravel_pytree(error)
-        before, after, h = stop_gradient((_rows(*y0), _rows(*y1), h))
+        before, after, t0, h = stop_gradient((_rows(*y0), _rows(*y1), t0, t1 - t0))
         size = jnp.maximum(jnp.abs(before), jnp.abs(after))
         if largest is None:
             allowed = self.tolerances.atol[:, None] + self.tolerances.rtol[:, None] * self._capped_angles(size)
@@ -212,6 +251,8 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         else:
             now = jnp.maximum(size, largest)
             allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
+            if (forced := self.scales.forced) is not None:
+                allowed = allowed + forced.left_over(forced.near(t0), h)
         # Where nothing is allowed nothing may be off: zero stays zero.
         weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)
         return unravel(error * weights.ravel()), now

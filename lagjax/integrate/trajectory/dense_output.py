@@ -102,10 +102,10 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         x[rows] = new.multipliers[name] if name in multipliers else np.nan
     if given is not None:
         here = jax.tree.map(lambda x: x[: rows.size], (times, given.modes))
-        for name, x in of_springs(trajectory, here[0], new.q, new.v, here[1]).items():
+        for name, x in of_elements(trajectory, here[0], new.q, new.v, new.multipliers, here[1]).items():
             found.multipliers[name][rows] = x
         # Where others hold what would slide, the direction of its friction is known at outputs alone.
-        slips = np.array(trajectory.switches.kinds) == "sliding velocity"
+        slips = np.char.startswith(np.array(trajectory.switches.kinds, str), "sliding velocity")
         held = np.any((np.asarray(here[1]) == HELD_BY_OTHERS) & slips, axis=1)
         for x in found.multipliers.values():
             x[rows[held]] = np.nan
@@ -113,14 +113,14 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         old[rows] = x
 
 
-def of_springs(trajectory, times, q: PyTree, v: PyTree, modes) -> dict[str, Array]:
-    """The forces of compliant contacts at these states, by name."""
+def of_elements(trajectory, times, q: PyTree, v: PyTree, multipliers: dict, modes) -> dict[str, Array]:
+    """The forces of compliant contacts, and of friction, at these states, by name."""
     laws = trajectory.system.laws
 
-    def forces(t: Array, q: PyTree, v: PyTree, modes: Array) -> dict[str, Array]:
-        return laws.forces(t, q, v, laws.given(trajectory.params, modes))
+    def forces(t: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array) -> dict[str, Array]:
+        return laws.acting(t, q, v, multipliers, laws.given(trajectory.params, modes))
 
-    return jax.vmap(forces)(times, q, v, modes) if laws.compliant else {}
+    return jax.vmap(forces)(times, q, v, multipliers, modes) if laws.compliant or laws.tangents else {}
 
 
 def _known_of(trajectory) -> Instants:

@@ -15,12 +15,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import mode_in_words
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
 from lagjax.system import Hybrid, InModes, Model, UnknownSystem, known_system, model_of
 
+# What is struck jumps by more than so many round-offs of the velocities in the motion.
+STRUCK = 1000
 # The name under which switches are among the events of a motion.
 SWITCHES = "switches"
 
@@ -34,7 +37,8 @@ class Switches(eqx.Module):
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
     - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      and `kinds` what they are modes of: a "gap", a "sliding velocity", a "spring" or a "control".
+      and `kinds` what they are modes of: a "gap", a "sliding velocity" (or one "in a plane"), a "spring", a "side" from
+      which a normal force presses, or a "control".
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -92,10 +96,19 @@ class Switches(eqx.Module):
         way = int(self.way[k])
         if self.kinds[way] == "control":
             return "acts"
-        after = self.mode_in_words(way, int(np.asarray(self.modes)[k, way]))
-        impulses = jax.tree.leaves(self.impulse)
-        struck = self.kinds[way] == "gap" and any(np.any(np.asarray(x)[k]) for x in impulses)
-        return f"is struck, then {after}" if struck else after
+        mode = int(np.asarray(self.modes)[k, way])
+        after = self.mode_in_words(way, mode)
+        if self.kinds[way] == "sliding velocity" and abs(mode) == 1:
+            after += " forward" if mode > 0 else " back"
+        return f"is struck, then {after}" if self.kinds[way] == "gap" and self._strikes(k, way) else after
+
+    def _strikes(self, k: int, way: int) -> bool:
+        """Whether velocities jump by more than round-off at switch k, where a gap that was open ends its mode."""
+        if k and int(np.asarray(self.modes)[k - 1, way]):
+            return False
+        before, after = (columns(np, x, rows=np.size(self.t))[: int(self.count)] for x in (self.v, self.v_after))
+        jump, size = np.max(np.abs(after[k] - before[k])), np.max(np.abs([before, after]))
+        return bool(jump > STRUCK * np.finfo(before.dtype).eps * size)
 
     def mode_in_words(self, way: int, mode: int) -> str:
         """A mode in a word; `way`: its place among the modes."""
@@ -110,8 +123,8 @@ class HybridTrajectory(Trajectory):
     - `switches`: the `Switches`.
     - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
       `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
-      gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a sampled control the number of its
-      next instant.
+      gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a normal force of either sign 1 or
+      -1, the side from which it presses; of a sampled control the number of its next instant.
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint, and of `at(t)`
       between outputs while others hold what would slide (mode 3): which friction is at its bound is known at outputs.
     - `end`: the last instant; where the motion ended on a switch, the state after it.

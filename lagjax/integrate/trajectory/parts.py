@@ -15,10 +15,14 @@ NO_PHASE = -1
 HELD_BY_OTHERS = 3
 
 
+# Those of sliding velocities along a line, and in a plane, in words.
+SLIDING = {-1: "slides", 0: "free", 1: "slides", 2: "sticks", HELD_BY_OTHERS: "is held by others"}
 # What modes are called, by the kind of what they are modes of.
 MODES = {
     "gap": {0: "open", 1: "closed"},
-    "sliding velocity": {-1: "slides", 0: "free", 1: "slides", 2: "sticks", HELD_BY_OTHERS: "is held by others"},
+    "sliding velocity": SLIDING,
+    "sliding velocity in a plane": SLIDING,
+    "side": {1: "presses", -1: "presses from the other side"},
     "spring": {0: "apart", 1: "pressed"},
 }
 

@@ -44,6 +44,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     guard_below_zero = "A guard of the first phase is below zero at the start."
     reset_not_finite = "The state after a switch is NaN or infinite."
     no_contact_forces = "No forces, or impulses, obey the laws of contact and friction together (Painlevé's paradox)."
+    element_refused = (
+        "A number of an element is NaN, or not what its law allows: friction, stiffness and damping below zero, a "
+        "restitution that is not 0 to 1, a time between instants that is not above zero."
+    )
+    normal_below_zero = (
+        "A normal force of friction, which presses from one side, fell below zero: nothing says what friction is then."
+    )
     no_such_phase = "start= is not the number of a phase."
     raised = "A function that is called in Python, by a callback, raised an exception."
     no_progress = (

@@ -98,3 +98,13 @@ def test_no_solution():
     mu, slides = np.tile([1.0, 0.0, 0.0], (LANES, 1)), np.tile([-1.0, 0.0, 0.0], (LANES, 1))
     mu[1:, 0] = 0.3
     assert np.asarray(forces_of(matrix, free, mu, slides)[1]).tolist() == [False] + 39 * [True]
+
+
+def test_excess_by_round_off():
+    """Friction that would have to exceed μ N by 1e-13 of it slides: it has μ N to the last digits. Twin: what it would
+    have to be."""
+    matrix, _, mu = random_problems(3, LANES, 0.3)
+    wanted = np.tile([1.0, 2.0, 1.5, 0.3 * (1 + 1e-13), 0.1, -0.2], (LANES, 1))
+    forces, well = map(np.asarray, forces_of(matrix, -np.einsum("kij,kj->ki", matrix, wanted), mu, 0.0 * mu))
+    beyond = forces[:, 3] / (0.3 * forces[:, 0]) - 1
+    assert np.sum(well) > LANES / 2 and np.all(beyond[well] < 2e-15) and wanted[0, 3] / 0.3 - 1 > 5e-14

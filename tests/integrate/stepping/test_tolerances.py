@@ -10,6 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.stepping.tolerances import (
+    Forced,
     PerCoordinateTolerance,
     Tolerances,
     rounding,
@@ -111,7 +112,7 @@ def weighed(size, error, mass, sizes_so_far):
     scales = scales_of(mass, *size, jnp.zeros(2), 1.0)
     largest = jnp.maximum(scales.first, sizes_so_far)
     weighing = PerCoordinateTolerance(pid, Tolerances(both, both), scales._replace(first=largest), (False, False))
-    found, _ = weighing._weighed(jnp.asarray(1.0), (*size,), (*size,), (*error,), largest)
+    found, _ = weighing._weighed(jnp.asarray(0.0), jnp.asarray(1.0), (*size,), (*size,), (*error,), largest)
     return jnp.stack(found).reshape(2, 2) / (1e-9 * (1 + jnp.abs(size)))
 
 
@@ -225,3 +226,18 @@ def test_off_a_constraint_at_zero_in_any_units():
     with pytest.raises(ValueError, match="off the constraints: 'bar' = -9.31e-16"):
         params = {"gap": 1e-6 * 2.0**-30, "push": 2.0**-30}
         lj.integrate(pair, np.zeros(2), np.zeros(2), params, ts=np.array([0.0, 1.0]))
+
+
+def test_forces_that_cancel():
+    """Round-off of accelerations a in a step h leaves 8 ε a h² and 8 ε a h, of the larger a beside a time; a start that
+    is no more than that is at rest. Twin: a start a thousand times farther is none."""
+    forced, eps = Forced(np.array([0.0, 1.0, 3.0]), np.array([[0.0, 2.0], [4.0, 2.0], [1.0, 0.0]])), np.finfo(float).eps
+    np.testing.assert_array_equal([forced.near(np.array(t)) for t in (0.0, 2.0, 3.0)], [[4.0, 2.0]] * 3)
+    np.testing.assert_allclose(
+        forced.left_over(np.array([4.0, 2.0]), np.array(0.1)), 8 * eps * np.array([[0.04, 0.02], [0.4, 0.2]])
+    )
+    still = [
+        scales_of(np.ones(2), size * np.ones(2), np.zeros(2), np.zeros(2), np.array(3.0), forced=forced).unknown
+        for size in (1e-16, 1e-9)
+    ]
+    assert [bool(x) for x in still] == [True, False]
