@@ -42,8 +42,8 @@ SETTINGS[FULL] = SETTINGS[MAIN]
 # Processor seconds of each part, `QUICK` and `MAIN`, as its summary prints them: what takes longest starts first, so
 # that no core waits for it, and a line says how long all will take. Of `FULL` nothing is said.
 SECONDS = {
-    "sphere_geodesic": (9, 23), "rolling_hoop": (13, 34), "slipping_hoop": (1, 35), "bead_on_hoop": (6, 30),
-    "mass_distributions": (13, 59), "sliding_wedge": (13, 21), "cross_rails": (12, 36), STABILITY: (6, 40),
+    "sphere_geodesic": (7, 16), "rolling_hoop": (11, 26), "slipping_hoop": (1, 28), "bead_on_hoop": (7, 27),
+    "mass_distributions": (14, 39), "sliding_wedge": (12, 15), "cross_rails": (11, 29), STABILITY: (5, 31),
 }  # fmt: skip
 
 
