@@ -44,8 +44,10 @@ class Pose(NamedTuple):
         **Raises:** `ValueError` unless both are three numbers, and for an axis that is zero.
         """
         along = _three("the axis of a pose", axis)
-        if not is_traced(along) and not np.any(np.asarray(along)):
-            raise ValueError("the axis of a pose must not be zero.\nFix: axis=(0.0, 0.0, 1.0), of any length.")
+        if not is_traced(along) and not 0 < np.max(np.abs(np.asarray(along))) < np.inf:
+            raise ValueError(
+                "the axis of a pose must be finite and not zero.\nFix: axis=(0.0, 0.0, 1.0), of any length."
+            )
         return cls(_three("the position of a pose", position), about(along, angle))
 
     def turned(self, axis: ArrayLike, angle: ArrayLike) -> "Pose":
@@ -135,6 +137,22 @@ def check_takes_params(role: str, owner: str, given):
     if callable(given):
         check_arguments(
             Call(role, given, ("params",), f" of {owner}"), "a function of the state, as a force may be one"
+        )
+
+
+def check_quantity(role: str, owner: str, given, shape: tuple[int, ...] = (), above_zero: bool = False):
+    """Raise unless a quantity is finite numbers of a shape, above zero if so asked, or a function of params."""
+    check_takes_params(role, owner, given)
+    if callable(given) or is_traced(given):
+        return
+    numbers = np.asarray(given)
+    well = numbers.shape == shape and np.issubdtype(numbers.dtype, np.number) and np.all(np.isfinite(numbers))
+    if not well or above_zero and not np.all(numbers > 0):
+        wanted = "a finite number" if shape == () else f"{shape[0]} finite numbers"
+        raise ValueError(
+            f"{role} of {owner} must be {wanted}{' above zero' * above_zero}, and is {given}.\n"
+            "Usual cause: a number that was computed before, and is NaN or has another sign.\n"
+            "Fix: numbers, or a function of params."
         )
 
 
@@ -398,10 +416,12 @@ class Marker:
         """A marker on a body."""
         _check_not_traced(f"place and axis of a marker on '{body.name}'", "point", point, axis)
         along = np.asarray(axis, float)
-        size = np.sqrt(np.sum(along**2))
-        if along.shape != (3,) or not size > 0:
+        largest = np.max(np.abs(along), initial=0.0)
+        if along.shape != (3,) or not 0 < largest < np.inf:
             raise ValueError(f"the axis of a marker on '{body.name}' must be three numbers, not all zero: {axis}.")
-        along = along / size
+        # Squares of the largest and the least numbers are none.
+        along = along / largest
+        along = along / np.sqrt(np.sum(along**2))
         near = np.eye(3)[1 if abs(along[0]) > 0.9 else 0]
         first = near - (near @ along) * along
         first = first / np.sqrt(np.sum(first**2))

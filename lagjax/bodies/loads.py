@@ -19,7 +19,7 @@ from lagjax.bodies.body import (
     SystemFunction,
     check_bodies,
     check_markers,
-    check_takes_params,
+    check_quantity,
     check_takes_state,
     valued,
 )
@@ -53,7 +53,7 @@ def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) 
 
     **Raises:** `TypeError` unless `bodies` is a list of them and `g` takes params if it is a function.
     """
-    check_takes_params("g", "lj.weight", g)
+    check_quantity("the field g", "lj.weight", g, (3,))
     return Load(Weight(check_bodies("lj.weight", bodies), g))
 
 
@@ -95,7 +95,7 @@ def spring(
     """
     check_markers("a spring is held at two places on bodies", a, b)
     for role, given in {"stiffness": stiffness, "length": length, "damping": damping}.items():
-        check_takes_params(role, "lj.spring", given)
+        check_quantity(f"the {role}", "lj.spring", given)
 
     pull = Spring(a, b, stiffness, length, damping)
     return Load(pull, None if _is_zero(damping) else pull.dissipation)
@@ -162,7 +162,7 @@ def torsion(
     """
     check_markers("a spring is held at two places on bodies", a, b)
     for role, given in {"stiffness": stiffness, "angle": angle, "damping": damping}.items():
-        check_takes_params(role, "lj.torsion", given)
+        check_quantity(f"the {role}", "lj.torsion", given)
 
     turns = Torsion(a, b, stiffness, angle, damping)
     return Load(turns, None if _is_zero(damping) else turns.dissipation)

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Ground, Marker, SystemFunction, ground, valued
+from lagjax.bodies.body import Ground, Marker, SystemFunction, check_quantity, ground, valued
 from lagjax.bodies.contact_point import Touch, below, on_plane, searched
 from lagjax.bodies.joints import check_two
 from lagjax.bodies.shapes import disk, ellipsoid, level, sphere
@@ -110,6 +110,7 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
+    check_quantity("the radius", "lj.rolling", radius, above_zero=True)
     return _contact(Touching(wheel, floor, "rim", radius))
 
 
@@ -124,6 +125,7 @@ def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str,
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
+    check_quantity("the radius", "lj.rolling_sphere", radius, above_zero=True)
     return _contact(Touching(ball, floor, "sphere", radius))
 
 
@@ -155,6 +157,8 @@ def rolling_ellipsoid(stone: Marker, floor: "Marker | Surface", half_axes: Seque
             f"lj.rolling_ellipsoid takes three half axes, and was given {half_axes!r}.\n"
             "Usual cause: one radius.\nFix: (a, b, c) along the axes of the marker; lj.rolling_sphere for a sphere."
         )
+    for half_axis in half_axes:
+        check_quantity("a half axis", "lj.rolling_ellipsoid", half_axis, above_zero=True)
     return _contact(Touching(stone, floor, "ellipsoid", tuple(half_axes)))
 
 

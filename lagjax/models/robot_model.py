@@ -104,8 +104,10 @@ class RobotModel:
            not_taken: Iterable[NotTaken]) -> "RobotModel":  # fmt: skip
         """The model of a tree; shapes come in the frames of the file's links."""
         field = np.asarray(gravity, float)
-        if field.shape != (3,):
-            raise ValueError(f"gravity must be three numbers, and is {gravity}.\nFix: gravity=(0.0, 0.0, -9.81).")
+        if field.shape != (3,) or not np.all(np.isfinite(field)):
+            raise ValueError(
+                f"gravity must be three finite numbers, and is {gravity}.\nFix: gravity=(0.0, 0.0, -9.81)."
+            )
         placed = tuple(_on_body(shape, merged) for shape in shapes)
         if not merged.joints:
             raise ValueError(

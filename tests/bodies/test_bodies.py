@@ -355,7 +355,7 @@ def test_numbers_that_no_body_has():
         made().at((0.0, 0.0, np.nan))
     with pytest.raises(ValueError, match="position of a pose must be three numbers"):
         lj.Pose.at((1.0, 2.0))
-    with pytest.raises(ValueError, match="axis of a pose must not be zero"):
+    with pytest.raises(ValueError, match="axis of a pose must be finite and not zero"):
         lj.Pose.at(axis=(0.0, 0.0, 0.0), angle=1.0)
     pose = lj.Pose.at((0, 0, 1), axis=(0, 0, 10), angle=1)
     for rates in ({"velocity": 3.0}, {"spin": 3.0}, {"spin": (1.0, 2.0)}):
@@ -364,3 +364,37 @@ def test_numbers_that_no_body_has():
     np.testing.assert_allclose(pose.quaternion, [np.cos(0.5), 0.0, 0.0, np.sin(0.5)], atol=1e-15)
     np.testing.assert_allclose(pose.spin(pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
     assert made(1, (1, 1, 1)).kinetic({"b": pose}, {"b": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5
+
+
+NAN, ROUND = float("nan"), lj.Body("round", 1.0, (1.0, 1.0, 1.0))
+NO_NUMBERS = {
+    "field": (lambda: lj.weight([ROUND], (0.0, 0.0, NAN)), "the field g of lj.weight must be 3 finite numbers"),
+    "one number": (lambda: lj.weight([ROUND], 9.81), "the field g of lj.weight must be 3 finite numbers, and is 9.81"),
+    "spring": (
+        lambda: lj.spring(lj.ground.at(), ROUND.at(), NAN),
+        "the stiffness of lj.spring must be a finite number",
+    ),
+    "radius": (lambda: lj.rolling_sphere(ROUND.at(), lj.ground.at(), -1.0), "the radius of .* above zero, and is -1.0"),
+    "rim": (lambda: lj.rolling(ROUND.at(), lj.ground.at(), NAN), "the radius of lj.rolling .* above zero, and is nan"),
+    "half axis": (
+        lambda: lj.rolling_ellipsoid(ROUND.at(), lj.ground.at(), (1.0, 0.0, 1.0)),
+        "a half axis of .*, and is 0",
+    ),
+    "axis": (lambda: ROUND.at(axis=(np.inf, 0.0, 0.0)), "the axis of a marker on 'round' must be three numbers"),
+    "pose": (lambda: lj.Pose.at(axis=(NAN, 0.0, 0.0)), "the axis of a pose must be finite and not zero"),
+}
+
+
+@pytest.mark.parametrize("name", NO_NUMBERS)
+def test_numbers_that_are_none(name):
+    """NaN, infinite, of the wrong sign or shape: refused by name where they are given."""
+    make, words = NO_NUMBERS[name]
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_axes_of_any_length():
+    """A direction may have the largest and the least numbers; a function of params is checked by nobody here."""
+    for size in (1e-200, 1.0, 1e200):
+        np.testing.assert_allclose(ROUND.at(axis=(0.0, 3 * size, 4 * size)).frame[2], [0.0, 0.6, 0.8], rtol=1e-15)
+    lj.rolling(ROUND.at(), lj.ground.at(), lambda params: params["r"])
