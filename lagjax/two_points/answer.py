@@ -164,7 +164,7 @@ def _connection(
     """The motion where it meets the end; else the path alone, and why."""
     aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
     followed, resolved = not isinstance(shot, str), np.max(solved.errors) <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
-    if followed:
+    if not isinstance(shot, str):
         aim, missed, trajectory = shot
         t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
     else:

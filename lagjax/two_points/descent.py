@@ -102,7 +102,8 @@ class _Ground:
         model, (count, s, n) = self.model, x.shape
         m = int(model.holonomic.sum())
         known = np.zeros((count, s, m)) if multipliers is None else multipliers
-        for _ in range(2 if m and multipliers is None else 1):
+        again = bool(m) and multipliers is None
+        while True:
             dtype = self.ends.x_a.dtype
             x, action, found = _second_order(
                 model, self.ends, np.asarray(x, dtype), np.asarray(self.parts, dtype), np.asarray(known, dtype)
@@ -117,6 +118,10 @@ class _Ground:
             # What is left of the slope along the constraints' rows is taken up by their multipliers.
             more = np.linalg.lstsq(rows.T, -slope[of_x], rcond=None)[0].reshape(-1, m)
             known = known + np.concatenate([more, np.zeros((1, m))]).reshape(count, s, m)
+            if not again:
+                break
+            # Once more, with the multipliers in the curvature.
+            again = False
         q = np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :]
         curvature, metric = q.T @ matrix[of_x][:, of_x] @ q, q.T @ self.kinetic @ q
         return _Place(np.asarray(x, float), float(action), q.T @ slope[of_x], curvature, metric, q, known)
@@ -136,9 +141,9 @@ class _Ground:
                 trial = self.at(_moved(place, vectors @ step), place.multipliers)
                 ratio = -np.inf if trial is None else (place.action - trial.action) / gain
                 radius *= 2.0 if ratio > 0.75 else 1.0 if ratio > 0.25 else 1 / 3
-                if ratio > 0.05:
+                if trial is not None and ratio > 0.05:
+                    place = trial
                     break
-            place = trial
             if np.max(np.abs(place.x - start) / size) > FAR:
                 return None
         return place.x

@@ -156,12 +156,14 @@ def _searched(
     tried = "; ".join(f"{plan.name}: {_in_words(answer)}" for plan, answer in found)
     # The least one on few elements need not be one on many: the next ones follow.
     ordered = sorted((x for _, x in found if is_found(x)), key=lambda x: x.cost) or [solved]
-    for coarse in ordered:
-        layout, fine, accuracy, more = _refined(question, mesh, layout, coarse, most, tol)
-        iterations += more
+    layout, fine, accuracy, more = _refined(question, mesh, layout, ordered[0], most, tol)
+    iterations += more
+    for coarse in ordered[1:]:
         if is_found(fine):
             break
         layout = Layout(question.plant, mesh.count)
+        layout, fine, accuracy, more = _refined(question, mesh, layout, coarse, most, tol)
+        iterations += more
     return layout, fine, accuracy, iterations, tried
 
 

@@ -342,6 +342,7 @@ class Laws(eqx.Module):
         for law in self.compliant:
             found.append(law.last(t, q, v, given))
         for law in self.sided:
+            assert law.side is not None
             found.append(given.modes[slice(*law.side)] * law.normal_forces(t, q, v, forces, params)[:: 1 + law.plane])
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
 

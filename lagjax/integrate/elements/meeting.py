@@ -488,7 +488,11 @@ class Meeting(eqx.Module):
         # Of each normal force, not of both components of a plane.
         found, places = solution.problem.normal_forces(solution.forces), np.zeros(0, int)
         places = np.concatenate([places, *(np.arange(*law.at, 1 + law.plane) - normals for law in laws.sided)])
-        both, pressed, of_sides = solution.problem.both[places], found[places], solution.no_force[normals:][places]
+        both, pressed, of_sides = (
+            np.asarray(solution.problem.both)[places],
+            found[places],
+            solution.no_force[normals:][places],
+        )
         presses = jnp.all(both | (pressed >= -of_sides / 2))
         sides = jnp.where(both & (pressed < 0), -1, 1).astype(modes.dtype)
         onto = jnp.where(holds, 0.0, onto)

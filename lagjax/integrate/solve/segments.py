@@ -229,7 +229,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
-    if met is not None:
+    if met is not None and phase.meeting is not None:
         met = met._replace(allowed=met.allowed & phase.meeting.laws.allow(ts[0], params))
         exists, refused = met.found & met.presses & met.allowed, _obeyed(met, RESULTS.no_contact_forces)
         known = all_finite((q0, v0))

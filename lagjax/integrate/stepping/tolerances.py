@@ -251,7 +251,7 @@ class PerCoordinateTolerance(diffrax.AbstractAdaptiveStepSizeController):
         else:
             now = jnp.maximum(size, largest)
             allowed = self._allowed_by_size(size, now, jnp.abs(after - before)[1] / h)
-            if (forced := self.scales.forced) is not None:
+            if self.scales is not None and (forced := self.scales.forced) is not None:
                 allowed = allowed + forced.left_over(forced.near(t0), h)
         # Where nothing is allowed nothing may be off: zero stays zero.
         weights = (self.atol + self.rtol * size) / jnp.where(allowed > 0, allowed, jnp.finfo(size.dtype).tiny)

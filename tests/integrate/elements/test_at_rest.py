@@ -64,6 +64,7 @@ def test_squeezed_at_rest():
     slips = 2 - m * G / (2 * mu) / 6
     fallen = -G * np.maximum(np.asarray(traj.t) - slips, 0.0) ** 3 / (6 * (2 - slips))
     np.testing.assert_allclose(traj.q["z"], fallen, rtol=1e-9, atol=1e-15)
+    assert isinstance(traj, lj.HybridTrajectory)
     np.testing.assert_allclose(traj.switches.t[0], slips, atol=1e-9)
 
 
