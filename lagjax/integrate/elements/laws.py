@@ -343,7 +343,9 @@ class Laws(eqx.Module):
             found.append(law.last(t, q, v, given))
         for law in self.sided:
             assert law.side is not None
-            found.append(given.modes[slice(*law.side)] * law.normal_forces(t, q, v, forces, params)[:: 1 + law.plane])
+            force = law.normal_forces(t, q, v, forces, params)[:: 1 + law.plane]
+            # What does not press at all, as without friction, presses from neither side.
+            found.append(jnp.where(force == 0, 1.0, given.modes[slice(*law.side)] * force))
         return jnp.concatenate([*found, jnp.zeros(0, t.dtype)])
 
     def rests(self, given: InModes) -> Bool[Array, " k"]:

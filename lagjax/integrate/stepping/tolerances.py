@@ -106,8 +106,8 @@ def tolerances_at(
     sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
     if forced is not None:
-        way = jnp.max(forced.a) * span**2
-        of_q = jnp.where(of_q <= rounding(way), FROM_NOTHING[0] * way, of_q)
+        # Below this it is round-off, however it is told apart.
+        of_q = jnp.maximum(of_q, FROM_NOTHING[0] * jnp.max(forced.a) * span**2)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))
     of_q = jnp.where(of_q > 0, of_q, jnp.where(of_v > 0, of_v * span, jnp.where(of_a > 0, of_a * span**2, 1.0)))
     return Tolerances(settings.rtol, stop_gradient(settings.rtol * jnp.stack([of_q, jnp.maximum(of_v, of_q / span)])))
