@@ -204,7 +204,7 @@ def test_outputs_leave_the_steps_alone(motion, method):
     np.testing.assert_allclose(found.q[np.isin(mixed, every)], whole.q, atol=1e-12)
     error = np.abs(np.asarray(found.q) - np.asarray(exact.q)).max(axis=1)
     between = ~np.isin(mixed, every)
-    assert error[between].max() < 3 * error.max() and 0 < error.max() < 1e-2
+    assert 0 < error[between].max() < 3 * error[~between].max() < 3e-2
     assert int(found.stats["num_steps"]) == 64 * 64 + 257
     # Twin: divided anew in each interval, the motion is another one.
     anew = run(*motion, [0.0, 0.23, 0.25], method, dt), run(*motion, [0.0, 0.23], method, dt)
