@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import quad_vec
 from scipy.optimize import brentq, linprog, lsq_linear
 
 import lagjax as lj
@@ -109,8 +110,9 @@ def margin_of_row(p, walls, t):
 def accelerations_of_row(p, walls, t):
     """Those of Gauss's principle: the forces in their bounds that leave the least of M a²."""
     n, contacts = len(p["m"]), rows_of_contacts(len(p["m"]), walls)
-    by_root = np.concatenate([contacts, np.eye(n)]).T / np.sqrt(p["m"])[:, None]
-    zero, rub = np.zeros(len(contacts)), np.maximum(p["rub"], 1e-300)
+    # Bounds of a width of zero are not what the programme is written for.
+    rub, zero = p["rub"][p["rub"] > 0], np.zeros(len(contacts))
+    by_root = np.concatenate([contacts, np.eye(n)[p["rub"] > 0]]).T / np.sqrt(p["m"])[:, None]
     bounds = np.concatenate([zero, -rub]), np.concatenate([zero + np.inf, rub])
     found = lsq_linear(by_root, -pulled(p, t) / np.sqrt(p["m"]), bounds, "bvls", tol=1e-15, max_iter=10_000)
     a = found.fun / np.sqrt(p["m"])
@@ -167,10 +169,10 @@ def at_rest_in_a_row(n, count, rng):
     while len(found) < count:
         p, walls, span, when = draw_row(n, rng, rng.choice([1.0, 1e-3, 1e6]))
         later = min(when + 0.02 * span, span)
-        x, w = np.polynomial.legendre.leggauss(NODES)
-        s = when + (later - when) * (x + 1) / 2
-        a = np.array([accelerations_of_row(p, walls, t) for t in s])
-        right = (later - when) / 2 * (w * (later - s)) @ a
+        of = lambda t, p=p, walls=walls: accelerations_of_row(p, walls, t)
+        # Others may give on the way: the accelerations have kinks.
+        right, _ = quad_vec(lambda t, of=of, later=later: (later - t) * of(t), when, later, epsrel=1e-9, limit=500)
+        a = np.array([of(t) for t in np.linspace(when, later, NODES + 1)[1:]])
         q0 = p["d"] * np.arange(n, dtype=float)
         ts = np.array([0.0, 0.5 * when, 0.999 * when, later])
         size = max(np.max(np.abs(right)), 1e-3 * np.max(q0))

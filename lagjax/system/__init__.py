@@ -10,7 +10,7 @@ from lagjax.system.function_arguments import OF_POSITION, OF_STATE, WITH_MULTIPL
 from lagjax.system.hybrid import Hybrid, Switch, replace_fields
 from lagjax.system.model import FirstOrder, Form, InModes, Model, given_in, model_of, unchecked
 from lagjax.system.signature import UnknownSystem, differences, known_system, middle_state, signature
-from lagjax.system.states import check_use, with_rates
+from lagjax.system.states import check_use, depends_on, with_rates
 from lagjax.system.system import System, check_functions, rate_of
 from lagjax.system.traced_functions import Traced
 from lagjax.system.user_errors import Call, check_arguments, in_words

@@ -96,6 +96,11 @@ def _reads(f: Traced, argument: str, name: str) -> bool:
     return depends(f.program.jaxpr, [x for path, x in _inputs(f) if path[:2] == (argument, name)])
 
 
+def depends_on(f: Traced, *arguments: str) -> bool:
+    """Whether a function depends on any of these of its arguments."""
+    return depends(f.program.jaxpr, [x for (argument, _), x in _inputs(f) if argument in arguments])
+
+
 def _acts_on(force: Traced, name: str) -> bool:
     """Whether an entry of the force depends on anything."""
     program, places = force.program, {}

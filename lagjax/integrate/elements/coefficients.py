@@ -8,6 +8,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 
+def is_fixed(law) -> bool:
+    """Whether a law is the same in all of a motion: a number, or a function of the parameters alone."""
+    return not callable(law) or takes_of_coefficient(law) == ("params",)
+
+
+def fixed(law, params: PyTree) -> Array:
+    """The value of one that is."""
+    return jnp.asarray(law(params) if callable(law) else law)
+
+
 def coefficient(law, of: Array, params: PyTree) -> Array:
     """The coefficient for each of the speeds, or depths, `of`."""
     if callable(law):

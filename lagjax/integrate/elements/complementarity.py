@@ -27,8 +27,8 @@ SWEEPS, STEPS = 30, 30
 # A root is found where the residual is below this part of the forces; singular values below this part of the largest
 # count as zero.
 SMALL = {np.dtype("float64"): 1e-11, np.dtype("float32"): 1e-4}
-# And not improved where it is below so many round-offs, or does not fall to this part.
-EXACT, FALLS_TO = 4, 0.25
+# And not improved where it is below so many round-offs, or did not fall to this part in so many steps.
+EXACT, FALLS_TO, STALLS = 4, 0.25, 4
 DEPENDENT = {np.dtype("float64"): 1e-10, np.dtype("float32"): 1e-4}
 
 
@@ -143,22 +143,25 @@ def solved(problem: ContactProblem) -> Forces:
         return jnp.max(jnp.abs(residual(still, forces))) / jnp.where(size > 0, size, 1.0)
 
     def newton(state: tuple) -> tuple:
-        forces, left, _, _, count = state
-        slope = inverse(forces)
-        return forces - slope @ residual(still, forces), error(forces), left, slope, count + 1
+        forces, best, before, stalled, count = state
+        slope, left = inverse(forces), error(forces)
+        stalled = jnp.where(left <= FALLS_TO * before, 0, stalled + 1)
+        # The first counts, also where nothing is a number.
+        better = (left < best[1]) | (count == 0)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), (forces, left, slope), best)
+        return forces - slope @ residual(still, forces), best, left, stalled, count + 1
 
     def goes_on(state: tuple) -> Array:
         # What breaks a law by little more than round-off is in another case: so it is not left at what is small.
-        _, left, before, _, count = state
-        done = (left <= small) & ((left <= EXACT * jnp.finfo(near.dtype).eps) | ~(left <= FALLS_TO * before))
+        _, (_, left, _), _, stalled, count = state
+        done = (left <= small) & ((left <= EXACT * jnp.finfo(near.dtype).eps) | (stalled >= STALLS))
         return ~done & (count < STEPS)
 
     first = jnp.zeros_like(still.free), jnp.asarray(True), jnp.asarray(0)
     near, *_ = lax.while_loop(lambda s: s[1] & (s[2] < SWEEPS), sweep, first)
-    unknown = jnp.full_like(near[0], jnp.inf)
-    start = near, unknown, unknown, jnp.zeros_like(still.matrix), jnp.asarray(0)
-    small = SMALL[near.dtype]
-    # The last step starts at a solution: its matrix is that of the solution's own case.
-    forces, left, _, slope, _ = lax.while_loop(goes_on, newton, start)
+    unknown, small = jnp.full_like(near[0], jnp.inf), SMALL[near.dtype]
+    start = near, (near, unknown, jnp.zeros_like(still.matrix)), unknown, jnp.asarray(0), jnp.asarray(0)
+    _, (forces, left, slope), *_ = lax.while_loop(goes_on, newton, start)
+    # One more step from the best: its matrix is that of the solution's own case.
     forces = stop_gradient(forces)
     return Forces(forces - stop_gradient(slope) @ residual(problem, forces), left <= small)

@@ -15,7 +15,8 @@ The guard of a mode is above zero as long as it lasts:
     held by others: δ - |s|        apart: -m            pressed: m
 
 A normal force that is a multiplier of a constraint presses from either side (1, -1), with friction μ |λ|: the guard is
-± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion.
+± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion. A sliding
+velocity without friction, since μ or N is zero in the whole motion, is free.
 
 Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
 """
@@ -29,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.coefficients import coefficient, takes_of_coefficient
+from lagjax.integrate.elements.coefficients import coefficient, fixed, is_fixed
 from lagjax.integrate.elements.complementarity import directions, lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
@@ -104,7 +105,7 @@ class Tangent(eqx.Module):
         if self.source:
             found = forces[self.source]
         else:
-            found = self.normal(t, q, v, params) if callable(self.normal) else self.normal
+            found = fixed(self.normal, params) if self.side is None else self.normal(t, q, v, params)
         return jnp.repeat(jnp.ravel(jnp.asarray(found, t.dtype)), 2 if self.plane else 1)
 
     def friction(self, t: Array, q: PyTree, slip: Array, v: PyTree, forces: dict, given: InModes) -> Float[Array, " k"]:
@@ -117,6 +118,15 @@ class Tangent(eqx.Module):
         mu = jnp.where(leans, self.sticking(speed, params), self.kinetic(speed, params))
         held = directions(given.slack[slice(*self.at)].astype(t.dtype), self.partners)
         return jnp.where(leans, held, -side) * mu * pressed
+
+    def never_rubs(self, params: PyTree) -> Bool[Array, " k"]:
+        """Which have no friction in the whole motion: no coefficient, or no normal force."""
+        never, every = jnp.zeros(self.at[1] - self.at[0], bool), (self.coefficient, self.static)
+        if all(map(is_fixed, every)):
+            never = never | (fixed(every[0], params) == 0) & (fixed(every[self.static is not None], params) == 0)
+        if self.normal is not None and self.side is None:
+            never = never | jnp.repeat(jnp.ravel(fixed(self.normal, params)) == 0, 1 + self.plane)
+        return never
 
     def kinetic(self, speed: Float[Array, " k"], params: PyTree) -> Float[Array, " k"]:
         """μ while it slides with this speed."""
@@ -228,8 +238,8 @@ class Laws(eqx.Module):
         of_rows = modes[..., : len(self.rows)]
         return jnp.where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
 
-    def rubs(self, modes: Int[Array, " k"]) -> Bool[Array, " kT"]:
-        """Which sliding velocities are not free for that the spring that presses them is apart."""
+    def rubs(self, modes: Int[Array, " k"], params: PyTree) -> Bool[Array, " kT"]:
+        """Which sliding velocities are not free for that the spring that presses them is apart, or nothing rubs."""
         pressed = {law.name: modes[slice(*law.at)] == PRESSED for law in self.compliant}
         found = [
             jnp.repeat(pressed[law.source], 1 + law.plane)
@@ -237,6 +247,7 @@ class Laws(eqx.Module):
             else jnp.ones(law.at[1] - law.at[0], bool)
             for law in self.tangents
         ]
+        found = [rubs & ~law.never_rubs(params) for rubs, law in zip(found, self.tangents)]
         return jnp.concatenate([*found, jnp.zeros(0, bool)])
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
@@ -273,9 +284,9 @@ class Laws(eqx.Module):
         found = []
 
         def bounded(role: str, law: Any, least: float = 0.0, most: float = np.inf, above: bool = False):
-            if law is None or callable(law) and takes_of_coefficient(law) != ("params",):
+            if law is None or not is_fixed(law):
                 return
-            value = jnp.asarray(law(params) if callable(law) else law, t.dtype)
+            value = fixed(law, params).astype(t.dtype)
             found.append((role, value, (value > least if above else value >= least) & (value <= most)))
 
         for law in self.normals:
@@ -284,7 +295,7 @@ class Laws(eqx.Module):
         for law in self.tangents:
             bounded(f"the coefficient of '{law.name}'", law.coefficient)
             bounded(f"the static coefficient of '{law.name}'", law.static)
-            if law.normal is not None and not callable(law.normal):
+            if law.normal is not None and law.side is None:
                 bounded(f"the normal force of '{law.name}'", law.normal)
         for law in self.compliant:
             bounded(f"the stiffness of '{law.name}'", law.stiffness, above=True)

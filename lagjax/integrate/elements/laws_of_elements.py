@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.coefficients import takes_of_coefficient
+from lagjax.integrate.elements.coefficients import is_fixed, takes_of_coefficient
 from lagjax.integrate.elements.compliant import Compliant
 from lagjax.integrate.elements.laws import Normal, Tangent
 from lagjax.integrate.elements.sampled import Sampled
-from lagjax.jaxtools import depends, is_linear
+from lagjax.jaxtools import depends, is_linear, varies
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -32,10 +32,22 @@ from lagjax.system import (
     System,
     Traced,
     coordinates,
+    depends_on,
     traced_call,
 )
 
 WITH_GAPS = (Contact, CompliantContact)
+
+
+class OfParamsAlone(eqx.Module):
+    """A function of the state and the parameters that does not depend on the state, as one of the parameters."""
+
+    function: Traced
+    takes: tuple[str, ...] = eqx.field(static=True, default=("params",))
+
+    def __call__(self, params: PyTree):
+        state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if varies(x) else x, self.function.program.like[:3])
+        return self.function(*state, params)
 
 
 def laws_of(elements: Elements, plain: System, start: State):
@@ -119,13 +131,15 @@ class ElementLaws:
             raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
         plane = jnp.shape(sliding.program.value) == (*shape, 2)
         both = source in self.plain.constraints
+        if isinstance(normal, Traced) and not depends_on(normal, *OF_STATE[:-1]):
+            normal = OfParamsAlone(normal)
         return Tangent(key, sliding, mu, static, normal, source, self.places(_size(sliding)), plane, both)
 
     def sided(self, tangents: tuple[Tangent, ...]) -> tuple[Tangent, ...]:
         """The same with places for the sides from which they are pressed, where normal forces may fall below zero."""
 
         def with_side(law: Tangent) -> Tangent:
-            if not (law.both or callable(law.normal)):
+            if not law.both and is_fixed(law.normal):
                 return law
             return replace(law, side=self.places((law.at[1] - law.at[0]) // (1 + law.plane)))
 

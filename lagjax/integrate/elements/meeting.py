@@ -450,7 +450,8 @@ class Meeting(eqx.Module):
     def _modes(self, at: AtMeeting, solution: ContactForces) -> Int[Array, " kNT"]:
         """The modes of gaps and of sliding velocities that follow from forces."""
         laws, owners, stays, sides = self.laws, np.array(self.laws.owners, int), solution.stays(), solution.sides()
-        rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], laws.rubs(at.given.modes))
+        rubs = laws.rubs(at.given.modes, at.given.params)
+        rubs = rubs & ((owners < 0) | jnp.append(stays, True)[owners])
         slides = jnp.where(laws.in_planes, lengths(sides, laws.partners) > 0, sides).astype(int)
         rests = jnp.where(lengths(solution.bound.leans, laws.partners) > 0, LEANS, STICKS)
         tangents = jnp.where(rubs, jnp.where(slides != 0, slides, rests), FREE)
