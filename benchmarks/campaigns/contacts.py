@@ -1,15 +1,16 @@
-"""Do motions with contacts and dry friction come out right: what rests until something gives, and what strikes and slides?
+"""Do motions with contacts and dry friction come out right: what rests until it gives, what strikes, what slides?
 
 At rest: rows of one to four blocks with friction on a floor, with contacts between them and walls that touch or do not;
 a stack of two; a block in a corner, both of whose faces rub; a capsule between two pads. Each is pulled by
-a + b t + c sin(w t), with a draw of masses, forces and friction in which all of it holds at t = 0, statically determinate
-or not. Forces are possible until t*: the root of the margin of a linear programme (SciPy's HiGHS), or a closed form. Right
-is a motion in which nothing moves before, a mode ends within 1e-9 of the span at t*, and positions after it are those of
-the accelerations that follow by Gauss's principle (a quadratic programme with bounds, SciPy's BVLS, integrated by Gauss's
-formula), where normal forces are given.
+a + b t + c sin(w t), with a draw of masses, forces and friction in which all of it holds at t = 0, statically
+determinate or not. Forces are possible until t*: the root of the margin of a linear programme (SciPy's HiGHS), or a
+closed form. Right is a motion in which nothing moves before, a mode ends within 1e-9 of the span at t*, and positions
+after it are those of the accelerations that follow by Gauss's principle (a quadratic programme with bounds, SciPy's
+BVLS, integrated by its quad_vec), where normal forces are given.
 
-Others, each against its closed form, with masses and lengths of many sizes: a ball that bounces, two balls that strike each
-other, Newton's cradle, a block on a spring with dry friction, a block on a slope, a puck on a plane.
+Others, each against its closed form, with masses and lengths of many sizes: a ball that bounces, two balls that strike
+each other, Newton's cradle, a block on a spring with dry friction, a block on a slope, a puck on a plane; and a block
+that rocks from corner to corner, against SciPy's DOP853.
 
 "wrong" is an answer that is off; "refused" ends in an error, or in a warning.
 
@@ -26,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import quad_vec
+from scipy.integrate import quad_vec, solve_ivp
 from scipy.optimize import brentq, linprog, lsq_linear
 
 import lagjax as lj
@@ -75,7 +76,7 @@ def first_below(margin, span):
 
 
 def row_of(n):
-    """Blocks on a floor between two walls; `rub`: the friction of each, `d`: their width, `room`: up to the right wall."""
+    """Blocks on a floor between two walls; `rub`: friction of each, `d`: their width, `room`: up to the right wall."""
 
     def gaps(t, q, p):
         left = jnp.concatenate([jnp.full(1, -p["d"]), q])
@@ -85,7 +86,8 @@ def row_of(n):
     return lj.System(
         lambda t, q, v, p: 0.5 * jnp.sum(p["m"] * v**2), force=lambda t, q, v, p: pull(p, t),
         elements={
-            "contact": lj.Contact(gaps), "floor": lj.Friction(lambda t, q, v, p: v, 1.0, normal=lambda t, q, v, p: p["rub"])
+            "contact": lj.Contact(gaps),
+            "floor": lj.Friction(lambda t, q, v, p: v, 1.0, normal=lambda t, q, v, p: p["rub"]),
         },
     )  # fmt: skip
 
@@ -453,6 +455,54 @@ def on_a_plane(count, rng):
     return found
 
 
+def rocking(count, rng):
+    """A slender block that is let go on one of its corners rocks from corner to corner (Housner, 1963).
+
+    About a corner it is a pendulum with θ'' = -3 g/(4 R) sin(α - θ); each impact leaves 1 - 3/2 sin² α of the rate.
+    """
+
+    def height(side, q, p):
+        return q["y"] + side * p["b"] * jnp.sin(q["phi"]) - p["h"] * jnp.cos(q["phi"])
+
+    def corner(side):
+        def along(t, q, v, p):
+            return v["x"] + (p["h"] * jnp.cos(q["phi"]) - side * p["b"] * jnp.sin(q["phi"])) * v["phi"]
+
+        return lj.Contact(lambda t, q, p: height(side, q, p), friction=2.0, sliding=along)
+
+    def energy(t, q, v, p):
+        inertia = p["m"] * (p["b"] ** 2 + p["h"] ** 2) / 3
+        kinetic = 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * inertia * v["phi"] ** 2
+        return kinetic - p["m"] * p["g"] * q["y"]
+
+    system = lj.System(energy, elements={"left": corner(-1), "right": corner(1)})
+    found = []
+    for _ in range(count):
+        m, h, g = 10.0 ** rng.uniform(-12, 12), 10.0 ** rng.uniform(-3, 3), 10.0 ** rng.uniform(-3, 3)
+        b, impacts = h / rng.uniform(2.0, 5.0), rng.integers(1, 4)
+        alpha, radius = np.arctan2(b, h), np.hypot(b, h)
+        rate2, left, angle = 0.75 * g / radius, 1 - 1.5 * np.sin(alpha) ** 2, rng.uniform(0.2, 0.7) * alpha
+
+        def swing(t, y, rate2=rate2, alpha=alpha):
+            return [y[1], -rate2 * np.sin(alpha - y[0])]
+
+        lands = lambda t, y: y[0]
+        lands.terminal, lands.direction = True, -1
+        accurate = {"method": "DOP853", "rtol": 1e-13, "atol": [1e-14 * angle, 1e-14 * angle * np.sqrt(rate2)]}
+        y, t, side, far = np.array([angle, 0.0]), 0.0, 1.0, 20 / np.sqrt(rate2)
+        for _ in range(impacts):
+            fall = solve_ivp(swing, (0.0, far), y, events=lands, **accurate)
+            t, y, side = t + fall.t[-1], np.array([0.0, -left * fall.y[1, -1]]), -side
+        last = solve_ivp(swing, (0.0, far), y, events=lands, **accurate).t[-1] * rng.uniform(0.2, 0.8)
+        right = side * solve_ivp(swing, (0.0, last), y, **accurate).y[0, -1]
+        q0 = {"x": b * np.cos(angle) - h * np.sin(angle), "y": b * np.sin(angle) + h * np.cos(angle), "phi": angle}
+        p = {"m": m, "b": b, "h": h, "g": g}
+        judge = lambda traj, right=right, angle=angle: near(traj.q["phi"][-1], right, "at", angle)
+        start = q0, dict.fromkeys(q0, 0.0), p
+        found.append(Problem(system, start, np.array([0.0, t + last]), judge, f"{p}, {angle}, {impacts} impacts"))
+    return found
+
+
 FAMILIES = {
     "at rest: a block at a wall": (partial(at_rest_in_a_row, 1), 6),
     "at rest: two blocks": (partial(at_rest_in_a_row, 2), 8),
@@ -467,6 +517,7 @@ FAMILIES = {
     "a block on a spring": (on_a_spring, 15),
     "a block on a slope": (on_a_slope, 15),
     "a puck on a plane": (on_a_plane, 15),
+    "a rocking block": (rocking, 10),
 }
 
 
