@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax.mechanics.first_order import is_determined, resolved
 from lagjax.mechanics.lagrangian import applied_force
-from lagjax.mechanics.multiplier_forces import Reactions, response, with_reactions
+from lagjax.mechanics.multiplier_forces import Reactions, at_once, response, with_reactions
 from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, chosen, minimum_norm
 from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense
 from lagjax.system import Model, constraints
@@ -57,7 +57,7 @@ class Solver(NamedTuple):
             a = a + multipliers @ self.responses
             return a, minimum_norm(self.rows.jacobian, multipliers, self.independent)
 
-        return with_reactions(held, self.free, gamma, self.reactions)
+        return with_reactions(held, self.free, gamma, self.reactions, at_once)
 
 
 class ForwardDynamics(NamedTuple):

@@ -49,13 +49,25 @@ def response(model: Model, t: Array, x: Array, u: Array) -> Float[Array, "n m"] 
     return jax.jacfwd(lambda multipliers: model.force(t, x, u, multipliers))(jnp.zeros(model.m, x.dtype))
 
 
-def with_reactions(solve: Callable, forcing: Array, gamma: Array, response) -> Reactions:
+def one_by_one(solve: Callable, loads: list[tuple]) -> list[tuple]:
+    """(a, λ) for each of these (forcing, gamma)."""
+    return [solve(*load) for load in loads]
+
+
+def at_once(solve: Callable, loads: list[tuple]) -> list[tuple]:
+    """The same in lanes, which share what does not depend on them: the inverse of the matrix."""
+    forcing, gamma = (jnp.stack(x) for x in zip(*loads))
+    return list(zip(*jax.vmap(solve)(forcing, gamma)))
+
+
+def with_reactions(
+    solve: Callable, forcing: Array, gamma: Array, response: Array | None, each: Callable = one_by_one
+) -> Reactions:
     """Solve the equations with the force B λ, given `solve(forcing, gamma)` -> (a, λ) for those without it."""
-    a, multipliers = solve(forcing, gamma)
     if response is None:
-        return Reactions(a, multipliers, jnp.asarray(True))
-    count = response.shape[1]
-    columns = [solve(response[:, j], jnp.zeros_like(gamma)) for j in range(count)]
+        return Reactions(*solve(forcing, gamma), jnp.asarray(True))
+    count, still = response.shape[1], jnp.zeros_like(gamma)
+    (a, multipliers), *columns = each(solve, [(forcing, gamma), *((response[:, j], still) for j in range(count))])
     # The rows of I - R, and λ₀ as the right-hand side.
     rows = [[(1.0 if i == j else 0.0) - columns[j][1][i] for j in range(count)] for i in range(count)]
     known, pivots = solve_without_exchanges(rows, [multipliers[i] for i in range(count)])

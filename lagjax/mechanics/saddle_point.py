@@ -40,7 +40,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jaxtools import compiled, jitted
 from lagjax.mechanics.first_order import completed, is_determined, resolved, with_first_order
 from lagjax.mechanics.lagrangian import LinearEquation, applied_force, mass_and_forcing
-from lagjax.mechanics.multiplier_forces import Reactions, response, with_reactions
+from lagjax.mechanics.multiplier_forces import Reactions, at_once, response, with_reactions
 from lagjax.numerics import DEPENDENT_BELOW, SINGULAR_BELOW, dense, independent_rows, unit_rows
 from lagjax.system import Model, State, constraints
 
@@ -249,6 +249,7 @@ def _solved(linear: LinearEquation, jacobian: Array, gamma: Array, independent: 
         linear.forcing,
         gamma,
         linear.response,
+        at_once,
     )
 
 
