@@ -38,6 +38,8 @@ from lagjax.system import InModes, Model, System, constraints, coordinates, mode
 
 # A gap is closed, and a velocity zero, below so many round-offs of the sizes that it is made of.
 CLOSED_BELOW, STILL_BELOW = 16, 1000
+# Ways along which gaps are looked at, in the smallest that counts; their bends are far smaller.
+WAYS = 4.0 ** np.arange(11)
 # A coordinate counts at least as heavy as this part of the heaviest, in √M_ii.
 LIGHT = 1e-6
 # A force is zero below so many round-offs of the forces in the motion.
@@ -140,6 +142,7 @@ class AsFound(NamedTuple):
     """The contacts as a meeting finds them, and below which size what they are made of is zero.
 
     - `closed` (k_N,), `fired` (k,): which gaps are closed; which modes end.
+    - `gap` (k_N,): below which size a gap is zero.
     - `scale` (k, 2): the sizes of gaps, or ways, and of velocities; `forced` (k,): of the accelerations by forces that
       may cancel; `drift` (k,): how far the round-off of these may take a gap in the whole motion.
     - `velocity` (k,): still is what is slower; `ends` (k_T,): the speed at which sliding in a plane ends.
@@ -148,17 +151,13 @@ class AsFound(NamedTuple):
 
     closed: Bool[Array, " kN"]
     fired: Bool[Array, " k"]
+    gap: Float[Array, " kN"]
     scale: Float[Array, "k 2"]
     forced: Float[Array, " k"]
     drift: Float[Array, " k"]
     velocity: Float[Array, " k"]
     ends: Float[Array, " kT"]
     below: Float[Array, " kN"]
-
-    @property
-    def gap(self) -> Float[Array, " kN"]:
-        """Below which size a gap is zero."""
-        return _round_offs(CLOSED_BELOW, self.scale[: self.closed.size, 0])
 
 
 class ContactForces(NamedTuple):
@@ -241,7 +240,7 @@ class Meeting(eqx.Module):
         rows = self._rows(at)
         forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
         moved, sizes = rows.sizes(sizes, 0.0 * forced, span)[1], rows.sizes(sizes, forced, span)
-        contacts = stop_gradient(self._as_found(at, fired, jnp.abs(rows.jacobian), sizes, moved))
+        contacts = stop_gradient(self._as_found(at, fired, rows.jacobian, sizes, moved))
         allowed = jnp.asarray(True)
         if impacts and self.laws.normals:
             struck = self._struck(at, rows, contacts.closed)
@@ -310,24 +309,25 @@ class Meeting(eqx.Module):
         self,
         at: AtMeeting,
         fired: Bool[Array, " k"],
-        rows: Array,
+        jacobian: Array,
         sizes: Float[Array, "2 n"],
         moved: Float[Array, " n"],
     ) -> AsFound:
-        """The contacts before an impact; `rows` (k, n): |A|; `sizes`: of coordinates and velocities; `moved`: of
+        """The contacts before an impact; `jacobian` (k, n): A; `sizes`: of coordinates and velocities; `moved`: of
         velocities, zero where nothing has moved."""
-        laws, (normals, _), (t, q, _, params) = self.laws, self.laws.count, at.state
+        laws, (normals, _), t, rows = self.laws, self.laws.count, at.t, jnp.abs(jacobian)
         scale, forced, drift = rows @ sizes.T, jnp.zeros(len(rows), t.dtype), jnp.zeros(len(rows), t.dtype)
         if self.forced is not None:
             a, span = self.forced.around(t)
             forced = rows @ a
             drift = _round_offs(CLOSED_BELOW, rows @ jnp.max(self.forced.a, axis=0) * span**2)
         modes, slack, fired = (x[: len(laws.rows)] for x in (at.given.modes, jnp.abs(at.given.slack), fired))
-        gaps = jnp.concatenate([jnp.zeros(0, t.dtype), *(law.gaps(t, q, params) for law in laws.normals)])
+        gaps, unevenness = self._gaps(at, jacobian[:normals], sizes[0])
+        gap = jnp.maximum(_round_offs(CLOSED_BELOW, scale[:normals, 0]), CLOSED_BELOW * unevenness)
         closed = (modes == CLOSED)[:normals] | fired[:normals]
         # Also what forces close before the clock moves.
         at_once = jnp.finfo(t.dtype).eps * drift[:normals]
-        zero = jnp.maximum(jnp.maximum(_round_offs(4 * CLOSED_BELOW, scale[:normals, 0]), slack[:normals]), at_once)
+        zero = jnp.maximum(jnp.maximum(4 * gap, slack[:normals]), at_once)
         closed = closed | (jnp.abs(gaps) <= zero)
         # Where all velocities are zero whenever modes change, the slack of what has slid says how fast it was.
         slid = (jnp.abs(modes) == 1).at[:normals].set(False)
@@ -340,8 +340,22 @@ class Meeting(eqx.Module):
         ends = part * lengths((rows @ moved)[normals:], laws.partners)
         # Also where nothing has moved yet.
         return AsFound(
-            closed, fired, scale, forced, drift, velocity, jnp.where(ends > 0, ends, part), jnp.maximum(-gaps, 0.0)
+            closed, fired, gap, scale, forced, drift, velocity, jnp.where(ends > 0, ends, part), jnp.maximum(-gaps, 0.0)
         )
+
+    def _gaps(self, at: AtMeeting, jacobian: Array, size: Float[Array, " n"]) -> tuple[Array, Array]:
+        """The gaps, and how unevenly they grow over the smallest ways, by the round-off of what they are made of: of
+        q + d - d with q near zero it is that of d."""
+        t, _, _, params = at.state
+
+        def gaps(x: Array) -> Array:
+            every = [law.gaps(t, at.model.tree(x), params) for law in self.laws.normals]
+            return jnp.concatenate([jnp.zeros(0, t.dtype), *every])
+
+        found, near = gaps(at.x), _round_offs(CLOSED_BELOW, size) * jnp.cos(jnp.arange(size.size, dtype=t.dtype))
+        x = at.x[None] + np.array(WAYS, t.dtype)[:, None] * near[None]
+        straight = (x - at.x[None]) @ jacobian.T
+        return found, jnp.max(jnp.abs(jax.vmap(gaps)(x) - found[None] - straight), axis=0, initial=0.0)
 
     def _ends_at(self, dtype) -> Float[Array, ""]:
         """At which part of the velocities in the motion sliding in a plane ends."""
