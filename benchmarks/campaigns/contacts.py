@@ -6,7 +6,8 @@ a + b t + c sin(w t), with a draw of masses, forces and friction in which all of
 determinate or not. Forces are possible until t*: the root of the margin of a linear programme (SciPy's HiGHS), or a
 closed form. Right is a motion in which nothing moves before, a mode ends within 1e-9 of the span at t*, and positions
 after it are those of the accelerations that follow by Gauss's principle (a quadratic programme with bounds, SciPy's
-BVLS, integrated by its quad_vec), where normal forces are given.
+BVLS, integrated by its quad_vec), where normal forces are given. What moves by no more than the round-off of the forces
+that hold it, 8 ε a t², rests.
 
 Others, each against its closed form, with masses and lengths of many sizes: a ball that bounces, two balls that strike
 each other, Newton's cradle, a block on a spring with dry friction, a block on a slope, a puck on a plane; and a block
@@ -146,12 +147,13 @@ def draw_row(n, rng, scale=1.0):
             return p, walls, span, when
 
 
-def rests_then(traj, when, span, size, right, moving):
-    """What is wrong with a motion that is to rest until `when`, and then be at `right` at its end."""
+def rests_then(traj, when, span, size, right, moving, pulls=0.0):
+    """What is wrong with a motion that is to rest until `when`, and then be at `right` at its end; `pulls`: the largest
+    acceleration by a single force, whose round-off goes ε a t²."""
     before, last = np.asarray(traj.t) < when, np.concatenate([np.ravel(x[-1] - x[0]) for x in jax.tree.leaves(traj.q)])
     early = max(float(np.max(np.abs(np.asarray(x)[before] - np.asarray(x)[0]))) for x in jax.tree.leaves(traj.q))
     times = np.asarray(traj.switches.t)[: len(traj.switches)]
-    if early > STILL * size:
+    if early > STILL * size + 8 * np.finfo(float).eps * pulls * when**2:
         return f"moved by {early:.1e} before t* = {when:.6g}"
     off = np.min(np.abs(times - when), initial=np.inf)
     if off > IN_TIME * span:
@@ -178,8 +180,10 @@ def at_rest_in_a_row(n, count, rng):
         q0 = p["d"] * np.arange(n, dtype=float)
         ts = np.array([0.0, 0.5 * when, 0.999 * when, later])
         size = max(np.max(np.abs(right)), 1e-3 * np.max(q0))
+        pulls = max(np.max(np.abs(pulled(p, t)) / p["m"]) for t in np.linspace(0.0, when, NODES))
+        moving = np.any(a != 0, axis=0)
         judge = partial(
-            rests_then, when=when, span=span, size=max(size, 1e-6), right=right, moving=np.any(a != 0, axis=0)
+            rests_then, when=when, span=span, size=max(size, 1e-6), right=right, moving=moving, pulls=pulls
         )
         found.append(Problem(system, (q0, np.zeros(n), p), ts, judge, f"{p} until {when}"))
     return found
@@ -308,7 +312,8 @@ def at_rest_in_a_grip(count, rng):
         fallen = (later - when) / 2 * (w * (later - s)) @ (margin(s) / p["m"])
         right = np.array([0.0, 0.0, 0.0, fallen])
         q0 = {"left": -r, "right": r, "x": 0.0, "z": 0.0}
-        judge = partial(rests_then, when=when, span=4.0, size=r, right=right, moving=None)
+        pulls = pulled(p, 0.0) / p["pad"]
+        judge = partial(rests_then, when=when, span=4.0, size=r, right=right, moving=None, pulls=pulls)
         ts = np.array([0.0, 0.5 * when, 0.999 * when, later])
         found.append(Problem(system, (q0, dict.fromkeys(q0, 0.0), p), ts, judge, f"{p} until {when}"))
     return found

@@ -125,6 +125,11 @@ class Forces(NamedTuple):
 
 def solved(problem: ContactProblem) -> Forces:
     """The forces of contacts that are solved together; the first derivative is that of the solution's own case."""
+    # The problem has no size of its own: one of forces of 1e-255 is solved as any other.
+    size = jnp.max(jnp.abs(jnp.concatenate([problem.step * problem.free, problem.constant])))
+    unit = stop_gradient(jnp.ldexp(jnp.ones_like(size), jnp.frexp(size)[1]))
+    unit = jnp.where((size > 0) & (unit > 0) & jnp.isfinite(unit), unit, 1.0)
+    problem = problem._replace(free=problem.free / unit, constant=problem.constant / unit)
     still = stop_gradient(problem)._replace(partners=problem.partners, both=problem.both)
 
     def residual(problem: ContactProblem, forces: Array) -> Array:
@@ -164,4 +169,4 @@ def solved(problem: ContactProblem) -> Forces:
     _, (forces, left, slope), *_ = lax.while_loop(goes_on, newton, start)
     # One more step from the best: its matrix is that of the solution's own case.
     forces = stop_gradient(forces)
-    return Forces(forces - stop_gradient(slope) @ residual(problem, forces), left <= small)
+    return Forces(unit * (forces - stop_gradient(slope) @ residual(problem, forces)), left <= small)

@@ -455,9 +455,11 @@ class Meeting(eqx.Module):
             a = problem.matrix @ forces.forces + problem.free
             return ContactForces(problem, bound, forces.forces, a, no_force, least / problem.step, forces.found)
 
-        def holds(bound: AtBound, forces: Forces) -> tuple[Array, Array]:
+        def holds(bound: AtBound, forces: Forces) -> tuple[Array, Array, Array, Array]:
             found = solution(bound, forces)
-            return self.laws.holds(self._modes(at, found)), found.no_force
+            closes = bound.lifted & (found.a < -found.no_acceleration)[: bound.lifted.size]
+            begins = jnp.where(problem.given, 0.0, found.sides())
+            return self.laws.holds(self._modes(at, found)), found.no_force, closes, begins
 
         return solution(*within_laws(problem, held, holds))
 

@@ -85,7 +85,8 @@ class BoundsTried(NamedTuple):
 def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tuple[AtBound, Forces]:
     """The forces of contacts, and what has the bound of its law since the shortest forces would break that.
 
-    `holds(bound, solution)`: which rows are held then, and below which size each force is zero.
+    `holds(bound, solution)`: which rows are held then, and below which size each force is zero; which of the gaps
+    without a force close, and to which side, or direction, what is not held begins to slide.
     """
     gaps = problem.may_push.size
     none = AtBound(jnp.zeros(gaps, bool), jnp.zeros_like(problem.slides))
@@ -95,15 +96,19 @@ def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tup
     def attempt(before: BoundsTried) -> BoundsTried:
         bound, tried = before.next, before.next.on(problem)
         solution = solved(tried)
-        on, no_force = holds(bound, solution)
+        on, no_force, closes, begins = holds(bound, solution)
         shortest, beyond = held.excess(tried.on_sides_of(solution.forces), on)
         worst = jnp.max(beyond - no_force / 2)
         here = (beyond - no_force / 2 == worst) & (worst > 0)
         leans = jnp.where(here[gaps:], directions(shortest[gaps:], problem.partners), bound.leans)
         further = AtBound(bound.lifted | here[:gaps], leans)
+        # A gap that closes needs its force: then what slid without that is at its bound, and not the gap.
+        closing = jnp.any(closes)
+        slid = jnp.where(lengths(bound.leans, problem.partners) > 0, bound.leans, -begins)
+        further = where(closing, AtBound(bound.lifted & ~closes, slid), further)
         # Where the others cannot carry it, all are held as they were.
-        better = solution.found | (before.count == 0)
-        goes_on = better & solution.found & (worst > 0) & (before.count < problem.free.size)
+        better = solution.found & ~closing | (before.count == 0)
+        goes_on = solution.found & ((worst > 0) | closing) & (before.count < problem.free.size)
         chosen = where(better, (bound, solution), (before.bound, before.solution))
         return BoundsTried(*chosen, further, goes_on, before.count + 1)
 

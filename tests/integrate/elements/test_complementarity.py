@@ -108,3 +108,19 @@ def test_excess_by_round_off():
     forces, well = map(np.asarray, forces_of(matrix, -np.einsum("kij,kj->ki", matrix, wanted), mu, 0.0 * mu))
     beyond = forces[:, 3] / (0.3 * forces[:, 0]) - 1
     assert np.sum(well) > LANES / 2 and np.all(beyond[well] < 2e-15) and wanted[0, 3] / 0.3 - 1 > 5e-14
+
+
+def test_a_gap_beside_friction_at_its_most():
+    """What rubs gives by a part of 1e-16 to 1e-9 of μ N, and a gap opens: it has no force at all, of whatever size the
+    others are. Twin: the force that would hold both pulls."""
+    matrix, beyond = np.tile(np.eye(6), (LANES, 1, 1)), 10.0 ** np.linspace(-16, -9, LANES)
+    # Two bodies of masses 1 and 0.2 that touch; the first is pulled off, and rubs under the third gap.
+    matrix[:, [0, 0, 5, 5], [0, 5, 0, 5]] = [6.0, 1.0, 1.0, 1.0]
+    free = np.zeros((LANES, 6))
+    pull = 0.3 * (1 + beyond)
+    free[:, 2], free[:, [0, 5]] = -1.0, pull[:, None]
+    for size in (1.0, 1e7, 1e-255):
+        forces, well = map(np.asarray, forces_of(matrix, size * free, np.full((LANES, 3), 0.3), np.zeros((LANES, 3))))
+        assert np.all(well) and np.all(forces[:, 0] == 0) and np.all(forces[:, 2] == size)
+        np.testing.assert_allclose(forces[:, 5] / size, -0.3, rtol=4e-16)
+    assert np.all(0.3 - pull[-30:] < 0)

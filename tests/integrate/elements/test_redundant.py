@@ -26,7 +26,10 @@ def in_bounds(matrix, free, rows, of_normals, mu, partners):
     held = HeldRows(rows, jnp.zeros((0, rows.shape[1])), jnp.zeros(0), jnp.zeros((k, 0)))
 
     def holds(bound, solution):
-        return jnp.concatenate([~bound.lifted, lengths(bound.leans, partners) == 0]), jnp.full(k, 1e-9)
+        a, leans = matrix @ solution.forces + free, lengths(bound.leans, partners) > 0
+        gaps, slides = k - slips, jnp.where(jnp.abs(a) > 1e-12, jnp.sign(a), 0.0)[k - slips :]
+        on = jnp.concatenate([~bound.lifted, ~leans & (slides == 0)])
+        return on, jnp.array([1e-10] * gaps + [1e-9] * slips), bound.lifted & (a < -1e-12)[:gaps], slides
 
     bound, solution = within_laws(problem, held, holds)
     leans = lengths(bound.leans, partners) > 0
@@ -60,6 +63,20 @@ def test_a_box_on_two_corners():
         forces, _, leans = resting(corners, np.eye(2, 4), [push, -1.0, 0.0], np.array(BOX), partners=(0, 1))
         np.testing.assert_allclose(forces, [(1 - push) / 2, (1 + push) / 2, -fraction, fraction - push], atol=1e-12)
         assert leans[0] == (fraction < push / 2)
+
+
+def test_a_gap_that_would_close():
+    """Two blocks side by side, each on its own normal force, of which the first is pulled to the second by a little
+    more than its friction holds: the gap between them carries that, though among the shortest forces it pulls. Twin:
+    a little less, and nothing is at its bound but the gap, which has no force."""
+    first, between, second = [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+    rows = [first, between, second, [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    presses = np.eye(5)[[0, 2]]
+    for over in (1e-10, -1e-10):
+        forces, lifted, leans = resting(rows, presses, [MU + over, -1.0, 2.0, -8.0], partners=(0, 1))
+        held = max(over, 0.0)
+        np.testing.assert_allclose(forces, [1.0, held, 8.0, held - MU - over, -2.0 - held], atol=1e-12)
+        assert lifted.tolist() == [False, over < 0, False] and leans.tolist() == [over > 0, False]
 
 
 def test_a_table_on_four_legs():
