@@ -1,5 +1,7 @@
 """Optimal control: closed forms, constraints, a published problem, and questions that have no answer."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -284,3 +286,21 @@ def test_meshes():
     low, high = cut.limits()
     assert np.all(low[[0, 2, 4, 5]] == high[[0, 2, 4, 5]]) and np.all(low[[1, 3]] < high[[1, 3]])
     assert low[3] > cut.parts[2] and high[3] < cut.parts[4]
+
+
+@pytest.mark.parametrize("falls", [True, False])
+def test_controls_at_a_jump(falls):
+    """Before a jump a control is at one of its limits, after it at the other; elsewhere, and the other control,
+    anywhere between them."""
+    controls, none = np.arange(8).reshape(4, 2), SimpleNamespace(q=np.zeros(0), v=np.zeros(0))
+    places = {"controls": controls, "end": [8], "parts": np.arange(9, 14), "q": np.zeros((2, 0), int)}
+    layout = SimpleNamespace(places=places | {"v": places["q"]}, size=14, of_controls=np.arange(4)[:, None])
+    limits = {"q": (-1.0, 1.0), "v": (-1.0, 1.0), "controls": (np.array([-2.0, -3.0]), np.array([2.0, 3.0]))}
+    question = SimpleNamespace(limits=limits, t_b=(1.0, 1.0), ends=(none, none))
+    cut = mesh.Mesh(np.linspace(0.0, 1.0, 5), {2: [mesh.Jump(0.5, 1, falls)]})
+    low, high = optimal_control._limits_of(question, layout, cut)
+    known = {1: 3.0 if falls else -3.0, 2: -3.0 if falls else 3.0}
+    for k in range(4):
+        assert (low[controls[k, 0]], high[controls[k, 0]]) == (-2.0, 2.0)
+        assert (low[controls[k, 1]], high[controls[k, 1]]) == ((known[k],) * 2 if k in known else (-3.0, 3.0))
+    assert (low[8], high[8]) == (1.0, 1.0) and np.sum(low[9:] < high[9:]) == 1

@@ -1,5 +1,8 @@
 """The balance of forces and its small departures: shared multipliers, roots and their derivatives."""
 
+import itertools
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.equilibria.balance import Steady, SteadySymmetries, balance, departures, shortest_multipliers
+from lagjax.analysis.equilibria.equilibria import _zero_modes
 from lagjax.analysis.equilibria.result import Equilibria, merged
 from lagjax.scenes import cross_rails
 from lagjax.system.model import model_of
@@ -134,3 +138,18 @@ def test_equal_equilibria_are_merged():
     assert found(False, 0, 0, 0, 0).of_start.tolist() == [0, 1, 2, 3]
     # At a multiple root, which is known to within a radius, the roots do not count.
     assert found(True, 0, 0, 0, 1).of_start.tolist() == [0, 0, 1, 0]
+
+
+def test_directions_in_which_the_balance_holds():
+    """Of a mass on a rod: none where a force restores it along that, and one where none does, whatever acts across.
+    Twin: the multiplier is a direction too, in which the balance does not hold."""
+
+    @jax.jit
+    def zero_modes(matrix):
+        steady = SimpleNamespace(n=2, m=1, symmetries=SimpleNamespace(count=0), fields=lambda y: jnp.zeros((0, 2)))
+        return _zero_modes(steady, SimpleNamespace(jacobian=matrix, rows=jnp.ones(3), y=jnp.zeros(3)))[0]
+
+    on_a_rod = lambda along, across: np.array([[along, 0.0, 0.0], [0.0, across, -2.5], [0.0, -2.5, 0.0]])
+    for along, across in itertools.product((7.85, 0.0), (0.0, 3.0)):
+        matrix = on_a_rod(along, across)
+        assert int(zero_modes(matrix)) == (along == 0) == 3 - np.linalg.matrix_rank(matrix)
