@@ -169,16 +169,18 @@ def good(tmp_path_factory):
     return folder
 
 
-def test_changed_files(good, tmp_path):
-    """Seventy changed trajectory files, some of which can be read."""
-    wrong, read = attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, range(70))
-    assert wrong == [] and 0 < read < 40
+@pytest.mark.parametrize("numbers", [range(70), pytest.param(range(1000, 1500), marks=pytest.mark.exhaustive)])
+def test_changed_files(good, tmp_path, numbers):
+    """Changed trajectory files, some of which can be read."""
+    wrong, read = attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, numbers)
+    assert wrong == [] and 0 < read < 0.6 * len(numbers)
 
 
-def test_changed_stores(good, tmp_path):
-    """Thirty changed stores, some of which can be read."""
-    wrong, read = attack_stores(good / "store", tmp_path, range(30))
-    assert wrong == [] and 0 < read < 25
+@pytest.mark.parametrize("numbers", [range(30), pytest.param(range(1000, 1300), marks=pytest.mark.exhaustive)])
+def test_changed_stores(good, tmp_path, numbers):
+    """Changed stores, some of which can be read."""
+    wrong, read = attack_stores(good / "store", tmp_path, numbers)
+    assert wrong == [] and 0 < read < 0.85 * len(numbers)
 
 
 def changed(good, path, change):
@@ -365,19 +367,6 @@ def test_a_sweep_continues_inside_its_store(good, tmp_path):
     (tmp_path / "in" / "store" / "y" / "zarr.json").unlink()
     with pytest.warns(UserWarning, match="It has been restored"):
         assert again().ok.all()
-
-
-@pytest.mark.exhaustive
-def test_five_hundred_changed_files(good, tmp_path):
-    """The same for trajectories, longer."""
-    numbers = range(1000, 1500)
-    assert attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, numbers)[0] == []
-
-
-@pytest.mark.exhaustive
-def test_three_hundred_changed_stores(good, tmp_path):
-    """The same for stores, longer."""
-    assert attack_stores(good / "store", tmp_path, range(1000, 1300))[0] == []
 
 
 @pytest.mark.exhaustive

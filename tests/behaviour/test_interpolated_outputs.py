@@ -16,7 +16,6 @@ from tests.systems import pendulum
 
 PARAMS = {"g": 1.0, "l": 1.0}
 HALF, MANY, FEW = np.sin(0.6), np.linspace(0.0, 6.0, 121), np.array([0.0, 6.0])
-TIMES = np.linspace(0.0, 2.0, 21)
 # As many numbers as reverse mode replays for; their sum is one.
 shared = lj.System(lambda t, q, v, p: 0.5 * v**2 + jnp.sum(p) * jnp.cos(q))
 SHARES = np.full(40, 1 / 40)
@@ -142,21 +141,6 @@ def test_on_the_constraints():
     assert np.max(np.abs(2 * traj.multipliers["rod"] + np.cos(angle) + rate**2)) < 1e-2
 
 
-@pytest.mark.exhaustive
-def test_derivatives_on_the_constraints():
-    """The slope by gravity, in reverse, is right."""
-
-    def loss(p):
-        traj = on_the_rod(p)
-        return jnp.sum(traj.q[:, 0]) + jnp.sum(traj.multipliers["rod"])
-
-    angle, rate = exact(MANY)
-
-    # At another gravity g the motion is as fast as √g, and the multiplier g times as large.
-    by_g = 0.5 * MANY * rate * np.cos(angle) - 0.5 * (np.cos(angle) + rate**2) + 0.75 * MANY * rate * np.sin(angle)
-    np.testing.assert_allclose(jax.grad(loss)(SHARES), np.sum(by_g) * np.ones(40), rtol=2e-3)
-
-
 DOWN = {"down": lj.Crossing(lambda t, q, v, m, p: q, terminal=True)}
 QUARTER = special.ellipk(HALF**2)
 
@@ -177,44 +161,9 @@ def test_beside_events_and_in_float32():
     assert single.q.dtype == np.float32 and max(worst(single)) < 3e-4
 
 
-@pytest.mark.exhaustive
-def test_derivative_of_an_event():
-    """The period is proportional to 1/√(sum of p)."""
-    slope = jax.grad(lambda p: until_down(p).events["down"].t[0])(SHARES)
-    assert slope == pytest.approx(np.full(40, -QUARTER / 2), rel=1e-4)
-
-
 def test_refused():
     """Unknown words, and methods whose steps are too long for the polynomial."""
     with refusal(ValueError, "outputs must be 'exact' or 'interpolated'", 'outputs="exact"'):
         lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="linear")
     with refusal(ValueError, "which Dopri8 does not go with", r"method=lj.Tsit5\(\)"):
         lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="interpolated", method=lj.Dopri8())
-
-
-@pytest.mark.exhaustive
-def test_networks_in_lanes_of_float32():
-    """A mass matrix that is a network: the default, at loose tolerance in lanes, has finite and right gradients."""
-    random = np.random.default_rng(0)
-    weights = [0.3 * random.normal(size=(2, 16)), 0.3 * random.normal(size=(16, 16)), 0.3 * random.normal(size=(16, 4))]
-
-    def lagrangian(t, q, v, p):
-        found = jnp.tanh(jnp.tanh(jnp.sin(q) @ p[0]) @ p[1]) @ p[2]
-        return 0.5 * v @ lj.learned.positive_definite(found[:3]) @ v - found[3]
-
-    system, starts = lj.System(lagrangian), random.normal(size=(2, 6, 2))
-
-    def slope(dtype, **how):
-        p, (q0, v0), ts = (
-            *(jax.tree.map(lambda x: jnp.asarray(x, dtype), x) for x in (weights, starts)),
-            TIMES.astype(dtype),
-        )
-        one = lambda p, q0, v0: lj.integrate(system, q0, v0, p, ts=ts, throw=False, **how)
-        assert jax.eval_shape(one, p, q0[0], v0[0]).static.method.startswith(
-            "Tsit5" if dtype == np.float32 else "Dopri8"
-        )
-        loss = lambda p: jnp.mean(jax.vmap(lambda q0, v0: one(p, q0, v0).q, (0, 0))(q0, v0) ** 2)
-        return jax.jit(jax.grad(loss))(p)
-
-    for found, right in zip(slope(np.float32), slope(np.float64)):
-        assert found.dtype == np.float32 and np.max(np.abs(found - right)) < 1e-3 * np.max(np.abs(right))

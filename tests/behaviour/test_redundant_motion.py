@@ -7,25 +7,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.mechanics.test_saddle_point import DOOR_STATE, RATE, door, twice
-from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+from tests.mechanics.test_saddle_point import DOOR_STATE, RATE, door
+from tests.systems import PARAMS, cartesian_lagrangian, rod
 from tests.tiers import exhaustive_but
 
 TOLERANCE = 1e-10
 START = ({"x": 1.0, "y": 0.75}, {"x": -1.5, "y": 2.0})
-
-
-@pytest.mark.exhaustive
-def test_pendulum_on_two_rods():
-    """A rod given twice moves the pendulum as one does, and the two share its force in the ratio of their scales."""
-    ts = np.linspace(0.0, 5.0, 6)
-    run = lambda system: lj.integrate(system, *START, PARAMS, ts=ts, rtol=TOLERANCE, atol=TOLERANCE)
-    one, two = run(rod_pendulum), run(twice(-0.5))
-    for name in one.q:
-        np.testing.assert_allclose(two.q[name], one.q[name], atol=1e-9)
-    np.testing.assert_allclose(two.multipliers["rod"], one.multipliers["rod"] / 1.25, rtol=1e-8)
-    np.testing.assert_allclose(two.multipliers["again"], -0.5 * two.multipliers["rod"], rtol=1e-12)
-    assert float(two.residual()) < 1e-15
 
 
 @pytest.mark.exhaustive

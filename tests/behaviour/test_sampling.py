@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ellipj
 
 import lagjax as lj
-from tests.fit.uncertainty.test_laplace import SIGMA, T, exact, fall, measured, swing
+from tests.fit.uncertainty.test_laplace import swing
 
 pytestmark = pytest.mark.slow
 DRAWS = 3000
@@ -64,23 +64,6 @@ def on_a_grid(data):
         mean = x @ p
         found.append((mean, np.sqrt((x - mean) ** 2 @ p), np.interp(0.9, np.cumsum(p) - p / 2, x)))
     return found
-
-
-@pytest.mark.exhaustive
-def test_a_normal_posterior():
-    """Draws for a fall have the exact mean, standard deviation and quantile of every unknown."""
-    y = measured()
-    found = lj.fit(fall, lj.Record(T, q=y, sigma=SIGMA), {"g": 9.0}, priors={"g": (9.81, 0.1)})
-    told = found.laplace()
-    draws = told.unknowns(nuts(told.standardised(found.log_posterior), 3, jax.random.key(0)))
-    mean, covariance, _ = exact(y, (9.81, 0.1))
-    sd = np.sqrt(np.diag(covariance))
-    start = np.asarray(draws["starts"])[:, 0] + (told.mean[1:] - np.asarray(found.sampling["starts"])[0])
-    for x, m, s in zip((draws["g"], *start.T), mean, sd):
-        assert np.max(np.abs(errors(x, m, s, m + 1.2816 * s))) < 4
-    # Twin: draws of the likelihood without its prior do not.
-    draws = told.unknowns(nuts(told.standardised(found.log_likelihood), 3, jax.random.key(0)))
-    assert np.max(np.abs(errors(draws["g"], mean[0], sd[0], mean[0] + 1.2816 * sd[0]))) > 8
 
 
 @pytest.mark.exhaustive

@@ -5,7 +5,6 @@ v² = g l sin φ, that is sin φ = (v₀² - 2 g l) / (3 g l). On its parabola x
 gap opens as t³, and the string is taut again after t = 4 v cos φ / g, at the angle -3 φ of the circle.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,18 +65,3 @@ def test_slack_and_taut():
     np.testing.assert_allclose(traj.switches.v_after[1], kept, rtol=1e-8)
     np.testing.assert_allclose(traj.switches.impulse[1], kept - falling, rtol=1e-8)
     assert abs(thrown(1.01 * speed).switches.t[1] / (slack + flight) - 1) > 1e-3
-
-
-@pytest.mark.exhaustive
-def test_derivatives():
-    """d(taut place)/d(speed) in both modes against the closed form's."""
-    speed = np.sqrt(3.0 * G * L)
-    place = lambda speed: thrown(speed).switches.q[1]
-
-    def exact(speed):
-        phi = jnp.arcsin((speed**2 / (G * L) - 2) / 3)
-        return L * jnp.array([jnp.cos(3 * phi), -jnp.sin(3 * phi)])
-
-    expected = jax.jacfwd(exact)(speed)
-    for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(mode(place)(speed), expected, rtol=1e-7)
