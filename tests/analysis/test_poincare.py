@@ -1,7 +1,5 @@
 """Poincaré sections, periods and turning points against elliptic integrals, Kepler's law and effective potentials."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -130,30 +128,6 @@ def test_radial_turning_points(mu, k, speed):
     np.testing.assert_array_equal(nearest.t, turns.t[int(other == far) :: 2][: len(nearest.t)])
 
 
-def kepler(speed, mu):
-    """T = 2π √(a³/μ), 1/a = 2/r - speed²/μ."""
-    return 2 * jnp.pi * (2 - speed**2 / mu) ** -1.5 / jnp.sqrt(mu)
-
-
-@pytest.mark.exhaustive
-def test_radial_periods():
-    """Radial periods obey Kepler's third law, or are half a spring's period; twin: with both forces neither holds."""
-    period = lambda mu, k, speed: np.asarray(lj.periods(radial(1.0, speed, mu, k, 30.0)["nearest"]))[:2]
-    np.testing.assert_allclose(period(1.25, 0.0, 1.25), kepler(1.25, 1.25), rtol=1e-9)
-    np.testing.assert_allclose(period(0.0, 0.75, 1.25), np.pi / np.sqrt(0.75), rtol=1e-9)
-    assert np.all(abs(period(1.25, 0.75, 1.25) / [float(kepler(1.25, 1.25)), np.pi / np.sqrt(0.75)] - 1) > 0.05)
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_keplers_period():
-    """Derivatives by the initial speed and by μ, forward and reverse."""
-    period = lambda x: lj.periods(radial(jnp.ones(()), x[0], x[1], 0.0, 30.0)["nearest"])[1]
-    x = jnp.array([1.25, 1.25])
-    exact = jax.grad(lambda x: kepler(*x))(x)
-    for mode in (jax.jacfwd, jax.grad):
-        np.testing.assert_allclose(mode(period)(x), exact, rtol=1e-7)
-
-
 # Sections of two degrees of freedom.
 
 
@@ -196,25 +170,6 @@ def test_section_of_henon_and_heiles():
     # The kinetic energy of y varies, so that a wrong energy would be seen.
     assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
     np.testing.assert_allclose(section.t[:11], orbit(0.125).t[:11], rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_lanes():
-    """A batch equals a loop over its lanes, and prints and draws them."""
-    starts = jnp.array([0.125, -0.1, 0.2])
-    lanes = jax.jit(jax.vmap(lambda y: orbit(y, span=80.0)))(starts)
-    for i, y in enumerate(starts):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", lj.EventWarning)
-            alone = orbit(y, span=80.0)
-        assert int(lanes.count[i]) == int(alone.count)
-        for a, b in zip(jax.tree.leaves((lanes.t, lanes.q, lanes.v)), jax.tree.leaves((alone.t, alone.q, alone.v))):
-            np.testing.assert_allclose(a[i], b, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(lj.periods(lanes)[i], lj.periods(alone), rtol=1e-7)
-    words = repr(lanes)
-    assert "lanes       3" in words and f"{int(lanes.count.min())} to {int(lanes.count.max())} a lane" in words
-    (axis,) = lanes.plot().axes
-    assert len({line.get_color() for line in axis.lines}) == 3
 
 
 def in_a_plane(seed=0, count=4):

@@ -26,34 +26,6 @@ def test_folds():
     assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
 
 
-@pytest.mark.exhaustive
-def test_folds_of_random_curves():
-    """Branches that are graphs mu(q): exactly the folds between their ends are found, by a fine grid of mu'."""
-
-    def potential(t, q, v, p):
-        waves = p["a"] * jnp.cos(q) + p["b"] * jnp.cos(2 * q + p["shift"]) / 2 + p["d"] * jnp.cos(5 * q) / 5
-        return 0.5 * v**2 + p["mu"] * q + waves - 0.5 * p["c"] * q**2
-
-    system, rng, start, counted = lj.System(potential), np.random.default_rng(5), -20.0, 0
-    for _ in range(12):
-        p = dict(zip("abd", rng.normal(size=3) * [2, 2, 0.5])) | {"c": 0.3 + 0.5 * rng.uniform(), "shift": rng.normal()}
-        mu = lambda q, p=p: (
-            p["a"] * np.sin(q) + p["b"] * np.sin(2 * q + p["shift"]) + p["d"] * np.sin(5 * q) + p["c"] * q
-        )
-        first = mu(start)
-        found = lj.continue_equilibria(system, p | {"mu": first}, start, along="mu", to=first + 12.0)
-        towards = np.sign(mu(start + 1e-6) - first)
-        values = mu(start + towards * np.linspace(1e-9, 80.0, 400001))
-        outside = np.flatnonzero((values < first - 1e-12) | (values > first + 12.0))
-        slopes = np.diff(values[: outside[0] if len(outside) else None])
-        turns = values[1:-1][: len(slopes) - 1][slopes[1:] * slopes[:-1] < 0]
-        folds = [float(c.parameter) for c in found.critical]
-        assert {c.kind for c in found.critical} <= {"fold"} and found[0].status == "the end of the range"
-        np.testing.assert_allclose(np.sort(folds), np.sort(turns), atol=1e-6)
-        counted += len(folds)
-    assert counted > 20
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("e", [1e-3, pytest.param(1e-6, marks=pytest.mark.exhaustive)])
 def test_nearly_a_pitchfork(e):

@@ -1,5 +1,6 @@
 """Branches of cycles: against elliptic integrals, Mathieu's boundaries, SciPy's shooting and averaging."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from lagjax.analysis.continuation.arclength import BranchPoint
 from lagjax.analysis.continuation.orbit_result import CriticalOrbit
 from lagjax.analysis.continuation.orbits import _zero
 from tests.analysis import closed_forms as known
-from tests.systems import PARAMS, pendulum
+from tests.systems import PARAMS, pendulum, rod_pendulum
 
 UNIT = {"g": 1.0, "l": 1.0}
 
@@ -58,6 +59,35 @@ def test_pendulum_by_its_amplitude():
     by_period = lj.continue_orbits(orbit, along="period", to=9.0)
     np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
     np.testing.assert_allclose(by_period.period, known.swinging(by_period.q, UNIT), rtol=1e-11)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
+def test_pendulum_on_a_rod(along, to):
+    """With a constraint: along the energy, and along the rod's length at constant energy; the rod keeps its length."""
+    start = {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"x": 0.0, "y": 0.0}
+    orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
+    branch = lj.continue_orbits(orbit, along=along, to=to)
+    energy, length = (branch.parameter, 1.0) if along == "energy" else (-np.cos(1.0), branch.parameter)
+    np.testing.assert_allclose(
+        branch.period, known.swinging(np.arccos(-energy / length), UNIT | {"l": length}), rtol=1e-10
+    )
+    np.testing.assert_allclose(np.hypot(branch.q["x"], branch.q["y"]), length, rtol=1e-12)
+    assert branch.status == "the end of the range" and branch.stable.all()
+
+
+@pytest.mark.exhaustive
+def test_relative_orbits():
+    """In a central force, along the exponent of its law: the harmonic oscillator, at r², has the period π in r."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) - q["r"] ** p["power"] / p["power"]
+
+    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.5}
+    orbit = lj.periodic_orbit(lj.System(lagrangian), start, 1.8, {"power": 1.0}, relative="phi")
+    branch = lj.continue_orbits(orbit, along="power", to=2.0)
+    np.testing.assert_allclose(branch.period[-1], np.pi, rtol=1e-11)
+    assert abs(branch.period[0] - np.pi) > 0.03
 
 
 @pytest.mark.exhaustive
@@ -116,10 +146,7 @@ DRIVEN = known.DUFFING | {"omega": 0.5}
 
 @pytest.mark.exhaustive
 def test_resonance_curve():
-    """Both folds, every orbit and its stability agree with SciPy's shooting; amplitudes are near harmonic balance.
-
-    Twin: a state off by a millionth is not SciPy's orbit, and beyond the folds there is only one orbit.
-    """
+    """Both folds, every orbit and its stability agree with SciPy's shooting; it is drawn. Twin: a millionth off."""
     orbit = lj.periodic_orbit(known.duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=3.0)
     assert [c.kind for c in branch.critical] == ["fold", "fold"] and branch.status == "the end of the range"
@@ -134,27 +161,30 @@ def test_resonance_curve():
         assert np.abs(z + 1e-6 - exact).max() > 1e-8
         assert bool(branch.stable[i]) == bool(np.abs(found).max() < 1)
         np.testing.assert_allclose(np.sort(np.abs(found)), np.sort(np.abs(branch.multipliers[i])), rtol=1e-6)
-    # One harmonic: (1 - ω² + 3/4 b A²)² A² + (c ω A)² = f².
-    near = np.arange(0, upper.index)[branch.parameter[: upper.index] > 1.0]
-    amplitude, omega = branch.high[near], branch.parameter[near]
-    b, f, _, c = DRIVEN.values()
-    force = np.sqrt((1 - omega**2 + 0.75 * b * amplitude**2) ** 2 + (c * omega) ** 2) * amplitude
-    assert np.mean(np.abs(force / f - 1)) < 0.5
-
-    def one_harmonic(omega):
-        """A² of the balance."""
-        roots = np.roots([(0.75 * b) ** 2, 1.5 * b * (1 - omega**2), (1 - omega**2) ** 2 + (c * omega) ** 2, -(f**2)])
-        return np.sqrt(np.sort(roots[np.abs(roots.imag) < 1e-9].real))
-
-    grid = np.linspace(1.0, 2.0, 4001)
-    several = grid[[len(one_harmonic(w)) == 3 for w in grid]]
-    np.testing.assert_allclose([lower.parameter, upper.parameter], [several[0], several[-1]], rtol=0.01)
     # SciPy's orbits at the folds have the double multiplier 1, which is off by the root of the orbits' error.
     for fold in branch.critical:
         omega = float(fold.parameter)
         z = np.array([branch.q[fold.index], branch.v[fold.index]])
         found = np.linalg.eigvals(monodromy(known.duffing_rate(DRIVEN | {"omega": omega}), 2 * np.pi / omega, z))
         assert np.abs(found - 1).min() < 1e-6 and np.abs(found - 1).max() > 0.1
+    (axis,) = branch.plot().axes
+    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
+    assert dashes == {"-", "--"} and axis.get_ylabel() == "largest q" and axis.get_xlabel() == "omega"
+    assert {"stable", "unstable", "fold"} <= set(axis.get_legend_handles_labels()[1])
+    assert branch.plot("period").axes[0].get_ylabel() == "period" and "fold" in repr(branch)
+    short = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=5)
+    assert short.status == "the limit of 5 points" and len(short) == 5
+    along = lambda name, to=1.0: lj.continue_orbits(orbit, along=name, to=to)
+    for act, error, words in (
+        (lambda: branch.plot("theta"), ValueError, "names no coordinate; there are q, and 'period'"),
+        (lambda: along("speed"), ValueError, "along='speed' is no number in params; there are 'b', 'c', 'f' and"),
+        (lambda: along("period"), ValueError, "along='period': the system depends on time"),
+        (lambda: along("omega", 0.5), ValueError, "leaves the parameter 'omega' no range: it starts at 0.5"),
+        (lambda: jax.jit(lambda x: lj.continue_orbits(x, along="omega", to=1.0).period)(orbit), TypeError, "JAX is"),
+        (lambda: branch[len(branch)], IndexError, "branch\\[0\\] to branch"),
+    ):
+        with pytest.raises(error, match=words):
+            act()
 
 
 def mathieu_lagrangian(t, q, v, p):
@@ -218,6 +248,31 @@ def test_a_cycle_that_shrinks_and_one_that_folds():
     np.testing.assert_allclose((circles - 1) ** 2, 1 + branch.parameter, atol=1e-9)
     np.testing.assert_array_equal(branch.stable[: fold.index], True)
     assert not branch.stable[fold.index + 1 :].any() and branch.status.startswith("a state of rest, near mu = ")
+
+
+@pytest.mark.exhaustive
+def test_combination_resonance():
+    """Two oscillators coupled by a drive near the sum of their frequencies: two pairs meet, by SciPy's multipliers."""
+
+    def lagrangian(t, q, v, p):
+        springs = 0.5 * (q[0] ** 2 + p["k"] * q[1] ** 2)
+        return 0.5 * v @ v - springs - p["e"] * jnp.cos(p["omega"] * t) * q[0] * q[1]
+
+    params = {"k": 2.0, "e": 0.25, "omega": 2.1}
+    orbit = lj.periodic_orbit(lj.System(lagrangian), (np.zeros(2), np.zeros(2)), 2 * np.pi / 2.1, params)
+    branch = lj.continue_orbits(orbit, along="omega", to=2.7)
+    assert [c.kind for c in branch.critical] == ["torus", "torus"]
+
+    def growth(omega):
+        coupling = lambda t: params["e"] * np.cos(omega * t)
+        rate = lambda t, y: [y[2], y[3], -y[0] - coupling(t) * y[1], -params["k"] * y[1] - coupling(t) * y[0]]
+        return np.abs(np.linalg.eigvals(monodromy(rate, 2 * np.pi / omega, np.zeros(4), 1.0))).max() - 1
+
+    first, second = (float(c.parameter) for c in branch.critical)
+    assert first < 1 + np.sqrt(2.0) < second
+    for edge, out in ((first, -1), (second, 1)):
+        assert growth(edge + out * 1e-6) < 1e-5 < growth(edge - out * 1e-6) < 1e-2
+    assert "a pair at ±" in repr(branch)
 
 
 @pytest.mark.exhaustive

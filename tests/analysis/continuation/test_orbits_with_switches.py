@@ -26,10 +26,8 @@ def test_stick_slip():
     np.testing.assert_allclose(ended.parameter[-1], 0.575, atol=1e-3)
     assert "the start comes to a switch" in ended.status
     # The largest x is that of the slip, about x = μ/k with the amplitude of its start.
-    at, reach = (
-        BELT["mu"] / BELT["k"],
-        np.hypot((BELT["static"] - BELT["mu"]) / BELT["k"], BELT["V"] / BELT["k"] ** 0.5),
-    )
+    k, V, mu, static = BELT.values()
+    at, reach = mu / k, np.hypot((static - mu) / k, V / k**0.5)
     np.testing.assert_allclose([ended.high[0], ended.low[0]], [at + reach, at - reach], atol=1e-5)
 
 

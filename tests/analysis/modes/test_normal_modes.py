@@ -68,15 +68,6 @@ def test_verdicts_in_a_program():
     assert modes.stable.tolist() == [verdict == "stable" for verdict in VERDICTS]
 
 
-@pytest.mark.slow
-def test_the_bead_at_its_critical_speed():
-    """There θ⁴ decides."""
-    exactly = BEAD | {"a": 1.0, "g": 4.0, "omega": 2.0}
-    modes = lj.normal_modes(small.bead, 0.0, 0.0, 0.0, exactly)
-    assert modes.verdict == "stable" and bool(modes.zero[0]) and bool(modes.stable)
-    assert np.isfinite(modes.roots).all()
-
-
 # Many degrees of freedom.
 
 
@@ -95,16 +86,13 @@ def test_a_chain():
 
 
 @pytest.mark.exhaustive
-def test_a_free_chain_and_a_hard_one():
-    """The rigid motion of a free chain is a named zero mode, not an instability; a hundred masses to 1e-10."""
+def test_a_free_chain():
+    """The rigid motion of a free chain is a named zero mode, not an instability."""
     modes = lj.normal_modes(small.free_chain, 0.0, np.zeros(4), np.zeros(4), {"m": 2.0, "k": 3.0})
     assert modes.verdict == "stable" and list(modes.zero) == [True, False, False, False]
     np.testing.assert_allclose(modes.shapes[0], np.ones(4), atol=1e-12)
     np.testing.assert_allclose(modes.frequency, 2 * np.sqrt(1.5) * np.sin(np.arange(4) * np.pi / 8), rtol=1e-10)
     assert "zero: along" in repr(modes)
-    n = 100
-    modes = lj.normal_modes(small.chain, 0.0, np.zeros(n), np.zeros(n), {"m": 1.0, "k": 1.0})
-    np.testing.assert_allclose(modes.frequency, 2 * np.sin(np.arange(1, n + 1) * np.pi / (2 * (n + 1))), rtol=1e-10)
 
 
 # Gyroscopic forces.
@@ -120,10 +108,6 @@ def test_cross_rails():
     check_shapes(above)
     with pytest.raises(IndexError, match="there are 2 modes"):
         above[2]
-    with pytest.raises(ValueError, match="not an equilibrium: 'R' accelerates by"):
-        lj.linearise(cross_rails.rotating_system, 0.0, {"R": 1.0, "r": 0.0}, {"R": 0.0, "r": 0.0}, cross_rails.PARAMS)
-    with pytest.raises(TypeError, match="bool"):
-        lj.linearise(small.bead, 0.0, True, 0, BEAD)
 
 
 def check_shapes(modes):
@@ -157,34 +141,6 @@ def test_derivatives_of_the_rails():
     by_differences = (shape(2.5 + 1e-5) - shape(2.5 - 1e-5)) / 2e-5
     np.testing.assert_allclose(jax.jacfwd(shape)(2.5), by_differences, atol=1e-8)
     assert np.max(np.abs(by_differences)) > 0.01
-
-
-@pytest.mark.exhaustive
-def test_stability_of_a_hundred_thousand_rails():
-    """Stable exactly if (1 - ω²m/K)(1 - ω²m/k) > 0; twin: with only one factor thousands differ."""
-    random, count = np.random.default_rng(0), 100_000
-    drawn = {
-        "K": random.uniform(0.1, 60, count),
-        "k": random.uniform(0.1, 60, count),
-        "omega": random.uniform(0, 15, count),
-    }
-    stable = jax.jit(jax.vmap(lambda some: rails(cross_rails.PARAMS | some).stable))(drawn)
-    params = cross_rails.PARAMS | drawn
-    assert np.sum(stable != cross_rails.is_stable(params)) == 0
-    assert np.sum(stable != (params["m"] * params["omega"] ** 2 < params["K"])) > 10_000
-
-
-@pytest.mark.exhaustive
-def test_foucault_and_a_charge():
-    """ω ± Ω in a rotating frame; the cyclotron frequency of a charge, whose free drift is no instability."""
-    modes = lj.normal_modes(small.foucault, 0.0, STILL, STILL, {"turn": 0.25, "omega": 3.0})
-    np.testing.assert_allclose(modes.frequency, [2.75, 3.25], **EQUAL)
-    fast = lj.normal_modes(small.foucault, 0.0, STILL, STILL, {"turn": 4.0, "omega": 3.0})
-    np.testing.assert_allclose(fast.frequency, [1.0, 7.0], **EQUAL)
-    assert fast.verdict == "gyroscopically stabilised" and list(fast.energy) == [-1, 1]
-    modes = lj.normal_modes(small.charge, 0.0, STILL, STILL, {"B": 2.5})
-    np.testing.assert_allclose(modes.frequency, [0.0, 2.5], **EQUAL)
-    assert modes.verdict == "stable" and list(modes.zero) == [True, False]
 
 
 # Steady motions.

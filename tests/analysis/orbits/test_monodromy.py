@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.analysis.closed_forms import kepler, slope_of_swinging, swinging
+from tests.analysis.closed_forms import slope_of_swinging, swinging
 from tests.analysis.steady_systems import conical
 from tests.systems import PARAMS, pendulum
 
@@ -26,19 +26,6 @@ def test_pendulum():
     rest = lj.floquet(pendulum, 0.0, 0.0, 0.0, PARAMS, 1.0)
     np.testing.assert_allclose(rest.multipliers, np.exp([1j * np.sqrt(g_over_l), -1j * np.sqrt(g_over_l)]), rtol=1e-9)
     assert not rest.trivial.any()
-
-
-@pytest.mark.exhaustive
-def test_kepler():
-    """All four multipliers are 1, two of them for known reasons, the others to 1e-5; and M is not the identity."""
-    mu, speed = 1.25, 1.25
-    period = 2 * np.pi / np.sqrt(mu) * (2 - speed**2 / mu) ** -1.5
-    found = lj.floquet(kepler, 0.0, np.array([1.0, 0.0]), np.array([0.0, speed]), {"mu": mu}, period)
-    np.testing.assert_allclose(found.multipliers, 1.0, atol=1e-5)
-    assert found.trivial.sum() == 2 and bool(found.stable)
-    # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
-    np.testing.assert_allclose(np.linalg.svd(found.monodromy - np.eye(4))[1][1:], 0.0, atol=1e-8)
-    assert np.abs(found.monodromy - np.eye(4)).max() > 1
 
 
 @pytest.mark.exhaustive

@@ -1,7 +1,5 @@
 """First-order states in periodic orbits: multipliers by matrix exponentials and by SciPy's variational equations."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +7,7 @@ import pytest
 from scipy import integrate, linalg, optimize
 
 import lagjax as lj
+from tests.analysis.orbits.test_switching_flow import BELT, stick_slip
 
 # A driven oscillator that a filter of its own position pulls.
 FILTERED = {"k": 0.3, "tau": 0.7, "c": 0.2, "f": 0.5, "omega": 1.3}
@@ -182,72 +181,17 @@ def test_without_mass():
         lj.floquet(lj.System(vortices), 0.0, place, 0 * place, None, 1.001 * period)
 
 
-# A block on a belt, and an actuator that pulls it with what it has followed of its place.
-BELT = {"k": 1.5, "V": 0.25, "mu": 0.5, "static": 1.0, "g": 0.4, "tau": 0.8}
-
-
-def block(t, q, v, p):
-    """A unit mass on a spring."""
-    return 0.5 * v["x"] ** 2 - 0.5 * p["k"] * q["x"] ** 2
-
-
-def against_belt(t, q, v, p):
-    """The velocity on the belt."""
-    return v["x"] - p["V"]
-
-
-def of_actuator(t, q, v, p):
-    """The actuator's pull."""
-    return {"x": p["g"] * q["z"], "z": 0.0}
-
-
-rubbing = lj.Friction(against_belt, lambda p: p["mu"], normal=1.0, static=lambda p: p["static"])
-on_belt = lj.System(block, force=of_actuator, states={"z": lagging}, elements={"belt": rubbing})
-
-
-def slip_of(p):
-    """Where sticking ends, x of z there; the matrix and the constant of a slip, y = (x, v, z)."""
-    matrix = np.array([[0, 1, 0], [-p["k"], 0, p["g"]], [1 / p["tau"], 0, -1 / p["tau"]]])
-    return lambda z: (p["static"] + p["g"] * z) / p["k"], matrix, np.linalg.solve(matrix, [0, p["mu"], 0])
-
-
-def cycle(p, z, slip, wait):
-    """From the end of sticking at z through a slip and a wait: what is left of v = V and of the end of sticking; z."""
-    begins, matrix, constant = slip_of(p)
-    y = jax.scipy.linalg.expm(matrix * slip) @ (jnp.array([begins(z), p["V"], z]) + constant) - constant
-    # On the belt z follows x = x0 + V t: z = x - V τ + (z0 - x0 + V τ) exp(-t/τ).
-    x, late = y[0] + p["V"] * wait, p["V"] * p["tau"]
-    after = x - late + (y[2] - y[0] + late) * jnp.exp(-wait / p["tau"])
-    return jnp.stack([y[1] - p["V"], x - begins(after), after])
-
-
 @pytest.mark.exhaustive
-def test_stick_slip_with_an_actuator():
-    """Period and multipliers 1, 0 and that of the actuator, by the closed form of slip and wait.
-
-    Twin: without the pull the period is another.
-    """
-    p = BELT
-
-    def left(unknown):
-        z, slip, wait = unknown
-        return np.asarray(cycle(p, z, slip, wait)) - [0, 0, z]
-
-    rough = np.array([0.4, 3.0, 3.0])
-    z, slip, wait = optimize.root(left, rough, tol=1e-14).x
-    assert np.abs(left([z, slip, wait])).max() < 1e-12 and slip > 0 and wait > 0
-    jacobian = np.asarray(jax.jacfwd(lambda x: cycle(p, *x))(jnp.array([z, slip, wait])))
-    # The multiplier of the map from z to z, with the times that end the slip and the wait.
-    exact = jacobian[2, 0] - jacobian[2, 1:] @ np.linalg.solve(jacobian[:2, 1:], jacobian[:2, 0])
-    begins, _, _ = slip_of(p)
-    early = 0.3 * wait
-    x = float(begins(z)) - p["V"] * early
-    orbit = lj.periodic_orbit(on_belt, ({"x": x, "z": z}, {"x": p["V"]}), slip + wait, p)
-    np.testing.assert_allclose(orbit.period, slip + wait, rtol=1e-10)
+def test_stick_slip_beside_a_filter():
+    """A filter of the block's place has its own multiplier e^(-T/τ) beside the cycle's 1 and 0, of the same period."""
+    block = lambda t, q, v, p: 0.5 * v["x"] ** 2 - 0.5 * p["k"] * q["x"] ** 2
+    rubbing = lj.Friction(
+        lambda t, q, v, p: v["x"] - p["V"], lambda p: p["mu"], normal=1.0, static=lambda p: p["static"]
+    )
+    on_belt = lj.System(block, states={"z": lagging}, elements={"belt": rubbing})
+    period = stick_slip(BELT)
+    orbit = lj.periodic_orbit(on_belt, ({"x": 0.1, "z": 0.1}, {"x": 0.25}), 1.1 * period, BELT | {"tau": 5.0})
+    np.testing.assert_allclose(orbit.period, period, rtol=1e-10)
     found = lj.floquet(orbit)
-    by_size: Any = sorted([1.0, 0.0, exact], key=lambda m: (m != 1.0, -abs(m)))
-    np.testing.assert_allclose(found.multipliers, by_size, atol=1e-9)
-    assert found.trivial.tolist() == [True, False, False] and abs(exact) > 1e-3
-    a, omega = (p["static"] - p["mu"]) / p["k"], np.sqrt(p["k"])
-    alone = 2 * a / p["V"] + (2 * np.pi - 2 * np.arctan(a * omega / p["V"])) / omega
-    assert abs(slip + wait - alone) > 0.1
+    np.testing.assert_allclose(found.multipliers, [1.0, np.exp(-period / 5.0), 0.0], atol=1e-9)
+    assert found.trivial.tolist() == [True, False, False]

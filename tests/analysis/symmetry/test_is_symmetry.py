@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.scenes import cross_rails, sliding_wedge
-from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_STONE, ON_PLANE, RADIUS, falling, rolling
+from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, falling, rolling
 
 
 @pytest.mark.exhaustive
@@ -73,8 +73,11 @@ def test_energy_in_one_frame_and_not_in_the_other():
 def test_float32_and_a_force_that_reacts():
     """In float32 a rotation passes within round-off; Coulomb friction breaks the momentum at the predicted rate."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)
-    found = lj.is_symmetry(KEPLER, lj.Generator.rotation("z"), q, v, {"m": np.float32(1.25), "k": np.float32(2.0)})
+    params = {name: np.float32(x) for name, x in OF_KEPLER.items()}
+    found = lj.is_symmetry(KEPLER, lj.Generator.rotation("z"), q, v, params)
     assert found and found.residual.dtype == np.float32
+    all_of_them = lj.symmetries(KEPLER, q, v, params)
+    assert list(all_of_them) == ["L_x", "L_y", "L_z", "Jacobi integral"] and 1e3 < all_of_them.gap < 1e8
     friction = lambda t, q, v, multipliers, p: {"x": -p["mu"] * multipliers["table"], "y": 0.0}
     table = lj.Holonomic(lambda t, q, p: q["y"])
     box = lj.System(falling, {"table": table}, force=friction)
@@ -83,3 +86,12 @@ def test_float32_and_a_force_that_reacts():
     )
     assert not slid and slid.broken_by() == ["the forces"]
     np.testing.assert_allclose(slid.rate, -0.25 * OF_STONE["m"] * OF_STONE["g"], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_no_states_on_the_constraints():
+    """An error says that no state satisfies the constraints."""
+    nowhere = lj.System(falling, {"never": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + 1.0)})
+    state = {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}
+    with pytest.raises(ValueError, match="only 0 states were found"):
+        lj.is_symmetry(nowhere, lj.Generator.shift("y"), *state, OF_STONE)

@@ -1,5 +1,6 @@
 """`symmetries` finds exactly the known symmetries of each system, in words, with the right numbers."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,22 +51,6 @@ def test_the_seven_mass_distributions(name, others):
         q, v = (mass_distributions.vector(*random.uniform(-3.0, 3.0, 3)) for _ in range(2))
         found = lj.symmetries(mass_distributions.SYSTEMS[name], q, v, other)
         assert {key.split(" with ")[0] for key in found.steady} == {key.split(" with ")[0] for key in TABLE[name]}
-
-
-@pytest.mark.exhaustive
-def test_a_left_handed_helix_of_any_pitch():
-    """The sign and the size of the screw follow h; the book's printed h p_z + L_z is another generator."""
-    params = mass_distributions.PARAMS["helix"] | {"h": -1.7}
-    q, v, _ = mass_distributions.ORBITS["helix"]
-    found = lj.symmetries(mass_distributions.SYSTEMS["helix"], q, v, params, basis={})
-    assert found.steady == ("h p_z + 2π L_z with h = -1.7", "Jacobi integral")
-    screw = found.details[found.steady[0]].charge.generator
-    printed = params["h"] * lj.Generator.translation("z") + lj.Generator.rotation("z")
-    at = mass_distributions.vector(1.0, 0.5, 0.25)
-    moved, wrong = (g.at(jnp.asarray(0.0), {k: jnp.asarray(x) for k, x in at.items()}, params)[0]
-                    for g in (screw, printed))  # fmt: skip
-    np.testing.assert_allclose([moved[k] for k in "xyz"], [-2 * np.pi * 0.5, 2 * np.pi, -1.7], rtol=1e-12)
-    assert abs(wrong["x"] - moved["x"]) > 1.0
 
 
 @pytest.mark.slow
@@ -150,8 +135,6 @@ def test_small_angles_are_no_small_system():
 
 def test_bad_input():
     """Errors for tracing, a wrong generator, no states, and an unknown name."""
-    import jax
-
     with pytest.raises(TypeError, match="symmetries are found from values"):
         jax.jit(lambda k: len(lj.symmetries(KEPLER, *IN_SPACE, OF_KEPLER | {"k": k})))(2.0)
     with pytest.raises(TypeError, match="a generator is a lj.Generator or a function"):
@@ -165,7 +148,7 @@ def test_bad_input():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("values", [(2.0, 1.0, 3.0), (3.0, 3.0, 3.0), (2.0, 1.0, 1.0), (2, 1, 3)])
+@pytest.mark.parametrize("values", [(2.0, 1.0, 3.0), (3, 3, 3)])
 def test_a_coefficient_is_no_parameter_because_it_has_its_value(values):
     """For any mass 2 p_x - e B y is conserved in a magnetic field, whatever m, e and B are here."""
 
