@@ -104,20 +104,14 @@ central = lj.System(central_lagrangian)
 TURNS = {"turn": lj.turning_points("r"), "nearest": lj.turning_points("r", direction=1)}
 
 
-def radial(r, speed, mu, k, span):
-    """The radial turning points of a mass thrown at right angles from a distance r."""
-    start = {"r": r, "phi": 0.0 * r}, {"r": 0.0 * r, "phi": speed / r}
-    return lj.integrate(central, *start, {"mu": mu, "k": k}, ts=[0.0, span], events=TURNS, **TIGHT).events
-
-
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (0.0, 0.75, 1.25), (1.25, 0.75, 0.5), (0.5, 0.25, 1.5)])
+@pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (1.25, 0.75, 0.5)])
 def test_radial_turning_points(mu, k, speed):
     """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
-    energy, h = 0.5 * speed**2 - mu + 0.5 * k, speed
-    roots = np.roots([0.5 * k, 0.0, -energy, -mu, 0.5 * h**2])
+    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": speed}, {"mu": mu, "k": k}
+    found = lj.integrate(central, *start, ts=[0.0, 30.0], events=TURNS, **TIGHT).events
+    roots = np.roots([0.5 * k, 0.0, -(0.5 * speed**2 - mu + 0.5 * k), -mu, 0.5 * speed**2])
     near, far = np.sort(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
-    found = radial(1.0, speed, mu, k, 30.0)
     turns, nearest = found["turn"].found(), found["nearest"].found()
     other = far if abs(near - 1) < 1e-9 else near
     assert len(turns.t) > 2 and abs(far - near) > 0.1
@@ -140,15 +134,6 @@ def henon_heiles_lagrangian(t, q, v, p):
 henon_heiles = lj.System(henon_heiles_lagrangian)
 ENERGY = 1 / 12
 KEPT = 12
-plane = lj.Crossing(lambda t, q, v, p: q["x"], direction=1, terminal=False, most=KEPT)
-back = {"back": lj.Crossing(lambda t, q, v, p: q["x"], direction=-1, terminal=False)}
-
-
-def orbit(y, span=70.0, **settings):
-    """A motion of the energy 1/12 from (0, y), thrown along x."""
-    vx = jnp.sqrt(2 * (ENERGY - y**2 / 2 + y**3 / 3))
-    start = {"x": 0.0 * y, "y": y}, {"x": vx, "y": 0.0 * y}
-    return lj.poincare(henon_heiles, *start, section=plane, ts=np.array([0.0, span]), events=back, **settings)
 
 
 @pytest.mark.exhaustive
@@ -157,8 +142,12 @@ def test_section_of_henon_and_heiles():
 
     Crossings that are not kept are warned of.
     """
+    across = lambda way, **room: lj.Crossing(lambda t, q, v, p: q["x"], direction=way, terminal=False, **room)
+    y = 0.125
+    start = {"x": 0.0, "y": y}, {"x": np.sqrt(2 * (ENERGY - y**2 / 2 + y**3 / 3)), "y": 0.0}
+    ways = {"section": across(1, most=KEPT), "events": {"back": across(-1)}}
     with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
-        section = orbit(0.125, span=120.0)
+        section = lj.poincare(henon_heiles, *start, ts=np.array([0.0, 120.0]), **ways)
     found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
     assert len(found.t) == KEPT and int(section.count) == 19
     for crossed, sign in ((found, 1), (other, -1)):
@@ -169,7 +158,6 @@ def test_section_of_henon_and_heiles():
     assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
     # The kinetic energy of y varies, so that a wrong energy would be seen.
     assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
-    np.testing.assert_allclose(section.t[:11], orbit(0.125).t[:11], rtol=1e-9)
 
 
 def in_a_plane(seed=0, count=4):
@@ -202,22 +190,17 @@ def test_pictures():
 
 
 def test_what_is_printed():
-    """The print of one motion has counts, periods and doubts; it also works while traced."""
+    """One motion: counts, periods and doubts, also while traced; a batch: the range of counts, a colour a lane."""
     section, traced = in_a_plane()[0], []
     words = repr(section)
     assert "crossings   4, at t = 1, " in words and "period      1 on average, 1 to 1, standard deviation 0" in words
     assert "uncertain   no" in words and "error" not in words
     jax.eval_shape(lambda section: traced.append(repr(section)), section)
     assert traced == ["Poincaré section, being traced, room for 5 crossings"]
-
-
-def test_lanes_in_words_and_pictures():
-    """A batch prints the range of its counts, and draws each lane in its colour."""
     lanes = jax.tree.map(lambda *x: np.stack(x), *(in_a_plane(i, count)[0] for i, count in enumerate((4, 3, 2))))
     words = repr(lanes)
     assert "lanes       3" in words and "2 to 4 a lane" in words and "period      1 on average, 1 to 1" in words
-    (axis,) = lanes.plot().axes
-    assert len({line.get_color() for line in axis.lines}) == 3
+    assert len({line.get_color() for line in lanes.plot().axes[0].lines}) == 3
 
 
 def test_angles_within_half_turns():
@@ -267,22 +250,23 @@ def test_refused_in_words(given, error, words):
     assert "Fix:" in str(raised.value)
 
 
-def test_refused_elsewhere():
-    """Turning points are of a velocity by name, which several need; periods of other things, unrecorded events."""
+def test_turning_points_by_name():
+    """They are of a velocity by name, which several need."""
     velocity = lambda name, v: lj.turning_points(name).guard(0.0, v, v, None)
     assert velocity("r", {"phi": 1.0, "r": 2.0}) == 2.0 and velocity("q[1]", np.array([1.0, 2.0])) == 2.0
-    with pytest.raises(ValueError, match=r"There are q\[0\], q\[1\]") as raised:
-        velocity(None, np.ones(2))
-    assert 'lj.turning_points("q[0]")' in str(raised.value)
-    with pytest.raises(ValueError, match="turning points of 'x': there is none; there are phi, r"):
-        velocity("x", {"phi": 1.0, "r": 2.0})
-    with pytest.raises(TypeError, match="by its name, not as int"):
-        lj.turning_points(0)
     assert [getattr(lj.turning_points("r", direction=1), name) for name in ("direction", "terminal")] == [1, False]
-    section, _ = in_a_plane()
-    with pytest.raises(TypeError, match="not from a Trajectory"):
-        lj.periods(section.trajectory)
-    with pytest.raises(ValueError, match="only one crossing was kept"):
-        lj.periods(crossings(np.ones(1)))
-    with pytest.raises(ValueError, match="no event 'top'; recorded: 'section'"):
-        lj.PoincareSection(section.trajectory, "top")
+    traj = in_a_plane()[0].trajectory
+    for act, error, words in (
+        (
+            lambda: velocity(None, np.ones(2)),
+            ValueError,
+            r'There are q\[0\], q\[1\](?s:.*)lj.turning_points\("q\[0\]"\)',
+        ),
+        (lambda: velocity("x", {"phi": 1.0, "r": 2.0}), ValueError, "points of 'x': there is none; there are phi, r"),
+        (lambda: lj.turning_points(0), TypeError, "by its name, not as int"),
+        (lambda: lj.periods(traj), TypeError, "not from a Trajectory"),
+        (lambda: lj.periods(crossings(np.ones(1))), ValueError, "only one crossing was kept"),
+        (lambda: lj.PoincareSection(traj, "top"), ValueError, "no event 'top'; recorded: 'section'"),
+    ):
+        with pytest.raises(error, match=words):
+            act()

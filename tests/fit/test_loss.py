@@ -111,22 +111,6 @@ def test_a_fit_ends_at_its_minimum(options):
     assert size(jax.grad(loss)(end)) < 1e-4 * size(jax.grad(loss)(nearby))
 
 
-@pytest.mark.exhaustive
-def test_slopes_on_a_constraint():
-    """For a mass on a rod of unknown length: compiled, in forward and reverse mode, and by finite differences."""
-    rod = {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2)}
-    mass = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"], rod)
-    t = np.linspace(0.0, 1.0, 11)
-    seen = lj.Record(t, q={"x": np.cos(2 * t)}, q0={"x": 1.0, "y": 0.0}, v0={"x": 0.0, "y": 0.0}, sigma=0.1)
-    residuals = lj.fit_residuals(mass, seen, {"g": 9.81, "l": 1.0}, bounds={"l": (0.5, 2.0)}, **EXACTLY)
-    at = jax.tree.map(lambda x: x + 0.03, residuals.guess)
-    assert at["starts"].shape == (1, 2) and 1.0 < residuals.params(at)["l"] < 2.0
-    forward, reverse = jax.jit(jax.jacfwd(residuals))(at), jax.jit(jax.jacrev(residuals))(at)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), forward, reverse)
-    moved = lambda d: residuals(at | {"params": at["params"] | {"l": at["params"]["l"] + d}})
-    np.testing.assert_allclose(forward["params"]["l"], (moved(1e-5) - moved(-1e-5)) / 2e-5, atol=1e-4)
-
-
 class Layer(eqx.Module):
     """A network of one layer."""
 
@@ -177,18 +161,6 @@ def test_what_does_not_go_together():
 
 
 @pytest.mark.exhaustive
-def test_starts_of_their_own():
-    """With nothing else free each window's start is that of SciPy's least squares with cos and sin."""
-    records = [record(i, known=False, amplitude=a) for i, a in enumerate((1.0, 0.5))]
-    found, w = quietly(spring, records, {"k": 3.0}, free=[]), np.sqrt(3.0)
-    for i, r in enumerate(records):
-        q = r.measured["q"]
-        off = lambda s, q=q: (s[0] * np.cos(w * T) + s[1] / w * np.sin(w * T) - q) / 0.01
-        exact = least_squares(off, [1.0, 0.0], xtol=1e-15)
-        np.testing.assert_allclose([found.q0[i], found.v0[i]], exact.x, atol=1e-6)
-
-
-@pytest.mark.exhaustive
 def test_what_fails_moves_nothing():
     """A motion with NaN has a constant loss without a slope, and the others are still fitted; a fit then tells."""
     import optax
@@ -205,60 +177,7 @@ def test_what_fails_moves_nothing():
         quietly(system, record(1, known=False, params={"sane": -1.0}), loss.params(end), free=[])
 
 
-def well(q):
-    """A double well."""
-    return 0.25 * (q**2 - 1) ** 2
-
-
 learned = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["potential"](q))
-
-
-def records_of_well():
-    """Eight motions with errors of 0.002."""
-    true, rng = lj.System(lambda t, q, v, params: 0.5 * v**2 - well(q)), np.random.default_rng(0)
-    ts = np.linspace(0.0, 6.0, 121)
-    for q0, v0 in rng.uniform([-1.6, -0.4], [1.6, 0.4], (8, 2)):
-        q = np.asarray(lj.integrate(true, q0, v0, ts=ts).q)
-        yield lj.Record(ts, q=q + 0.002 * rng.normal(size=len(ts)), sigma=0.002)
-
-
-@pytest.mark.exhaustive
-def test_a_potential_is_learned():
-    """By the recipe, with batches: held-back residuals fall, the force is found, and a seed is reproducible."""
-    import optax
-
-    *records, one, other = records_of_well()
-    start = {"potential": lj.learned.Network(1.0, key=jax.random.key(0))}
-    cut = {"window": 1.0, "joined": False, "rtol": 1e-6, "atol": 1e-6}
-    first = quietly(learned, records, start, free=[], **cut)
-    loss = lj.fit_loss(learned, records, start, **cut)
-    unknowns = loss.guess | {"starts": first.sampling["starts"]}
-    rates = {part: optax.adam(optax.cosine_decay_schedule(x, 1000)) for part, x in (("params", 2e-2), ("starts", 5e-3))}
-    optimiser = optax.multi_transform(rates, {part: part for part in rates})
-    end = trained(loss, unknowns, optimiser, 1000, 16)
-    score = lambda params: float(quietly(learned, [one, other], params, free=[], **cut).rms()["q"])
-    assert score(loss.params(end)) < 0.004 < 0.01 < score(start)
-    q = jnp.concatenate([jnp.asarray(r.measured["q"]) for r in (one, other)])
-    true, found = (jax.vmap(jax.grad(V))(q) for V in (well, loss.params(end)["potential"]))
-    # 0.08; without training, by a network that is zero, 1.
-    assert float(jnp.linalg.norm(found - true)) < 0.15 * float(jnp.linalg.norm(true))
-    short = [trained(loss, unknowns, optimiser, 20, 16, seed) for seed in (0, 0, 1)]
-    assert eqx.tree_equal(*short[:2]) and not eqx.tree_equal(*short[1:])
-
-
-@pytest.mark.exhaustive
-def test_inside_of_a_program():
-    """Under jit and in lanes, a training gives the same as a single call."""
-    import optax
-
-    def stiffness(q):
-        seen = lj.Record(T, q=q, q0=1.0, v0=0.0, sigma=0.01)
-        loss = lj.fit_loss(spring, seen, {"k": 3.5}, **EXACTLY)
-        return trained(loss, loss.guess, optax.adam(0.05), 60)["params"]["k"]
-
-    measured = np.stack([record(i).measured["q"] for i in range(2)])
-    alone = [stiffness(q) for q in measured]
-    np.testing.assert_allclose(jax.jit(jax.vmap(stiffness))(measured), alone, rtol=1e-8)
 
 
 @pytest.mark.exhaustive

@@ -6,12 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import lagjax as lj
 from lagjax.fit.problem import checks
 from lagjax.fit.problem.checks import check_predicted
 from lagjax.numerics import Unknowns
-from tests.fit.cases import PENDULUM, pendulum
-from tests.fit.problem.test_arguments import RECORD
+from tests.fit.cases import pendulum
 from tests.fit.problem.test_initial_states import on_a_rod
 
 
@@ -44,10 +42,3 @@ def test_a_motion_that_fails(monkeypatch):
     words = "the motion of record 7 fails: b after 1 with x at ts, True, {'rtol': 0.001}"
     with pytest.raises(ValueError, match=f"from the guess {words}"):
         checks.check_motion(problem, np.array([True, False]), Unknowns("x", "ab"))
-
-
-@pytest.mark.exhaustive
-def test_a_guess_that_cannot_move():
-    """A guess from which the motion fails at once gives an error with the message of `integrate`."""
-    with pytest.raises(ValueError, match="(?s)from the guess the motion of record 0 fails.*mass matrix"):
-        lj.fit(pendulum, RECORD, PENDULUM | {"l": 0.0}, free="g")

@@ -172,11 +172,3 @@ def test_quantiles_and_inverses():
     np.testing.assert_allclose(limits, chdtri(n, 2.87e-7) / n, rtol=0.2)
     for found in inverted:
         np.testing.assert_allclose(found, r, rtol=1e-6)
-
-
-@pytest.mark.exhaustive
-def test_a_start_read_off_traced_measurements(clean):
-    """Inside a program the start is read off as outside."""
-    fit = lambda data: lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), TRUE).values
-    data = measured(clean, 0)
-    np.testing.assert_allclose(jax.jit(fit)(data), fit(data), rtol=1e-6)
