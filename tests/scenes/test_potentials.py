@@ -9,7 +9,6 @@ import pytest
 from scipy import special
 
 from lagjax.scenes import mass_distributions as scene
-from lagjax.scenes import potentials
 from lagjax.scenes.potentials import agm, jacobi_elliptic
 from tests.by_numpy import by_numpy
 from tests.scenes.test_mass_distributions import cylindrical, in_field
@@ -111,17 +110,6 @@ def test_field_through_the_lid():
         assert abs(on - below) < 2e-8 and abs(on - above) < 2e-8
 
 
-def test_screw_symmetry_of_the_potential():
-    """Φ is unchanged by z + hε/2π with φ + ε, at every ε; not by z + hε with φ + ε, which h p_z + L_z generates."""
-    h, (x, y, z) = scene.PARAMS["helix"]["h"], (1.5, 0.375, 0.25)
-    start = in_field("helix", x, y, z)[0]
-    for angle in (0.1, 1.0, 2.5):
-        c, s = np.cos(angle), np.sin(angle)
-        moved = c * x - s * y, s * x + c * y
-        assert abs(in_field("helix", *moved, z + h * angle / (2 * np.pi))[0] - start) < 1e-13
-        assert abs(in_field("helix", *moved, z + h * angle)[0] - start) > 1e-2
-
-
 def test_jacobi_functions_against_scipy():
     """sn, cn, dn and K agree with scipy's, also for m near 1 given by its complement, and for m < 0."""
     m1 = np.array([0.5, 1e-3, 1.0, 1e-12, 1e-30])
@@ -134,9 +122,3 @@ def test_jacobi_functions_against_scipy():
     # dn(u | -n) = 1 / dn(√(1 + n) u | n / (1 + n))
     negative = by_numpy(jacobi_elliptic)(u[:, 0], -3.0, 4.0)[2]
     np.testing.assert_allclose(negative, 1 / special.ellipj(2 * u[:, 0], 0.75)[2], rtol=1e-13)
-
-
-def test_the_gradient_as_compiled():
-    """`gradient` is that of the potential."""
-    q, params = scene.vector(0.5, 0.25, 1.0), scene.PARAMS["plane"]
-    np.testing.assert_allclose(potentials.gradient(potentials.plane, q, params)["z"], 2 * np.pi * 0.75, rtol=1e-15)

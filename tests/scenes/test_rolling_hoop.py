@@ -1,6 +1,5 @@
 """The rolling hoop against its closed forms and the reference values of source §2."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -128,18 +127,6 @@ def test_a_start_without_contact_is_refused(theta, theta_rate):
         hoop.roll(PARAMS, theta, theta_rate, np.array([0.0, 1.0]))
 
 
-@pytest.mark.exhaustive
-def test_a_thousand_swings_stay_on_the_constraints():
-    """1,000 natural periods: residuals stay below 1e-12; errors of phase and energy only accumulate."""
-    theta0 = hoop.BOTTOM + 1.0
-    ts = np.linspace(0.0, 1000 * hoop.period(hoop.PARAMS, theta0), 201)
-    got = integrate(hoop.system, *hoop.start(hoop.PARAMS, theta0), hoop.PARAMS, ts=ts, rtol=1e-10, atol=1e-10)
-    assert float(got.residual()) <= 1e-12 and float(got.drift()) <= 1e-6
-    exact, _ = hoop.exact_motion(hoop.PARAMS, theta0, ts)
-    assert np.max(np.abs(got.q["theta"] - exact["theta"])) <= 1e-5
-    np.testing.assert_allclose(got.q["phi"], exact["phi"], rtol=0, atol=1e-4)
-
-
 def exact_final(params):
     """θ and λ at t = 0.5 near PARAMS: from rest, θ depends on the parameters through w alone."""
     theta, theta_rate = (reference(HOOP_REST + name) for name in ("theta(t=0.5)", "thetadot(t=0.5)"))
@@ -179,13 +166,12 @@ def departure_time_by_mpmath(beta):
 
 @pytest.mark.exhaustive
 def test_gradients_of_the_departure_time():
-    """∂t_d/∂(m, R, a, g, β) of the event to 1e-6: forward and in reverse against the exact one, and by differences."""
+    """∂t_d/∂(m, R, a, g, β) of the event to 1e-6: forward and in reverse against the exact one."""
     ts = np.array([0.0, 2.0])
 
-    def when(params, **options):
-        q, v = hoop.start(params, 1.25)
-        options = {"rtol": 1e-10, "atol": 1e-10, "events": hoop.DEPARTURE} | options
-        return integrate(hoop.system, q, v, params, ts=ts, **options).end.t
+    def when(params):
+        start = hoop.start(params, 1.25)
+        return integrate(hoop.system, *start, params, ts=ts, rtol=1e-10, atol=1e-10, events=hoop.DEPARTURE).end.t
 
     t, length = reference("s2.hoop.tdep.start_theta0=1.25"), PARAMS["R"] + PARAMS["a"]
     by_beta = float(mpmath.diff(departure_time_by_mpmath, 1))
@@ -195,14 +181,6 @@ def test_gradients_of_the_departure_time():
         got = jax.jit(mode(when))(params)
         for name, value in exact.items():
             assert float(got[name]) == pytest.approx(value, rel=1e-6, abs=1e-9), (mode.__name__, name)
-    # With steps that do not depend on the parameters the time of the event is smooth in them.
-    fixed = jax.jit(lambda params: when(params, stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01))
-    for name, value in exact.items():
-        h = 1e-3 * PARAMS[name]
-        two = lambda h: (
-            float(fixed(params | {name: PARAMS[name] + h}) - fixed(params | {name: PARAMS[name] - h})) / h / 2
-        )
-        assert (4 * two(h / 2) - two(h)) / 3 == pytest.approx(value, rel=1e-6, abs=1e-9), name
 
 
 def test_the_scene_is_complete():
