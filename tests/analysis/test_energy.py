@@ -17,7 +17,6 @@ from lagjax.scenes import SCENES
 from lagjax.system.model import model_of
 from tests.by_hand import ASKED, by_hand
 from tests.by_numpy import by_numpy, equations
-from tests.system.test_hybrid import SPHERE, rolls, slides, throw
 
 RTOL = 1e-9
 # Not by calling `runs`: their exact solutions would be computed whatever tests are run.
@@ -178,17 +177,6 @@ def test_impacts():
         assert not lj.energy_ledger(traj, lj.Hybrid({"flying": flipped(ball)}, [floor], most_switches=4)).closes
     # The velocity tells whether the output is before or after the impact.
     assert (ledger.impact_total[1] == 0) == (at_impact.v[1] < 0) and "2 switches" in repr(ledger)
-
-
-@pytest.mark.exhaustive
-def test_friction_on_a_multiplier():
-    """A sphere that slides and then rolls loses two sevenths of its energy; twin: friction of the opposite sign."""
-    traj = throw(0.25, estimate_error=False)
-    ledger = lj.energy_ledger(traj)
-    assert len(traj.switches) == 1 and ledger.relative_closure < 100 * RTOL
-    np.testing.assert_allclose(ledger.works["force"].total[-1], -2 / 7 * 0.5 * SPHERE["m"] * 3.0**2, rtol=1e-9)
-    wrong = lj.Hybrid({"slides": flipped(slides), "rolls": rolls}, traj.system.switches)
-    assert lj.energy_ledger(traj, wrong).relative_closure > 1e4 * max(ledger.relative_closure, RTOL)
 
 
 @pytest.mark.exhaustive

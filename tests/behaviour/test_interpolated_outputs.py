@@ -93,7 +93,7 @@ def loss(p, q0, ts, **how):
 
 @pytest.mark.exhaustive
 def test_derivatives():
-    """The gradient by parameters, start and times, which replays the steps, is right."""
+    """The gradient by parameters, start and times, which replays the steps, is right, and the forward one; in lanes."""
     point = SHARES, jnp.asarray(1.2), jnp.asarray(MANY)
     gradient = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-5, **between), (0, 1, 2)))
     loose = gradient(*point)
@@ -109,31 +109,21 @@ def test_derivatives():
     by_times[0] = -np.sum(by_times[1:])
     for a, b in zip(loose, (by_sum * np.ones(40), by_start, by_times)):
         assert np.max(np.abs(a - b)) < 2e-3 * np.max(np.abs(b))
-
-
-@pytest.mark.exhaustive
-def test_derivatives_in_forward_mode_and_lanes():
-    """The replay gives the forward derivative of the same steps; and in lanes with different numbers of steps."""
-    point, along = (SHARES, jnp.asarray(1.2), jnp.asarray(MANY)), (jnp.arange(40.0) / 40, jnp.asarray(0.3))
-    gradient = jax.jit(jax.grad(lambda *x: loss(*x, rtol=1e-5, **between), (0, 1, 2)))
+    along = jnp.arange(40.0) / 40, jnp.asarray(0.3)
     pushed = jax.jvp(lambda *x: loss(*x, MANY, rtol=1e-5, **between), point[:2], along)[1]
-    assert sum(jnp.sum(a * b) for a, b in zip(gradient(*point), along)) == pytest.approx(float(pushed), rel=1e-10)
+    assert sum(jnp.sum(a * b) for a, b in zip(loose, along)) == pytest.approx(float(pushed), rel=1e-10)
+    # Lanes of different numbers of steps.
     starts = jnp.array([0.2, 1.2, 3.0])
-    each = [gradient(SHARES, q0, point[2])[0] for q0 in starts]
+    each = sum(gradient(SHARES, q0, point[2])[0] for q0 in starts)
     together = jax.grad(lambda p: jnp.sum(jax.vmap(lambda q0: loss(p, q0, MANY, rtol=1e-5, **between))(starts)))(SHARES)
-    assert jnp.max(jnp.abs(together - sum(each))) < 1e-9 * jnp.max(jnp.abs(together))
-
-
-def on_the_rod(p):
-    """The same motion on a rod."""
-    start = np.array([np.sin(1.2), -np.cos(1.2)])
-    return lj.integrate(rod, start, np.zeros(2), p, ts=MANY, rtol=1e-4, throw=False, **between)
+    assert jnp.max(jnp.abs(together - each)) < 1e-9 * jnp.max(jnp.abs(together))
 
 
 @pytest.mark.exhaustive
 def test_on_the_constraints():
     """Outputs satisfy them to round-off, with the multiplier there."""
-    traj = on_the_rod(SHARES)
+    start = np.array([np.sin(1.2), -np.cos(1.2)]), np.zeros(2)
+    traj = lj.integrate(rod, *start, SHARES, ts=MANY, rtol=1e-4, throw=False, **between)
     assert np.max(np.abs(np.sum(traj.q**2, 1) - 1)) < 1e-13 and np.max(np.abs(np.sum(traj.q * traj.v, 1))) < 1e-13
     angle, rate = exact(MANY)
     assert np.max(np.abs(traj.q[:, 0] - np.sin(angle))) < 2e-3
@@ -145,15 +135,10 @@ DOWN = {"down": lj.Crossing(lambda t, q, v, m, p: q, terminal=True)}
 QUARTER = special.ellipk(HALF**2)
 
 
-def until_down(p):
-    """The same motion up to the lowest point."""
-    return lj.integrate(shared, 1.2, 0.0, p, ts=MANY, rtol=1e-6, events=DOWN, throw=False, **between)
-
-
 @pytest.mark.slow
 def test_beside_events_and_in_float32():
     """An event is found where it is, and ends the outputs; float32 stays float32."""
-    traj = until_down(SHARES)
+    traj = lj.integrate(shared, 1.2, 0.0, SHARES, ts=MANY, rtol=1e-6, events=DOWN, throw=False, **between)
     assert traj.events["down"].t[0] == pytest.approx(QUARTER, abs=1e-5)
     assert np.array_equal(np.isnan(traj.q), MANY > QUARTER)
     assert np.nanmax(np.abs(traj.q - exact(MANY)[0])) < 2e-5

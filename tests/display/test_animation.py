@@ -76,13 +76,6 @@ def test_outlines_have_no_marks():
         assert (len(group) == 3) is marked
 
 
-def test_the_same_film_is_the_same_text(page):
-    """The same film has the same name, so a notebook run again does not change; another film has another name."""
-    assert Animation(T, POINTS, 25.0, 10)._repr_html_() == page
-    other = Animation(T, {"tip": POINTS["tip"]}, 25.0, 10)._repr_html_()
-    assert other[:50] != page[:50]
-
-
 def test_saves_a_page(tmp_path, page):
     """The saved page contains the same film."""
     Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.html")

@@ -216,21 +216,6 @@ def test_tongues_of_a_parametric_pendulum():
 
 
 @pytest.mark.exhaustive
-def test_van_der_pol_family():
-    """Periods are those in the literature; at μ = 0, where all circles are orbits, the multiplier passes 1."""
-    orbit = lj.periodic_orbit(known.van_der_pol, (2.0, 0.0), 6.5, {"mu": 1})
-    branch = lj.continue_orbits(orbit, along="mu", to=10.0)
-    np.testing.assert_allclose(branch.period[[0, -1]], [known.VAN_DER_POL[1.0], known.VAN_DER_POL[10.0]], atol=2e-8)
-    assert branch.stable.all() and not branch.critical
-    back = lj.continue_orbits(orbit, along="mu", to=-1.0)
-    (critical,) = back.critical
-    assert critical.kind == "branch point" and abs(float(critical.parameter)) < 1e-9
-    off = np.abs(back.parameter) > 1e-6
-    np.testing.assert_array_equal(back.stable[off], back.parameter[off] > 0)
-    np.testing.assert_allclose(back.period[-1], back.period[0], rtol=1e-11)
-
-
-@pytest.mark.exhaustive
 def test_a_cycle_that_shrinks_and_one_that_folds():
     """x'' + x = (μ + a² - a⁴) x' on average: it folds at μ = -1/4, and shrinks to rest at μ = 0 (Hopf), or 2 √μ."""
     small = lj.System(known.spring_lagrangian, force=lambda t, q, v, p: (p["mu"] - q**2) * v)
@@ -273,24 +258,6 @@ def test_combination_resonance():
     for edge, out in ((first, -1), (second, 1)):
         assert growth(edge + out * 1e-6) < 1e-5 < growth(edge - out * 1e-6) < 1e-2
     assert "a pair at ±" in repr(branch)
-
-
-@pytest.mark.exhaustive
-def test_torus_of_a_driven_van_der_pol():
-    """With less drive entrainment is lost: a pair passes the unit circle, as SciPy's multipliers do."""
-    lagrangian = lambda t, q, v, p: known.spring_lagrangian(t, q, v, p) + p["f"] * q * jnp.cos(2 * t)
-    system = lj.System(lagrangian, force=known.van_der_pol.force)
-    orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0, "mu": 0.5})
-    branch = lj.continue_orbits(orbit, along="f", to=0.5)
-    (torus,) = branch.critical
-    assert torus.kind == "torus" and branch.stable[0] and not branch.stable[-1]
-    f = float(torus.parameter)
-    rate = lambda t, y: [y[1], -y[0] + 0.5 * (1 - y[0] ** 2) * y[1] + f * np.cos(2 * t)]
-    _, found = shot(rate, np.pi, np.array([branch.q[torus.index], branch.v[torus.index]]) + 1e-4)
-    np.testing.assert_allclose(np.abs(found), 1.0, atol=1e-8)
-    # Liouville's formula gives the size there: ∮ (1 - q²)/2 dt = 0; twin: not elsewhere.
-    of = lambda i: np.prod(np.abs(branch.multipliers[i]))
-    assert abs(of(torus.index) - 1) < 1e-11 < abs(of(torus.index + 2) - 1)
 
 
 # Plots and messages.

@@ -1,8 +1,5 @@
 """Singular or indefinite mass matrices and singular coordinates: solved if possible, otherwise refused by name."""
 
-import itertools
-
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -96,54 +93,7 @@ paced = lj.System(proper_time)
 PACED = ({"t": 0.0, "x": 0.0, "y": 0.0}, {"t": 1.25, "x": 0.5, "y": 0.25})
 
 
-# The azimuth is singular at the poles of a sphere; great circles are not.
-
 polar = lj.System(lambda t, q, v, params: 0.5 * (v["psi"] ** 2 + jnp.sin(q["psi"]) ** 2 * v["theta"] ** 2))
-NEAR_MISSES = (0.0, 1e-300, 1e-100, 1e-17, 1e-15, 1e-13, 1e-12, 1e-9, 1e-6, 1e-3)
-
-
-def great_circle(miss, s):
-    """The points at arc lengths s of the great circle that passes the pole at the distance `miss` at s = 0."""
-    nearest, across = np.array([np.sin(miss), 0.0, np.cos(miss)]), np.array([0.0, 1.0, 0.0])
-    return np.cos(s)[..., None] * nearest + np.sin(s)[..., None] * across
-
-
-def polar_state(miss, s):
-    """(q, v) of that great circle in colatitude and azimuth, to round-off however near the pole."""
-    c, sine = np.cos(s), np.sin(s)
-    distance = np.hypot(np.sin(miss) * c, sine)
-    q = {"psi": np.arctan2(distance, np.cos(miss) * c), "theta": np.arctan2(sine, np.sin(miss) * c)}
-    # sin²ψ dθ/ds = sin(miss), Clairaut.
-    return q, {"psi": np.cos(miss) * sine / distance, "theta": np.sin(miss) / distance**2}
-
-
-def distance_to_great_circle(traj, miss):
-    """The largest distance, at the outputs, between a path in ψ and θ and its great circle."""
-    psi, theta = np.asarray(traj.q["psi"]), np.asarray(traj.q["theta"])
-    path = np.stack([np.sin(psi) * np.cos(theta), np.sin(psi) * np.sin(theta), np.cos(psi)], axis=-1)
-    return np.max(np.abs(path - great_circle(miss, np.asarray(traj.t))))
-
-
-@pytest.mark.exhaustive
-def test_through_the_pole_or_not_at_all():
-    """A path into the pole continues on its great circle, to the tolerance, or ends at the pole; nothing else."""
-    outcomes, ts = [], np.array([-1.0, -0.25, 0.5, 1.25])
-    for miss, tol, first in itertools.product(NEAR_MISSES, (1e-6, 1e-9, 1e-12), (-1.0, -0.77, -1.31)):
-        settings = {"rtol": tol, "atol": tol, "throw": False}
-        traj = lj.integrate(polar, *polar_state(miss, first), ts=np.array([first, *ts[1:]]), **settings)
-        through = bool(traj.result == lj.RESULTS.successful)
-        outcomes.append(through)
-        if through:
-            assert distance_to_great_circle(traj, miss) < 20 * tol, (miss, tol, first)
-        else:
-            assert abs(float(traj.end.t)) < 1e-12 and abs(float(traj.end.q["psi"])) < 1e-12, (miss, tol, first)
-    # Twin: fixed steps that are too long for the passage leave the great circle.
-    fixed = {"dt0": 0.125, "stepsize_controller": diffrax.ConstantStepSize()}
-    assert distance_to_great_circle(lj.integrate(polar, *polar_state(0.05, -1.0), ts=ts, **fixed), 0.05) > 1e-3
-    # Both outcomes occur, and the error says where.
-    assert set(outcomes) == {True, False}
-    with pytest.raises(RuntimeError, match=r"stopped at t = -?\d\.\d+e-14,(?s:.*)psi = \d\.\d+e-14, theta ="):
-        lj.integrate(polar, *polar_state(1e-15, -1.0), ts=ts, rtol=1e-12, atol=1e-12)
 
 
 # What is refused: the system, a state where M is singular, the coordinate that is named, and a remedy.

@@ -9,10 +9,9 @@ import lagjax as lj
 from lagjax.analysis.equilibria.result import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import about_z, conical
-from tests.systems import PARAMS, double_pendulum, pendulum
+from tests.systems import PARAMS, pendulum
 
 BEAD = bead_on_hoop.PARAMS
-CHAIN = {"m1": 1.0, "m2": 2.0, "l1": 1.0, "l2": 0.5, "g": 9.8125}
 tilt_of = lambda params: jnp.arccos(params["g"] / (params["a"] * params["omega"] ** 2))
 
 
@@ -31,18 +30,6 @@ def test_pendulum():
     np.testing.assert_allclose(np.sort(found.eigenvalues[1].real), [-rate, rate], rtol=1e-12)
     upward = lj.equilibria(pendulum, PARAMS | {"g": -PARAMS["g"]}, starts=[0.3, 3.0, -3.0, 2 * np.pi + 0.2])
     assert upward.stable.tolist() == [False, True]
-
-
-@pytest.mark.exhaustive
-def test_double_pendulum():
-    """Four equilibria from a grid of starts, one stable; those a turn away are merged."""
-    starts = np.stack(np.meshgrid(*[np.linspace(-3.5, 3.5, 6)] * 2), axis=-1).reshape(-1, 2)
-    found = lj.equilibria(double_pendulum, CHAIN, starts=starts)
-    assert len(found) == 4 and np.all(found.status == 0)
-    np.testing.assert_allclose(np.sin(found.q), 0.0, atol=1e-13)
-    up = np.cos(np.asarray(found.q)) < 0
-    assert sorted(map(tuple, up)) == [(False, False), (False, True), (True, False), (True, True)]
-    np.testing.assert_array_equal(found.stable, ~up.any(axis=1))
 
 
 @pytest.mark.exhaustive

@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, linalg, special
+from scipy import linalg, special
 
 import lagjax as lj
-from tests.analysis.closed_forms import VAN_DER_POL, van_der_pol
 from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum
 
 
@@ -91,26 +90,6 @@ def test_kapitza_on_a_rod():
     assert list(jax.jit(jax.vmap(at))(edge * np.array([1 - 1e-6, 1 + 1e-6])).stable) == [False, True]
     # The boundary is near the limit of fast drives from the averaged equations.
     assert abs((SHAKEN["A"] * edge) ** 2 / (2 * SHAKEN["g"] * SHAKEN["l"]) - 1) < 0.01
-
-
-@pytest.mark.exhaustive
-def test_van_der_pol():
-    """The cycle attracts; the multiplier is e^∮μ(1-q²)dt by SciPy; twin: under the other sign of μ it repels."""
-    orbit = lj.periodic_orbit(van_der_pol, (2.0, 0.0), 6.5, {"mu": 1.0})
-    found = lj.floquet(van_der_pol, 0.0, orbit.q, orbit.v, {"mu": 1.0}, orbit.period)
-    np.testing.assert_allclose(orbit.period, VAN_DER_POL[1.0], rtol=1e-12)
-
-    def rate(t, y):
-        return [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]
-
-    end = integrate.solve_ivp(rate, [0, VAN_DER_POL[1.0]], [orbit.q, orbit.v, 0.0], rtol=1e-12, atol=1e-13).y[2, -1]
-    assert found.trivial.tolist() == [True, False] and bool(found.attracts)
-    np.testing.assert_allclose(found.multipliers[1], np.exp(end), rtol=1e-8)
-    np.testing.assert_allclose(found.product, found.liouville, rtol=1e-7)
-    # Backward in time the cycle is the same, but repels.
-    away = lj.floquet(van_der_pol, 0.0, orbit.q, -orbit.v, {"mu": -1.0}, orbit.period)
-    np.testing.assert_allclose(away.multipliers[1], np.exp(-end), rtol=1e-8)
-    assert not bool(away.stable) and "above 1" in away.verdict
 
 
 @pytest.mark.exhaustive

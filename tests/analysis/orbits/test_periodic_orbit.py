@@ -8,7 +8,7 @@ from scipy import integrate
 
 import lagjax as lj
 from tests.analysis import closed_forms as known
-from tests.systems import PARAMS, double_pendulum, pendulum, rod_pendulum
+from tests.systems import PARAMS, pendulum, rod_pendulum
 
 G_OVER_L = PARAMS["g"] / PARAMS["l"]
 
@@ -166,19 +166,6 @@ def test_knife_edge_on_a_slope():
     assert orbit.turns["turn"] == 1
     found = lj.floquet(orbit)
     assert found.multipliers.shape == (5,) and "shift of x" in repr(found) and bool(found.stable)
-
-
-@pytest.mark.exhaustive
-def test_nonlinear_mode_of_the_double_pendulum():
-    """The slow mode of equal rods: small swings have the linear period, 2π/√((2 - √2) g/l), large ones a longer one."""
-    params = {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.8125}
-    linear = 2 * np.pi / np.sqrt((2 - np.sqrt(2)) * params["g"])
-    small = lj.periodic_orbit(double_pendulum, (1e-3 * np.array([1.0, 2**0.5]), np.zeros(2)), linear, params)
-    np.testing.assert_allclose(small.period, linear, rtol=1e-6)
-    large = lj.periodic_orbit(double_pendulum, (np.array([0.5, 0.5 * 2**0.5]), np.zeros(2)), linear, params)
-    assert closes(large) < 1e-7 and float(large.period) > 1.02 * linear
-    found = lj.floquet(large)
-    assert found.trivial.sum() == 2 and bool(found.stable) and abs(abs(found.multipliers[2]) - 1) < 1e-8
 
 
 # Derivatives, lanes.

@@ -222,8 +222,6 @@ def test_rimless_wheel():
         lj.periodic_orbit(wheel, (1.0, 2.0), exact, WHEEL)
 
 
-
-
 def driven(t, q, v, p):
     """A unit mass on a spring with a driving force."""
     return 0.5 * v**2 - 0.5 * q**2 + p["f"] * q * jnp.cos(p["omega"] * t)
