@@ -132,32 +132,6 @@ def henon_heiles_lagrangian(t, q, v, p):
 
 
 henon_heiles = lj.System(henon_heiles_lagrangian)
-ENERGY = 1 / 12
-KEPT = 12
-
-
-@pytest.mark.exhaustive
-def test_section_of_henon_and_heiles():
-    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points.
-
-    Crossings that are not kept are warned of.
-    """
-    across = lambda way, **room: lj.Crossing(lambda t, q, v, p: q["x"], direction=way, terminal=False, **room)
-    y = 0.125
-    start = {"x": 0.0, "y": y}, {"x": np.sqrt(2 * (ENERGY - y**2 / 2 + y**3 / 3)), "y": 0.0}
-    ways = {"section": across(1, most=KEPT), "events": {"back": across(-1)}}
-    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
-        section = lj.poincare(henon_heiles, *start, ts=np.array([0.0, 120.0]), **ways)
-    found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
-    assert len(found.t) == KEPT and int(section.count) == 19
-    for crossed, sign in ((found, 1), (other, -1)):
-        np.testing.assert_allclose(crossed.q["x"], 0.0, atol=1e-14)
-        assert (sign * crossed.v["x"] > 0.1).all()
-        y, speed = crossed.q["y"], crossed.v["x"] ** 2 + crossed.v["y"] ** 2
-        np.testing.assert_allclose(0.5 * speed + y**2 / 2 - y**3 / 3, ENERGY, rtol=1e-8)
-    assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
-    # The kinetic energy of y varies, so that a wrong energy would be seen.
-    assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
 
 
 def in_a_plane(seed=0, count=4):

@@ -5,7 +5,6 @@ import multiprocessing
 import pickle
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -32,11 +31,6 @@ system = lj.System(spring)
 def swing(k):
     """The spring released at 1: x = cos k t."""
     return lj.integrate(system, {"x": 1.0}, {"x": 0.0}, {"k": k, "power": 2}, ts=TS)
-
-
-def at(point):
-    """A point of a sweep."""
-    return {"motion": swing(point["k"]), "k": point["k"]}
 
 
 def in_float64():
@@ -78,31 +72,6 @@ def test_methods():
         found = motion(copied(lj.Radau5()))
         np.testing.assert_array_equal(found.q["x"], known.q["x"], err_msg=way)
         assert found.asked.method == lj.Radau5()
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("stored", [False, True])
-def test_sweeps(stored, tmp_path):
-    """Values, statuses and texts stay the same; a pickle is data, and takes the function again."""
-    store = tmp_path / "store" if stored else None
-    swept = lj.sweep(at, {"k": np.array([1.0, 2.0])}, store=store, progress=False)
-    for way in ("copy", "deepcopy", "pickle"):
-        found = WAYS[way](swept)
-        assert repr(found) == repr(swept) and found.ok.all()
-        lane = lambda swept: jax.tree.map(lambda x: jnp.asarray(x[1]), swept.values["motion"])
-        if stored and way == "pickle":
-            # A store is reopened: it does not have the functions of the system.
-            one, other = (jax.tree.leaves(lane(x).q) for x in (found, swept))
-            np.testing.assert_array_equal(one, other)
-        else:
-            same(lane(found), lane(swept))
-    if stored:
-        with pytest.raises(ValueError, match="the values in a store belong to the run"):
-            found.resweep(where=True)
-    else:
-        with pytest.raises(ValueError, match="unpickled does not know the function that ran it"):
-            found.resweep(where=[True, False])
-        assert found.resweep(at, where=[True, False]).ran == 1
 
 
 @pytest.mark.exhaustive

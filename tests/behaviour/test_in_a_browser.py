@@ -374,20 +374,3 @@ def test_a_film_in_space_turns_and_zooms(browser, tmp_path):
     page.press(" ")
     page.wait(f"!{canvas}.ariaLabel.includes('t = 1.00')")
     assert page.complaints() == []
-
-
-def test_lanes_in_space(browser, tmp_path):
-    """A lane with twice the radius is drawn at twice the size; one without a motion says so."""
-    t, points = circle(3)
-    body, spec = film(t, {name: np.concatenate([x, 0 * x[..., :1]], axis=-1) for name, x in points.items()}, 25.0, 0)
-    html = fragment(body, {"film": spec}, film_scripts(spec), "window.show = film(root, spec.film);")
-    page = opened(browser, tmp_path, whole("Lanes", html), width=700)
-    blue = []
-    for lane in (0, 1):
-        page.run(f"show({lane})")
-        blue.append(np.sum(pixels(page, tmp_path)[..., 2] - pixels(page, tmp_path)[..., 0] > 0.5))
-    page.run("show(2)")
-    assert 1.4 < blue[1] / blue[0] < 2.1 and "no motion to draw" in page.run(
-        "document.querySelector('canvas').ariaLabel"
-    )
-    assert page.complaints() == []

@@ -183,7 +183,7 @@ def test_observation_velocity_and_end():
 
 @pytest.mark.exhaustive
 def test_a_long_record_wants_a_growing_horizon():
-    """A fit of 27 periods at once ends in a wrong minimum; growing parts, joined windows and many starts do not."""
+    """A fit of 27 periods at once ends in a wrong minimum; growing parts and joined windows do not."""
     ts = np.linspace(0.0, 60.0, 1500)
     known = PENDULUM | {"c": 0.01}
     truth = lj.integrate(pendulum, 1.0, 0.0, known, ts=ts)
@@ -195,18 +195,10 @@ def test_a_long_record_wants_a_growing_horizon():
     np.testing.assert_allclose(joined.values, found.values, rtol=1e-5)
     np.testing.assert_allclose(joined.sd, found.sd, rtol=0.02)
     assert joined.freedom == found.freedom
-    apart = fit(0.9, window=5.0, joined=False)
-    np.testing.assert_allclose(apart.values, [1.25], rtol=0.01)
-    assert float(apart.sd[0]) > 2 * float(found.sd[0])
     # Twin: at once and without restarts the search fails.
     with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
         lost = fit(0.9, grow=False, restarts=0)
     assert lost.rms()["q"] > 0.1
-    # Many starts succeed.
-    best = fit(1.15, grow=False, restarts=30, spread=0.3)
-    np.testing.assert_allclose(best.values, found.values, rtol=1e-5)
-    assert best.costs is not None and len(best.costs) == 31
-    assert int(np.sum(best.costs > 2 * best.cost)) > 5
 
 
 @pytest.mark.exhaustive

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 import lagjax as lj
 from tests.fit.cases import formula, in_closed_form
@@ -178,27 +177,6 @@ def test_what_fails_moves_nothing():
 
 
 learned = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["potential"](q))
-
-
-@pytest.mark.exhaustive
-def test_bounds_forgiveness_and_other_solvers():
-    """Bounds hold, a Huber loss tolerates outliers; SciPy's least squares ends where the fit does."""
-    import optax
-
-    rng = np.random.default_rng(1)
-    r = record(3)
-    wild = np.where(rng.random(len(T)) < 0.1, 1.0, 0.0)
-    dirty = lj.Record(T, q=r.measured["q"] + wild, q0=1.0, v0=0.0, hold_q=True, hold_v=True, sigma=0.01)
-    bounds = {"k": (0.0, None)}
-    ends = {}
-    for how in ("huber", "squares"):
-        loss = lj.fit_loss(spring, dirty, {"k": 3.5}, loss=how, bounds=bounds, **EXACTLY)
-        ends[how] = float(loss.params(trained(loss, loss.guess, optax.adam(0.02), 300))["k"])
-    assert abs(ends["huber"] - 4) < 0.05 < abs(ends["squares"] - 4)
-    residuals = lj.fit_residuals(spring, dirty, {"k": 3.5}, bounds=bounds, **EXACTLY)
-    of_vector = jax.jit(lambda y: residuals({"params": {"k": y[0]}, "starts": residuals.guess["starts"]}))
-    by_scipy = least_squares(of_vector, [np.log(3.5)], jax.jit(jax.jacfwd(of_vector)))
-    np.testing.assert_allclose(np.exp(by_scipy.x), quietly(spring, dirty, {"k": 3.5}, bounds=bounds).values, rtol=1e-5)
 
 
 def test_the_share_of_motions_that_fail_in_closed_form(monkeypatch):

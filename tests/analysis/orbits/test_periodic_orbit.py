@@ -129,23 +129,6 @@ def test_relative_orbit():
 
 
 @pytest.mark.exhaustive
-def test_duffing():
-    """The driven orbit attracts, and is SciPy's motion after its transients; twin: a rounded period is refused."""
-    period = 2 * np.pi / known.DUFFING["omega"]
-    orbit = lj.periodic_orbit(known.duffing, (1.0, 0.0), period, known.DUFFING)
-    assert bool(orbit.converged) and float(orbit.period) == period
-    rate, near = known.duffing_rate(known.DUFFING), [orbit.q + 0.01, orbit.v]
-    settled = integrate.solve_ivp(rate, [0, 80 * period], near, rtol=1e-12, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose([orbit.q, orbit.v], settled, atol=1e-9)
-    with pytest.raises(ValueError, match="the system is not the same after period = 6"):
-        lj.periodic_orbit(known.duffing, (1.0, 0.0), 6.0, known.DUFFING)
-    found = lj.floquet(orbit)
-    assert bool(found.attracts) and not found.trivial.any()
-    np.testing.assert_allclose(found.product, np.exp(-known.DUFFING["c"] * period), rtol=1e-9)
-    assert abs(0.01 * np.abs(found.multipliers[0]) ** 80) < 1e-9
-
-
-@pytest.mark.exhaustive
 def test_knife_edge_on_a_slope():
     """A velocity constraint: the blade turns at ω and moves on a cycloid, sideways and not down the slope."""
 
@@ -222,6 +205,7 @@ REFUSED = {
     "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
     "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),
     "damped": (known.duffing, {"hold": "energy"}, ValueError, "so the orbit has the period of the drive"),
+    "a rounded period": (known.duffing, {}, ValueError, "the system is not the same after period = 6"),
 }
 
 
