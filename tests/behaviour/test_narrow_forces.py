@@ -100,11 +100,7 @@ def test_derivatives_by_the_time_of_a_jump():
     for outputs in (np.array([0.0, 20.0, 100.0]), np.array([0.0, 37.0, 100.0])):
         t = outputs[1:]
         after = np.array([0.0, 63.0])
-        exact = {
-            "on": [-0.25 * after, [0.0, -0.25]],
-            "F": [0.5 * after**2, after],
-            "g": [-0.5 * t**2, -t],
-        }
+        exact = {"on": [-0.25 * after, [0.0, -0.25]], "F": [0.5 * after**2, after], "g": [-0.5 * t**2, -t]}
         for derivative in (jax.jacrev, jax.jacfwd):
             found = derivative(states)(params, outputs)
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, jax.tree.map(

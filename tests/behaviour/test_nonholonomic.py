@@ -80,7 +80,7 @@ def disk_exact(params, start, t):
 
 
 # A sledge on one blade: contact point (x, y), heading α, centre of mass at the distance a ahead of the blade; gravity g
-# along x. With g = 0 it is Chaplygin's sleigh, with a = 0 the skate on an incline.
+# along x. With g = 0 it is Chaplygin's sleigh.
 
 
 def sledge_lagrangian(t, q, v, params):
@@ -99,7 +99,6 @@ def blade(t, q, v, params):
 sledge = lj.System(sledge_lagrangian, {"blade": lj.Nonholonomic(blade)})
 # I = 3 m a² makes the sleigh's positions elementary: its heading is then 2 gd(s).
 SLEIGH = {"m": 1.25, "a": 0.5, "I": 3 * 1.25 * 0.5**2, "g": 0.0}
-SKATE = {"m": 1.25, "a": 0.0, "I": 0.625, "g": 9.8125}
 OUTPUTS = 21
 
 
@@ -117,19 +116,6 @@ def sleigh_exact(params, t, speed=1.5, first=-1.25):
     y = b**2 / a * (gudermannian(s) - jnp.tanh(s) / jnp.cosh(s))
     v = jnp.stack([turn, u * jnp.cos(heading), u * jnp.sin(heading)])
     return jnp.stack([heading, x, y]), v, params["m"] * u * turn * (1 - a**2 / b**2)
-
-
-def skate_exact(params, t, turn=1.5, speed=0.0):
-    """(heading, x, y), their rates and λ of the skate: α = ω t, u̇ = g cos α; from rest a cycloid, across the slope.
-
-    Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, §I.3 and §III.2.
-    """
-    k, heading = params["g"] / turn, turn * t
-    u = speed + k * jnp.sin(heading)
-    x = (speed * jnp.sin(heading) + 0.5 * k * jnp.sin(heading) ** 2) / turn
-    y = (speed * (1 - jnp.cos(heading)) + k * (0.5 * heading - 0.25 * jnp.sin(2 * heading))) / turn
-    v = jnp.stack([turn * jnp.ones_like(t), u * jnp.cos(heading), u * jnp.sin(heading)])
-    return jnp.stack([heading, x, y]), v, params["m"] * (u * turn + params["g"] * jnp.sin(heading))
 
 
 def named(values):
@@ -208,9 +194,7 @@ disk_form = lambda params, t: disk_exact(params, DISK_START, t)
 # The system, its velocity constraint and parameters, the closed form, the outputs, the errors that it would show.
 CLOSED = {
     "disk": (vertical_disk, disk_rolls, DISK | {"g": 6.25}, disk_form, np.linspace(0.0, 6.0, 25), (ALONG, ACROSS)),
-    "level disk": (vertical_disk, disk_rolls, DISK, disk_form, np.linspace(0.0, 6.0, 25), (ALONG, ACROSS)),
     "sleigh": (sledge, blade, SLEIGH, by_name(sleigh_exact), np.linspace(0.0, 4.0, OUTPUTS), (ALONG, ACROSS)),
-    "skate": (sledge, blade, SKATE, by_name(skate_exact), np.linspace(0.0, 4.0, OUTPUTS), (ALONG, ACROSS)),
     # Half of Chetaev's force does not change the motion of a single constraint but doubles μ.
     "cruise": (cruise, speed_kept, CRUISE, cruise_exact, np.array([0.0, 0.5, 1.0, 2.0]), (ALONG,)),
     "driven": (driven, driving, DRIVEN, driven_exact, np.linspace(0.0, 4.0, 9), (ALONG, ACROSS, "no d(phi)/dt")),

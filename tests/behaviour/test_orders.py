@@ -120,9 +120,7 @@ OTHERS = [
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
 ]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
-TIERS = {
-    ("Tsit5", "free"): pytest.mark.slow,
-}
+TIERS = {("Tsit5", "free"): pytest.mark.slow}
 
 
 def cases():

@@ -27,10 +27,7 @@ def gap(t, q, params):
 
 string = lj.Hybrid(
     {"taut": lj.System(lagrangian, {"string": lj.Holonomic(gap)}), "slack": lj.System(lagrangian)},
-    [
-        lj.Switch("taut", to="slack", when=lj.releases("string")),
-        lj.Switch("slack", to="taut", when=lj.touches(gap)),
-    ],
+    [lj.Switch("taut", to="slack", when=lj.releases("string")), lj.Switch("slack", to="taut", when=lj.touches(gap))],
     most_switches=4,
 )
 

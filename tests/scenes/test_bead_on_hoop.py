@@ -13,8 +13,6 @@ from lagjax.mechanics.lagrangian import jacobi_integral, momentum
 from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
 from lagjax.scenes.potentials import agm
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
 from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
 
@@ -128,22 +126,6 @@ def test_misprints_are_seen():
     assert scene.MISPRINTS and all("\n" not in line for line in scene.MISPRINTS)
 
 
-def test_exact_motion_obeys_equation_13():
-    """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a missing term is detected."""
-    both = by_numpy(lambda params, psi, t: jax.jvp(lambda t: scene.exact_motion(params, psi, t), (t,), (1.0,)))
-    for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
-        off, angle, rate, right = [], 0.0, 0.0, 0.0
-        for t in np.linspace(0.1, 2.0, 5):
-            (angle, rate), (slope, bend) = both(params, psi, t)
-            np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)
-            pull = params["g"] / params["a"]
-            right = np.sin(angle) * (params["omega"] ** 2 * np.cos(angle) - pull)
-            np.testing.assert_allclose(bend, right, rtol=1e-9, atol=1e-9)
-            off.append(abs(bend + pull * np.sin(angle)))
-        assert max(off) > 0.1
-    np.testing.assert_allclose(second(params, angle, rate), right, rtol=1e-9, atol=1e-9)
-
-
 def test_torque_is_the_multiplier():
     """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is detected."""
     balance = by_numpy(scene.balance)
@@ -168,23 +150,6 @@ def test_torque_is_the_multiplier():
         assert turned == pytest.approx((0.0, 0.0), abs=1e-15)
         # L_z of the hoop at the angle θ is the momentum of θ; E - ω L_z is the Jacobi integral of ψ alone.
         assert of_systems(q, v, params) == pytest.approx((float(state.L_z), float(state.h)))
-
-
-def test_normal_forces_are_multipliers():
-    """In spherical coordinates with the constraint r = a, its multiplier is N_r, and the motor's is a sin ψ N_perp."""
-
-    def lagrangian(t, q, v, params):
-        speed_squared = v["r"] ** 2 + (q["r"] * v["psi"]) ** 2 + (q["r"] * jnp.sin(q["psi"]) * v["theta"]) ** 2
-        return 0.5 * params["m"] * speed_squared + params["m"] * params["g"] * q["r"] * jnp.cos(q["psi"])
-
-    hoop = Holonomic(lambda t, q, params: q["r"] - params["a"])
-    free = System(lagrangian, constraints={"hoop": hoop, "motor": Holonomic(scene.motor)})
-    psi, psi_rate = STATE
-    q, v = {"r": 0.75, "psi": psi, "theta": 0.0}, {"r": 0.0, "psi": psi_rate, "theta": 6.0}
-    multipliers = equations(free, 0.0, q, v, FAST).multipliers
-    assert float(multipliers["hoop"]) == pytest.approx(reference("s3.state.N_r"), rel=1e-12)
-    sideways = float(multipliers["motor"]) / (FAST["a"] * np.sin(psi))
-    assert sideways == pytest.approx(reference("s3.state.N_perp"), rel=1e-12)
 
 
 def test_speed_zero_amplitude_and_reversal():

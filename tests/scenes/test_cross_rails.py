@@ -170,23 +170,6 @@ def test_equations_and_equilibrium():
         assert length > PARAMS["R0"] if params is PARAMS else length < 0.0
 
 
-def test_no_turning_and_backward_turning():
-    """At ω = 0 the springs oscillate independently and h' = E; -ω mirrors r and L_z, which +ω does not."""
-    still = PARAMS | {"omega": 0.0}
-    q, _ = exact_motion(still, Q0, V0, 1.5)
-    fast, slow = np.sqrt(40.0), 4.0
-    assert float(q["R"]) == pytest.approx(0.75 + 0.25 * np.cos(fast * 1.5) + 0.25 * np.sin(fast * 1.5) / fast)
-    assert float(q["r"]) == pytest.approx(0.125 * np.cos(slow * 1.5) - 0.5 * np.sin(slow * 1.5) / slow)
-    books = balance(still, Q0, V0)
-    assert float(books.h) == float(books.E)
-    mirror = {"R": 1.0, "r": -1.0}
-    flip = lambda state: jax.tree.map(lambda x, sign: sign * x, state, mirror)
-    forward = exact_motion(PARAMS, Q0, V0, 1.5)
-    for omega, right in ((-2.5, True), (2.5, False)):
-        backward = exact_motion(PARAMS | {"omega": omega}, flip(Q0), flip(V0), 1.5)
-        assert (relative_error(tuple(map(flip, backward)), forward) < 1e-13) == right
-
-
 def test_modes_and_verdict():
     """Modes are the eigenvalues of the linear equations, the verdict their growth; factor 1 gives other modes."""
     rng, is_stable = np.random.default_rng(7), by_numpy(scene.is_stable)
@@ -219,22 +202,3 @@ def test_slow_mode_near_a_critical_speed():
         half_sum = 28 + params["omega"] ** 2
         by_difference = half_sum - np.sqrt(half_sum**2 - (16 - params["omega"] ** 2) * (40 - params["omega"] ** 2))
         assert abs(by_difference / exact - 1) > 1e-6
-
-
-def test_escape_at_the_critical_speed():
-    """At ω² = K/m the mean motion of the exact solution is ½ a t² and b t, with a and b as in closed form."""
-    t = np.array([2e4, 4e4])
-    q, _ = exact_motion(AT["critical"], Q0, V0, t)
-    a, b = by_numpy(scene.escape)(PARAMS)
-    second = 2 * (q["R"][1] - 2 * q["R"][0]) / (t[1] ** 2 - 2 * t[0] ** 2)
-    # The remaining oscillation is of order one in 1e9.
-    assert float(second) == pytest.approx(float(a), rel=1e-6)
-    assert float((q["r"][1] - q["r"][0]) / (t[1] - t[0])) == pytest.approx(float(b), rel=1e-4)
-
-
-def test_exact_gradient_at_critical_speeds():
-    """The exact motion is smooth in ω through the critical speed k/m: its derivative is the difference quotient."""
-    at = lambda omega: scene.exact_motion(PARAMS | {"omega": omega}, Q0, V0, 1.0)[0]["r"]
-    of, step = by_numpy(at), 2.0**-14
-    slope = float(by_numpy(jax.grad(at))(4.0))
-    assert float(of(4.0 + step) - of(4.0 - step)) / (2 * step) == pytest.approx(slope, rel=1e-6)

@@ -6,20 +6,10 @@ import jax
 import numpy as np
 
 from lagjax.scenes import sphere_geodesic
-from lagjax.stability.geodesics import _circle_from_angles, _over_azimuth, by_angles
+from lagjax.stability.geodesics import _circle_from_angles, by_angles
 from tests.by_numpy import by_numpy, equations
-from tests.stability.closed_forms import defect
 
 PARAMS = sphere_geodesic.PARAMS
-
-
-def test_over_the_azimuth():
-    """cot ψ = A cos θ + B sin θ through any start obeys the equation; twin: a start with another slope does not."""
-    assert defect(sphere_geodesic.over_azimuth, _over_azimuth, 1.2, 0.3, PARAMS, np.array([0.2, 0.4, 0.9])) < 1e-10
-    after = lambda slope: by_numpy(_over_azimuth)(1.2, slope, PARAMS, np.array([0.0, 0.5]))
-    q, v = after(0.3)
-    np.testing.assert_allclose([q[0], v[0]], [1.2, 0.3], rtol=1e-14)
-    assert abs(after(0.31)[0][1] - q[1]) > 1e-3
 
 
 def test_the_circle_from_angles():

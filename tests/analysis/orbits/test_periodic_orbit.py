@@ -95,6 +95,9 @@ def test_kepler():
     # All orbits of an energy have one period: M - 1 has rank one, f times the slope of the energy.
     sizes = np.linalg.svd(found.monodromy - np.eye(4))[1]
     assert sizes[0] > 1 and np.all(sizes[1:] < 1e-7)
+    line = np.asarray(orbit.plot().axes[0].lines[0].get_xydata())
+    np.testing.assert_allclose(line[0], line[-1], atol=1e-7)
+    assert np.ptp(line[:, 0]) > 1
 
 
 def polar_lagrangian(t, q, v, p):

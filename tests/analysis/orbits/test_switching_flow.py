@@ -30,8 +30,7 @@ def falling(t, q, v, p):
 
 bouncing = lj.Hybrid({"flying": lj.System(falling)}, [lj.Switch("flying", to="flying", when=table, reset=bounced)])
 bouncing_by_element = lj.System(
-    falling,
-    elements={"table": lj.Contact(lambda t, q, p: table(t, q, None, p), restitution=lambda p: p["e"])},
+    falling, elements={"table": lj.Contact(lambda t, q, p: table(t, q, None, p), restitution=lambda p: p["e"])}
 )
 OMEGA, E = 8.0, 0.8
 PERIOD = 2 * np.pi / OMEGA
