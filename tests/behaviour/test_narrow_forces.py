@@ -41,13 +41,6 @@ def test_a_pulse():
 
 
 @pytest.mark.slow
-def test_outputs_meet_a_pulse():
-    """No step is longer than the time between two outputs: with outputs every 0.05 the pulse is met."""
-    traj = lj.integrate(pushed, 0.0, 0.0, ts=np.linspace(0.0, 100.0, 2001))
-    np.testing.assert_allclose(traj.q[-1], AFTER, rtol=1e-6)
-
-
-@pytest.mark.slow
 def test_another_limit_is_no_other_program():
     """The limit and the times of jumps are arguments of the compiled program, not parts of it."""
     system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * q**2)

@@ -77,20 +77,6 @@ def test_pendulum_on_a_rod(along, to):
 
 
 @pytest.mark.exhaustive
-def test_relative_orbits():
-    """In a central force, along the exponent of its law: the harmonic oscillator, at r², has the period π in r."""
-
-    def lagrangian(t, q, v, p):
-        return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) - q["r"] ** p["power"] / p["power"]
-
-    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.5}
-    orbit = lj.periodic_orbit(lj.System(lagrangian), start, 1.8, {"power": 1.0}, relative="phi")
-    branch = lj.continue_orbits(orbit, along="power", to=2.0)
-    np.testing.assert_allclose(branch.period[-1], np.pi, rtol=1e-11)
-    assert abs(branch.period[0] - np.pi) > 0.03
-
-
-@pytest.mark.exhaustive
 def test_a_branch_that_turns():
     """Halo orbits (mass ratio 0.04) end where z = 0 and turn there: a critical point, and the range that was reached.
 

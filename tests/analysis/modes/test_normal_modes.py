@@ -11,6 +11,7 @@ import lagjax as lj
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
 from tests.analysis.steady_systems import DISK, TOP, UPRIGHT, UPRIGHT_DISK, disk, straight_on, top
+from tests.systems import DOUBLE_PARAMS, double_pendulum, double_rods, rod_pendulum
 
 BEAD = {"a": 1.25, "g": 9.8125, "omega": 2.0}
 STILL = {"x": 0.0, "y": 0.0}
@@ -186,3 +187,66 @@ def test_it_draws_itself():
     assert 0.09 < np.max(np.abs(moved)) <= 0.1 + 1e-12
     with pytest.raises(ValueError, match="not a film"):
         modes[0].animate(lambda t, q, params: (q["R"], q["r"]), seconds=0.0)
+
+
+def test_the_force_of_a_constraint_is_in_the_stiffness():
+    """A rod pendulum in Cartesian coordinates gets g/l from λ·∂²g alone; L itself has no stiffness."""
+    params = {"g": 9.8125, "l": 1.25}
+    modes = lj.normal_modes(rod_pendulum, 0.0, {"x": 0.0, "y": -1.25}, {"x": 0.0, "y": 0.0}, params)
+    found = modes.linearisation
+    np.testing.assert_allclose(modes.frequency, [np.sqrt(params["g"] / params["l"])], **EQUAL)
+    np.testing.assert_allclose(found.stiffness[0, 0], -2 * found.multipliers["rod"], rtol=1e-13)
+    assert len(modes) == 1 and np.abs(modes.shapes["y"][0]) < 1e-12
+
+
+@pytest.mark.exhaustive
+def test_the_double_pendulum_by_angles_and_by_rods():
+    """The roots of det(K - ω² M), in angles, with two constraints, and with one constraint given twice."""
+    m1, m2, l1, l2, g = (DOUBLE_PARAMS[name] for name in ("m1", "m2", "l1", "l2", "g"))
+    M = np.array([[(m1 + m2) * l1**2, m2 * l1 * l2], [m2 * l1 * l2, m2 * l2**2]])
+    K = np.diag([(m1 + m2) * g * l1, m2 * g * l2])
+    exact = np.sqrt(np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real))
+    by_angles = lj.normal_modes(double_pendulum, 0.0, np.zeros(2), np.zeros(2), DOUBLE_PARAMS)
+    hanging = {"first": np.array([0.0, -l1]), "second": np.array([0.0, -l1 - l2])}
+    at = 0.0, hanging, jax.tree.map(np.zeros_like, hanging), DOUBLE_PARAMS
+    twice = lj.System(double_rods.lagrangian, {**double_rods.constraints, "again": double_rods.constraints["inner"]})
+    for modes in (by_angles, lj.normal_modes(double_rods, *at), lj.normal_modes(twice, *at)):
+        np.testing.assert_allclose(modes.frequency, exact, **EQUAL)
+        assert modes.verdict == "stable"
+
+
+@pytest.mark.slow
+def test_where_a_stiffness_vanishes_the_next_term_decides():
+    """q⁴ is stable, which a zero mode says; twin: -q⁴ is not."""
+    quartic = lj.System(lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["c"] * q["x"] ** 4 - q["y"] ** 2)
+    modes = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": 1.0})
+    assert modes.verdict == "stable" and list(modes.zero) == [True, False]
+    hill = lj.normal_modes(quartic, 0.0, STILL, STILL, {"c": -1.0})
+    assert hill.verdict == "divergence" and "first term that does not vanish" in repr(hill)
+
+
+def test_damping_and_circulation():
+    """Damped and overdamped roots; stable up to 2n = |k₁ - k₂| and flutter above it, as Ziegler found."""
+    at = lambda **params: lj.normal_modes(small.circulating, 0.0, STILL, STILL, params)
+    modes = at(k1=1.0, k2=4.0, n=0.0, c=0.5)
+    np.testing.assert_allclose(modes.roots, [-0.25 + 1j * np.sqrt(k - 0.0625) for k in (1.0, 4.0)], rtol=1e-12)
+    assert modes.verdict == "asymptotically stable"
+    modes = at(k1=1.0, k2=4.0, n=0.0, c=5.0)
+    np.testing.assert_allclose(modes.roots, np.sort([*np.roots([1, 5, 1]), *np.roots([1, 5, 4])])[::-1], rtol=1e-10)
+    assert at(k1=1.0, k2=1.5, n=0.249, c=0.0).verdict == "stable"
+    modes = at(k1=1.0, k2=1.5, n=0.251, c=0.0)
+    assert modes.verdict == "flutter"
+    np.testing.assert_allclose(modes.linearisation.circulatory, [[0.0, -0.251], [0.251, 0.0]])
+    np.testing.assert_allclose(at(k1=1.0, k2=1.5, n=0.0, c=0.5).linearisation.damping, 0.5 * np.eye(2))
+
+
+@pytest.mark.exhaustive
+def test_a_double_root_is_reported():
+    """An isotropic oscillator has finite derivatives, those of the mean, and is reported as double."""
+    at = lambda k1: lj.normal_modes(small.circulating, 0.0, STILL, STILL, {"k1": k1, "k2": 4.0, "n": 0.0, "c": 0.0})
+    modes = at(4.0)
+    assert list(modes.double) == [True, True] and "double" in repr(modes)
+    slope = jax.jacfwd(lambda k1: at(k1).frequency)(4.0)
+    assert np.isfinite(slope).all()
+    np.testing.assert_allclose(np.sort(np.abs(slope))[-2:], 0.125, rtol=1e-8)
+    np.testing.assert_allclose(np.max(jax.jacfwd(lambda k1: at(k1).frequency)(4.1)), 1 / (2 * np.sqrt(4.1)), rtol=1e-8)

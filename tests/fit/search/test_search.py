@@ -106,22 +106,6 @@ def test_what_leaves_no_trace_keeps_its_guess(monkeypatch):
 
 
 @pytest.mark.exhaustive
-def test_what_contradicts_sigma_is_no_success(clean):
-    """A missing effect or errors larger than sigma: not converged, with a warning, from every start."""
-    data = measured(clean, 3) + SIGMA * np.sin(7 * TS)
-    with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
-        found = lj.fit(driven, lj.Record(TS, q=data, sigma=SIGMA), GUESS)
-    assert bool(found.rested) and not bool(found.converged) and found.result == lj.RESULTS.misfit
-    assert "NOT measurement errors" in repr(found) and np.all(np.isfinite(found.costs))
-    larger = lambda times: clean + times * (measured(clean, 3) - clean)
-    with pytest.warns(lj.FitWarning, match="of 'q' are 2 times as large as sigma says"):
-        found = lj.fit(driven, lj.Record(TS, q=larger(2.0), sigma=SIGMA), GUESS)
-    assert not bool(found.converged)
-    # Twin: errors a little larger than sigma give no warning.
-    assert bool(lj.fit(driven, lj.Record(TS, q=larger(1.2), sigma=SIGMA), GUESS).converged)
-
-
-@pytest.mark.exhaustive
 def test_in_a_sweep(clean):
     """50 repeats from guesses up to 30 % off, and 50 with a missing effect: the status tells them apart."""
 
