@@ -69,25 +69,6 @@ def test_saved_and_loaded(tmp_path):
         lj.load_trajectory(path)
 
 
-@pytest.mark.exhaustive
-def test_constraints_and_options(tmp_path):
-    """Starts on constraints are available without the system; options with functions are passed again."""
-    rod = lj.System(
-        lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"],
-        {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)},
-    )
-    t, events = np.linspace(0.0, 0.4, 9), {"low": lj.Crossing(lambda t, q, v, params: q["x"])}
-    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"g": 9.81}, ts=t)
-    record = lj.Record(t, q=jax.tree.map(lambda x: np.asarray(x) + NOISE[:9], motion.q), sigma=1e-3)
-    found = lj.fit(rod, record, {"g": 9.0}, events=events)
-    found.save(tmp_path / "fit.npz")
-    without, again = lj.load_fit(tmp_path / "fit.npz"), lj.load_fit(tmp_path / "fit.npz", rod, events=events)
-    assert repr(without) == repr(found) == repr(again)
-    for whole in (without, again):
-        assert jax.tree.map(float, whole.q0) == jax.tree.map(float, found.q0)
-    np.testing.assert_array_equal(again.motion().q["x"], found.motion().q["x"])
-
-
 class Own(eqx.Module):
     """A module of the user's, with a layer in a list, and an activation."""
 

@@ -105,15 +105,9 @@ def test_exact_motion_is_the_matrix_exponential():
         for K in (20.0, 8.0):
             params = PARAMS | {"omega": omega, "K": K}
             kappa, Kappa = params["k"] / params["m"], K / params["m"]
-            matrix = mpmath.matrix(
-                [
-                    [0, 0, 1, 0, 0],
-                    [0, 0, 0, 1, 0],
-                    [mpmath.mpf(omega) ** 2 - Kappa, 0, 0, 2 * omega, Kappa * params["R0"]],
-                    [0, mpmath.mpf(omega) ** 2 - kappa, -2 * omega, 0, 0],
-                    [0, 0, 0, 0, 0],
-                ]
-            )
+            rows = np.eye(5, k=2)[:2], [[0, 0, 0, 2 * omega, Kappa * params["R0"]], [0, 0, -2 * omega, 0, 0], 5 * [0]]
+            matrix = mpmath.matrix(np.concatenate(rows).tolist())
+            matrix[2, 0], matrix[3, 1] = mpmath.mpf(omega) ** 2 - Kappa, mpmath.mpf(omega) ** 2 - kappa
             with mpmath.workdps(40):
                 z = mpmath.expm(3 * matrix) * mpmath.matrix([1, 0.125, 0.25, -0.5, 1])
             q, v = exact_motion(params, Q0, V0, 3.0)

@@ -80,27 +80,23 @@ def test_homogeneous_in_all_lengths(name, degree, lengths):
     np.testing.assert_allclose([first, second], [degree * value, degree**2 * value], rtol=1e-11, atol=1e-11)
 
 
-def test_no_nan_at_special_points():
-    """Gradients are finite, and zero by symmetry, on the sheet, the axes and in the centre of a ball."""
-    for name, q in (
-        ("plane", (0.5, 0.5, 0.0)),
-        ("cylinder", (0.0, 0.0, 0.0)),
-        ("finite cylinder", (0.0, 0.0, 0.0)),
-        ("elliptic cylinder", (0.0, 0.0, 0.0)),
-    ):
-        assert all(abs(x) < 1e-13 for x in in_field(name, *q)[1].values()), name
-    for name, q in (
-        ("half plane", (0.0, 1.0, 0.0)),
-        ("half plane", (0.0, -1.0, 0.0)),
-        ("cylinder", (1.25, 0.0, 0.0)),
-        ("finite cylinder", (1.25, 0.0, 0.75)),
-        ("finite cylinder", (0.0, 0.0, 0.75)),
-        ("finite cylinder", (1e100, 0.0, 0.0)),
-        ("elliptic cylinder", (2.0, 0.0, 0.0)),
-        ("dumbbell", (0.0, 0.0, 1.5)),
-        ("helix", (0.0, 0.0, 0.0)),
-    ):
-        assert all(np.isfinite(x) for x in in_field(name, *q)[1].values()), name
+SPECIAL = {
+    "plane": [(0.5, 0.5, 0.0)],
+    "half plane": [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0)],
+    "cylinder": [(0.0, 0.0, 0.0), (1.25, 0.0, 0.0)],
+    "finite cylinder": [(0.0, 0.0, 0.0), (1.25, 0.0, 0.75), (0.0, 0.0, 0.75), (1e100, 0.0, 0.0)],
+    "elliptic cylinder": [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0)],
+    "dumbbell": [(0.0, 0.0, 1.5)],
+    "helix": [(0.0, 0.0, 0.0)],
+}
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_no_nan_at_special_points(name):
+    """Gradients are finite on sheets, edges, axes and in the centre of a ball, and zero where all is symmetric."""
+    fields = [np.array(list(in_field(name, *q)[1].values())) for q in SPECIAL[name]]
+    assert np.isfinite(fields).all()
+    assert name in ("half plane", "dumbbell", "helix") or np.max(np.abs(fields[0])) < 1e-13
 
 
 def test_field_through_the_lid():

@@ -7,6 +7,7 @@ import pytest
 from scipy import linalg, special
 
 import lagjax as lj
+from tests.analysis.closed_forms import slope_of_swinging, swinging
 from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum, rod_pendulum
 
 
@@ -166,3 +167,21 @@ def test_equations_that_fail():
         lj.periodic_orbit(massless, start, 4.0)
     with pytest.raises(ValueError, match="L is nan at t = 0"):
         lj.periodic_orbit(pendulum, (1.0, 0.0), 2.0, PARAMS | {"g": np.nan})
+
+
+def test_pendulum():
+    """M = 1 + (dT/dE) f dEᵀ in closed form, and both multipliers are 1 for a known reason."""
+    amplitude = 2.0
+    found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, swinging(amplitude))
+    g_over_l = PARAMS["g"] / PARAMS["l"]
+    slope = slope_of_swinging(amplitude)
+    # With v = 0, f = (0, -g/l sin q). A start shifted by dq returns after T + T'dq, so after T it is off by -f T' dq.
+    exact = np.array([[1.0, 0.0], [slope * g_over_l * np.sin(amplitude), 1.0]])
+    np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
+    np.testing.assert_array_equal(found.multipliers, [1.0, 1.0])
+    assert found.trivial.all() and "1 (along the motion), 1 (across energies)" in repr(found)
+    assert bool(found.stable) and "linearly stable" in found.verdict
+    # Twin: at the equilibrium no multiplier is trivial; they are e^{±i ω T}.
+    rest = lj.floquet(pendulum, 0.0, 0.0, 0.0, PARAMS, 1.0)
+    np.testing.assert_allclose(rest.multipliers, np.exp([1j * np.sqrt(g_over_l), -1j * np.sqrt(g_over_l)]), rtol=1e-9)
+    assert not rest.trivial.any()

@@ -83,30 +83,6 @@ def test_linear():
 
 
 @pytest.mark.exhaustive
-def test_without_mass():
-    """Two equal vortices, whose coordinates are all of first order: four multipliers, and M in closed form.
-
-    At the distance d they turn at 1/(π d²), so that a larger distance turns them back by 2π a length in a turn.
-    Twin: a period off by a part in 1000 does not bring them back.
-    """
-
-    def vortices(t, q, v, p):
-        """Two vortices of strength 1 (Kirchhoff)."""
-        return 0.5 * jnp.sum(q[:, 0] * v[:, 1] - q[:, 1] * v[:, 0]) + jnp.log(jnp.sum((q[0] - q[1]) ** 2)) / (4 * np.pi)
-
-    place, period = np.array([[1.0, 0.0], [-1.0, 0.0]]), 2 * np.pi * np.pi * 4
-    found = lj.floquet(lj.System(vortices), 0.0, place, 0 * place, None, period)
-    exact, turned = np.eye(8)[:, :4], 2 * np.pi * np.array([1, 0, -1, 0])
-    exact[1, :4] += turned
-    exact[3, :4] -= turned
-    np.testing.assert_allclose(found.monodromy[:4, :4], exact[:4], atol=1e-8)
-    assert found.multipliers.shape == (4,)
-    np.testing.assert_allclose(found.multipliers, 1.0, atol=1e-4)
-    with pytest.raises(ValueError, match="does not come back"):
-        lj.floquet(lj.System(vortices), 0.0, place, 0 * place, None, 1.001 * period)
-
-
-@pytest.mark.exhaustive
 def test_stick_slip_beside_a_filter():
     """A filter of the block's place has its own multiplier e^(-T/τ) beside the cycle's 1 and 0, of the same period."""
     block = lambda t, q, v, p: 0.5 * v["x"] ** 2 - 0.5 * p["k"] * q["x"] ** 2

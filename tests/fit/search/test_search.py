@@ -59,29 +59,6 @@ def test_a_stage_does_not_move_what_it_cannot_see(clean, monkeypatch):
     assert bool(again.converged) and "1 of 2 starts ended here" in repr(again)
 
 
-@pytest.mark.exhaustive
-def test_what_only_round_off_sees_keeps_its_guess():
-    """Positions do not determine the mass of a pendulum on a rod: it stays near its guess and affects nothing else;
-    twin: with a prior it is where that says, and g, which is seen, is nowhere near its guess."""
-    free = lambda t, q, v, p: p["m"] * (0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"])
-    rod = lj.System(free, {"rod": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1.0)})
-    ts = np.linspace(0.0, 3.0, 40)
-    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"m": 1.0, "g": 9.8}, ts=ts).q
-    errors = 0.01 * np.random.default_rng(0).normal(size=(2, ts.size))
-    measured = {"x": motion["x"] + errors[0], "y": motion["y"] + errors[1]}
-    record, guess = lj.Record(ts, measured, sigma=0.01), {"m": 2.0, "g": 9.0}
-
-    with pytest.warns(lj.FitWarning, match="do not determine all"):
-        found = lj.fit(rod, record, guess, restarts=0)
-    assert abs(float(found.params["m"]) - 2.0) < 0.2 and "(not determined)" in repr(found)
-    assert abs(float(found.params["g"]) - 9.0) > 0.7
-    told = lj.fit(rod, record, guess, restarts=0, priors={"m": (1.3, 0.1)})
-    np.testing.assert_allclose(told.params["m"], 1.3, rtol=1e-6)
-    alone = lj.fit(rod, record, guess, free="g", restarts=0)
-    np.testing.assert_allclose(found.params["g"], alone.params["g"], rtol=1e-8)
-    np.testing.assert_allclose(found.sd[found.names.index("g")], alone.sd[0], rtol=1e-3)
-
-
 @pytest.mark.slow
 def test_what_leaves_no_trace_keeps_its_guess(monkeypatch):
     """A mass that drops out is at its guess although another start, with another mass, gave the best end; twin: with a
