@@ -1,4 +1,4 @@
-"""What `fit` minimises as a function: against the fit, formulas and finite differences; and trained with optax."""
+"""What `fit` minimises as a function: against the fit, formulas and finite differences."""
 
 import warnings
 from collections.abc import Callable
@@ -29,25 +29,6 @@ def quietly(*args, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", lj.FitWarning)
         return lj.fit(*args, **{"progress": False} | EXACTLY | options)
-
-
-def trained(loss, unknowns, optimiser, steps, batch=None, seed=0):
-    """The recipe of `docs/learned.md`: the unknowns after some steps of an optimiser of optax."""
-    import optax
-
-    @jax.jit
-    def train(unknowns):
-        def step(carry, key):
-            unknowns, state = carry
-            chosen = None if batch is None else jax.random.choice(key, loss.windows, (batch,), replace=False)
-            slopes = jax.grad(loss)(unknowns, chosen)
-            changes, state = optimiser.update(slopes, state, unknowns)
-            return (optax.apply_updates(unknowns, changes), state), None
-
-        keys = jax.random.split(jax.random.key(seed), steps)
-        return jax.lax.scan(step, (unknowns, optimiser.init(unknowns)), keys)[0][0]
-
-    return train(unknowns)
 
 
 def oscillation(t, q, v, params):
@@ -161,19 +142,17 @@ def test_what_does_not_go_together():
 
 @pytest.mark.exhaustive
 def test_what_fails_moves_nothing():
-    """A motion with NaN has a constant loss without a slope, and the others are still fitted; a fit then tells."""
-    import optax
-
+    """A motion with NaN has a constant loss without a slope, and the others keep theirs; a fit then tells."""
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p["k"] + 0.0 * jnp.sqrt(p["sane"])) * q**2)
     records = [record(i, params={"sane": sane}) for i, sane in enumerate((1.0, -1.0, 1.0))]
     loss = lj.fit_loss(system, records, {"k": 3.0, "sane": 1.0}, free="k", **EXACTLY)
     value, slopes = jax.value_and_grad(loss)(loss.guess, [1])
     # Ten spreads of the data, at each sample but the first.
     assert value > 3 * 0.5 * 30 * (10 * 0.5 / 0.01) ** 2 and slopes["params"]["k"] == 0.0
-    end = trained(loss, loss.guess, optax.adam(0.05), 150)
-    assert abs(end["params"]["k"] - 4.0) < 0.05
+    all_of_them, others = (jax.grad(loss)(loss.guess, which)["params"]["k"] for which in (None, [0, 2]))
+    np.testing.assert_allclose(all_of_them, others * 2 / 3, rtol=1e-9)
     with pytest.raises(ValueError, match="from the guess the motion|record 1"):
-        quietly(system, record(1, known=False, params={"sane": -1.0}), loss.params(end), free=[])
+        quietly(system, record(1, known=False, params={"sane": -1.0}), {"k": 4.0, "sane": 1.0}, free=[])
 
 
 learned = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["potential"](q))

@@ -113,19 +113,6 @@ def test_every_reference_value():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
 
 
-def test_misprints_are_seen():
-    """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center are all wrong."""
-    rate, torque = rate_of_balance(FAST, *STATE, second(FAST, *STATE)), reference("s3.state.torque")
-    assert float(rate.L_z) == pytest.approx(torque, rel=1e-12)
-    assert abs(float(rate.p_psi) - torque) > 0.5 * abs(torque)
-    # Not harmonic: the period goes as one over the amplitude.
-    long, short = (by_numpy(scene.exact_period)(CRITICAL, 2.0**-n) for n in (11, 10))
-    assert short / long == pytest.approx(0.5)
-    # On the rim: the distance from the axis is a sin α, which tends to a, not to 0.
-    assert np.sin(by_numpy(scene.equilibrium_angle)(FAST | {"omega": 1e6})) == pytest.approx(1.0)
-    assert scene.MISPRINTS and all("\n" not in line for line in scene.MISPRINTS)
-
-
 def test_torque_is_the_multiplier():
     """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is detected."""
     balance = by_numpy(scene.balance)

@@ -71,17 +71,6 @@ def test_closed_forms_match_the_references():
     assert set(found) == set(keys("s2")) - EXCLUDED
 
 
-def test_the_source_is_wrong_where_said():
-    """λ is -mg on the side and -3mg at the bottom; friction has no finite bound; 30° holds only from the top."""
-    weight = PARAMS["m"] * PARAMS["g"]
-    assert hoop.exact_multipliers(PARAMS, 0.0, TOP).contact == pytest.approx(-weight)
-    assert hoop.exact_multipliers(PARAMS, hoop.BOTTOM, TOP).contact == pytest.approx(-3 * weight)
-    near = hoop.exact_multipliers(PARAMS, np.pi / 6 + 1e-9, TOP)
-    assert near.rolling > 1e6 * near.contact
-    assert abs(hoop.departure_sine(PARAMS, 1.25) - 0.5) > 0.02
-    assert hoop.departure_sine(PARAMS, 1.25) == pytest.approx(np.sin(1.25) / 2, rel=1e-14)
-
-
 def test_multipliers_from_the_lagrangian():
     """The saddle-point solve gives the closed λ and μ to 1e-12, and not those of another inertia or sign."""
     for beta in hoop.SHAPES.values():
@@ -101,7 +90,7 @@ def test_multipliers_from_the_lagrangian():
 
 
 def test_flight_is_the_same_lagrangian_without_constraints():
-    """Unconstrained, the parabola is a motion in polar coordinates, and never touches again."""
+    """Unconstrained, the parabola is a motion in polar coordinates."""
     left = by_numpy(hoop.leaving)(PARAMS, TOP)
 
     def at(t):
@@ -113,11 +102,6 @@ def test_flight_is_the_same_lagrangian_without_constraints():
         assert [rate[name], second[name]] == pytest.approx([float(v[name]), float(a[name])], rel=1e-12)
     assert a["phi"] == 0.0 and v["phi"] == left.spin
     assert q["r"] ** 2 == pytest.approx(reference("s2.parabola.rho^2(0.25)"), rel=1e-13)
-    t, L = np.linspace(0.0, 0.25, 3), PARAMS["R"] + PARAMS["a"]
-    gap, speed, cosine = hoop.flight(PARAMS, left, t), np.hypot(left.vx, left.vy), left.x / L
-    quartic = L**2 + PARAMS["g"] * speed * cosine * t**3 + PARAMS["g"] ** 2 * t**4 / 4
-    assert np.allclose(gap.x**2 + gap.y**2, quartic, rtol=1e-13)
-    assert not np.allclose(hoop.flight(PARAMS, left._replace(vy=-left.vy), t).y[1:], gap.y[1:], rtol=1e-2)
 
 
 @pytest.mark.parametrize("theta, theta_rate", [(1.25, -3.0), (-0.5, 0.0), (3.5, 0.0)])

@@ -130,16 +130,6 @@ def test_signs_of_the_work(solved):
     assert abs(-on_wedge - 2 * gained / T) > 1.0
 
 
-def test_misprinted_relation_breaks_the_momentum(solved):
-    """a_y = a_x (1 + m/M) tan α conserves p_x; divided by tan α, as printed, it does not."""
-    a, _ = solved[""]
-    m, M, tan = PARAMS["m"], PARAMS["M"], np.tan(PARAMS["alpha"])
-    momentum_rate = lambda a_y: (m + M) * a["x"] - M * a_y / tan
-    assert abs(momentum_rate(a["x"] * (1 + m / M) * tan)) < 1e-13
-    assert abs(momentum_rate(a["x"] * (1 + m / M) / tan)) > 1.0
-    np.testing.assert_allclose(a["y"], a["x"] * (1 + m / M) * tan, rtol=1e-13)
-
-
 def test_massless_wedge(solved):
     """M = 0: the mass matrix is singular, the equations are not; the particle falls freely, Ẍ = -g cot α."""
     a, multipliers = solved["massless"]

@@ -83,14 +83,6 @@ def test_points_without_a_plane(how, length, ends):
     assert float(geodesic.distance(PARAMS, *ends)) == pytest.approx(length, rel=1e-15, abs=1e-14)
 
 
-def test_the_source_is_wrong_where_said():
-    """A² + B² = tan²i may exceed one, and the misprinted first line is not Lagrange's equation of f."""
-    steep = plane_and_arc(*ends_of("s1.steep(incl>45: A2+B2>1)"))
-    assert float(steep.A**2 + steep.B**2) == pytest.approx(1 / float(steep.clairaut) ** 2 - 1, rel=1e-12)
-    assert steep.A**2 + steep.B**2 > 1
-    assert len(geodesic.MISPRINTS) == 6
-
-
 def test_lagranges_equation_of_the_arc_length():
     """ψ'' sin²ψ = 2 ψ'² sin ψ cos ψ + sin³ψ cos ψ, M = sin²ψ/f³ and h = -cos i at random states, from L alone."""
     rng = np.random.default_rng(1)

@@ -174,18 +174,13 @@ def test_resonance_curve():
             act()
 
 
-def mathieu_lagrangian(t, q, v, p):
-    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and with large swings."""
-    return 0.5 * v**2 + (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * jnp.cos(q)
-
-
 @pytest.mark.slow
 def test_tongues_of_a_parametric_pendulum():
     """At rest its multiplier passes -1 and 1 at Mathieu's characteristic values, also at a tongue of width 5e-4.
 
     Twin: the characteristic values of another q differ.
     """
-    system, q = lj.System(mathieu_lagrangian), 0.25
+    system, q = known.mathieu, 0.25
     orbit = lj.periodic_orbit(system, (0.0, 0.0), np.pi, {"a": 0.1, "q": q})
     branch = lj.continue_orbits(orbit, along="a", to=10.0)
     edges = lambda q: np.array([edge(n, q) for n in (1, 2, 3) for edge in (special.mathieu_b, special.mathieu_a)])

@@ -7,16 +7,8 @@ import pytest
 from scipy import linalg, special
 
 import lagjax as lj
-from tests.analysis.closed_forms import slope_of_swinging, swinging
+from tests.analysis.closed_forms import mathieu, slope_of_swinging, swinging
 from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum, rod_pendulum
-
-
-def mathieu_lagrangian(t, q, v, p):
-    """x'' + (a - 2 q cos 2t) x = 0."""
-    return 0.5 * v**2 - 0.5 * (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * q**2
-
-
-mathieu = lj.System(mathieu_lagrangian)
 
 
 @jax.jit
