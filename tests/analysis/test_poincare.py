@@ -9,7 +9,7 @@ import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
 from tests.analysis.closed_forms import slope_of_swinging, swinging
 from tests.by_hand import by_hand
-from tests.systems import PARAMS, pendulum
+from tests.systems import PARAMS, cartesian_lagrangian, pendulum
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 bottom = lambda t, q, v, p: q
@@ -92,48 +92,6 @@ def test_nothing_beyond_the_last_one_is_differentiated():
     np.testing.assert_array_equal([backward[:2], lanes[0, :2]], [[1.5, 2.0]] * 2)
 
 
-# Central motions.
-
-
-def central_lagrangian(t, q, v, p):
-    """A unit mass in a plane, attracted by -μ/r + ½ k r²."""
-    return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + p["mu"] / q["r"] - 0.5 * p["k"] * q["r"] ** 2
-
-
-central = lj.System(central_lagrangian)
-TURNS = {"turn": lj.turning_points("r"), "nearest": lj.turning_points("r", direction=1)}
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (1.25, 0.75, 0.5)])
-def test_radial_turning_points(mu, k, speed):
-    """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
-    start = {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": speed}, {"mu": mu, "k": k}
-    found = lj.integrate(central, *start, ts=[0.0, 30.0], events=TURNS, **TIGHT).events
-    roots = np.roots([0.5 * k, 0.0, -(0.5 * speed**2 - mu + 0.5 * k), -mu, 0.5 * speed**2])
-    near, far = np.sort(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
-    turns, nearest = found["turn"].found(), found["nearest"].found()
-    other = far if abs(near - 1) < 1e-9 else near
-    assert len(turns.t) > 2 and abs(far - near) > 0.1
-    np.testing.assert_allclose(turns.q["r"][0::2], other, rtol=1e-9)
-    np.testing.assert_allclose(turns.q["r"][1::2], 1.0, rtol=1e-9)
-    # Twin: with one direction there is only every second one, the nearest.
-    np.testing.assert_allclose(nearest.q["r"], near, rtol=1e-9)
-    np.testing.assert_array_equal(nearest.t, turns.t[int(other == far) :: 2][: len(nearest.t)])
-
-
-# Sections of two degrees of freedom.
-
-
-def henon_heiles_lagrangian(t, q, v, p):
-    """Hénon & Heiles, U = ½ (x² + y²) + x² y - y³/3."""
-    x, y = q["x"], q["y"]
-    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (x**2 + y**2) - x**2 * y + y**3 / 3
-
-
-henon_heiles = lj.System(henon_heiles_lagrangian)
-
-
 def in_a_plane(seed=0, count=4):
     """A section x = 0 of given numbers, with room for five, and y and its velocity there."""
     y, vy = numbers = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 5))
@@ -141,7 +99,7 @@ def in_a_plane(seed=0, count=4):
     state = lambda of_y: {"x": 0.0 * of_y, "y": of_y}
     recorded = {"section": crossings(1.0 + np.arange(5) + 0 * y, state(y), state(vy), count)}
     ends = state(np.array([0.5, 0.25])), state(np.array([-1.0, 1.0]))
-    return lj.PoincareSection(by_hand(henon_heiles, [0.0, 9.0], *ends, events=recorded)), numbers
+    return lj.PoincareSection(by_hand(lj.System(cartesian_lagrangian), [0.0, 9.0], *ends, events=recorded)), numbers
 
 
 def test_pictures():

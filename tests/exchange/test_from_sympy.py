@@ -16,51 +16,11 @@ from sympy.physics import mechanics as me
 
 import lagjax as lj
 from tests.by_numpy import equations
-from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum
 
 t = sp.Symbol("t")
 x, y, theta, phi, angle = me.dynamicsymbols("x y theta phi angle")
 m, g, l, c, k = symbols = sp.symbols("m g l c k", positive=True)
 KINETIC, POTENTIAL = m * (x.diff() ** 2 + y.diff() ** 2) / 2, m * g * y
-
-
-def double_pendulum_of_particles():
-    """Two particles on rods, their energies found by SymPy from their positions."""
-    m1, m2, l1, l2 = sp.symbols("m1 m2 l1 l2", positive=True)
-    N, pivot = me.ReferenceFrame("N"), me.Point("O")
-    pivot.set_vel(N, 0)
-    rod = lambda angle, length: length * (sp.sin(angle) * N.x - sp.cos(angle) * N.y)
-    inner = pivot.locatenew("inner", rod(theta, l1))
-    outer = inner.locatenew("outer", rod(phi, l2))
-    bodies = []
-    for point, mass in ((inner, m1), (outer, m2)):
-        point.set_vel(N, point.pos_from(pivot).dt(N))
-        bodies.append(me.Particle(point.name, point, mass))
-        bodies[-1].potential_energy = mass * g * point.pos_from(pivot).dot(N.y)
-    return me.Lagrangian(N, *bodies), [theta, phi], [m1, m2, l1, l2, g]
-
-
-@pytest.mark.slow
-def test_double_pendulum():
-    """Accelerations by SymPy's equations and by a Lagrangian by hand; twin: without a term they differ."""
-    L, coordinates, parameters = double_pendulum_of_particles()
-    q, v = (dict(zip(("theta", "phi"), x)) for x in DOUBLE_SWING)
-    known = {**{x: q[x.name] for x in coordinates}, **{x.diff(): v[x.name] for x in coordinates}}
-    known = {y: x for y, x in known.items() if y.is_Derivative} | {y: x for y, x in known.items() if y.is_Function}
-    numbers = known | {p: DOUBLE_PARAMS[p.name] for p in parameters}
-
-    def by_sympy(L):
-        method = me.LagrangesMethod(L, coordinates)
-        method.form_lagranges_equations()
-        mass, force = (np.array(x.subs(numbers).evalf(), float) for x in (method.mass_matrix, method.forcing))
-        return np.linalg.solve(mass, force[:, 0])
-
-    a = equations(lj.from_sympy(L, coordinates, parameters), 0.0, q, v, DOUBLE_PARAMS).a
-    found = [a["theta"], a["phi"]]
-    np.testing.assert_allclose(found, by_sympy(L), rtol=1e-12)
-    np.testing.assert_allclose(found, equations(double_pendulum, 0.0, *DOUBLE_SWING, DOUBLE_PARAMS).a, rtol=1e-12)
-    dropped = L + parameters[1] * g * parameters[3] * (1 - sp.cos(phi))
-    assert np.max(np.abs(by_sympy(dropped) - found)) > 0.1
 
 
 def method_of_a_rod():

@@ -10,7 +10,6 @@ from base64 import b64decode
 from collections.abc import Sized
 from importlib.util import find_spec
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -222,10 +221,3 @@ def test_what_else_is_refused(waves, monkeypatch):
     monkeypatch.setitem(sys.modules, "ipywidgets", None)
     with pytest.raises(ImportError, match=re.escape('pip install "lagjax[interact]"')):
         ask(wave, knobs)()
-
-
-def test_single_precision():
-    """Without x64 values are float32, as everywhere."""
-    with jax.enable_x64(False):
-        knobs = knobs_of(lambda point: {"a": 2 * point["a"]}, {"a": (0.0, 1.0), "n": [1, 2]}, start={"a": 0.25})
-        assert knobs.result["a"] == 0.5 and knobs.result["a"].dtype == np.float32

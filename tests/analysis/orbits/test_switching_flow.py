@@ -163,16 +163,6 @@ def test_stick_slip():
         assert isinstance(orbit.trajectory, lj.HybridTrajectory)
 
 
-@pytest.mark.exhaustive
-def test_derivatives_of_a_period():
-    """The derivative by μ of the period of sticking and slipping, in both modes. Twin: that of the wait alone."""
-    period = lambda mu: lj.periodic_orbit(block, (0.1, 0.25), 6.5, BELT | {"mu": mu}).period
-    h = 1e-6
-    slope = (stick_slip(BELT | {"mu": 0.5 + h}) - stick_slip(BELT | {"mu": 0.5 - h})) / (2 * h)
-    np.testing.assert_allclose([jax.jacfwd(period)(0.5), jax.grad(period)(0.5)], [slope, slope], rtol=1e-8)
-    assert abs(slope + 2 / BELT["k"] / BELT["V"]) > 0.1
-
-
 # A rimless wheel that walks down a slope.
 
 

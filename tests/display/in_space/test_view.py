@@ -74,13 +74,3 @@ def test_what_looks_away_is_hidden():
     painted = marks(ball, view)
     assert 0.3 * len(SPHERE.faces) < len(painted) < 0.5 * len(SPHERE.faces)
     assert min(mark.nearness for mark in painted) > 0
-
-
-def test_lines_behind_and_before():
-    """A line through a box is painted in pieces, some before it and some behind it."""
-    line = Shape("line", (Anchor(None, np.array([0.0, -3.0, 0.0])), Anchor(None, np.array([0.0, 3.0, 0.0]))))
-    poses = {"a": np.array([0.0, 0, 0, 1, 0, 0, 0])}
-    view, _ = view_of(np.array([-1.0, -3, -1]), np.array([1.0, 3, 1]), -90.0, 10.0)
-    nearness = [mark.nearness for mark in marks(InSpace((line,), poses, {}), view)]
-    faces = [mark.nearness for mark in marks(InSpace((box("a", 0.5),), poses, {}), view)]
-    assert min(nearness) < min(faces) and max(nearness) > max(faces) and len(nearness) > 8
