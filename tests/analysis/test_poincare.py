@@ -99,7 +99,8 @@ def in_a_plane(seed=0, count=4):
     state = lambda of_y: {"x": 0.0 * of_y, "y": of_y}
     recorded = {"section": crossings(1.0 + np.arange(5) + 0 * y, state(y), state(vy), count)}
     ends = state(np.array([0.5, 0.25])), state(np.array([-1.0, 1.0]))
-    return lj.PoincareSection(by_hand(lj.System(cartesian_lagrangian), [0.0, 9.0], *ends, events=recorded)), numbers
+    made = by_hand(lj.System(cartesian_lagrangian), [0.0, 9.0], *ends, PARAMS, events=recorded)
+    return lj.PoincareSection(made), numbers
 
 
 def test_pictures():
