@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
-from tests.analysis.closed_forms import slope_of_swinging, swinging
+from tests.analysis.closed_forms import swinging
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, cartesian_lagrangian, pendulum
 
@@ -52,24 +52,6 @@ def test_pendulum(q0):
     assert f"crossings   {count}, at t = {0.75 * exact:.9g}, " in words
     assert f"period      {exact:.9g} on average" in words and "standard deviation" in words
     assert "uncertain   no" in words and "error       of the times at most" in words
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_the_period():
-    """Derivatives of one period and of the mean period, by amplitude and length, forward and reverse."""
-
-    def period(x):
-        start = x[0], 0.0 * x[0], {"g": PARAMS["g"], "l": x[1]}
-        found = lj.periods(lj.poincare(pendulum, *start, section=bottom, ts=[0.0, 15.0], **TIGHT))
-        return jnp.stack([found[0], jnp.nanmean(found)])
-
-    x = np.array([2.5, PARAMS["l"]])
-    amplitude, l = 2.5, PARAMS["l"]
-    slopes = slope_of_swinging(amplitude), swinging(amplitude) / (2 * l)
-    forward, (value, pull) = jax.jacfwd(period)(x), jax.vjp(period, x)
-    np.testing.assert_allclose(value, swinging(amplitude), rtol=1e-9)
-    for found in (forward[0], forward[1], pull(jnp.array([1.0, 0.0]))[0], pull(jnp.array([0.0, 1.0]))[0]):
-        np.testing.assert_allclose(found, slopes, rtol=1e-8)
 
 
 def crossings(t, q=None, v=None, count=None):

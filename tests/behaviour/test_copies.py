@@ -44,22 +44,16 @@ def shown(motion):
 
 
 def same(found, motion):
-    """Compare with the closed form, and with the text and structure of the original."""
-    assert shown(found) == shown(motion) and found.residual() == 0
-    assert jax.tree.structure(found) == jax.tree.structure(motion)
-    assert found.params["power"] == 2 and bool(found.result == lj.RESULTS.successful)
-    np.testing.assert_allclose(found.q["x"], np.cos(2.0 * TS), atol=1e-8)
+    """A copy has the text, structure, numbers and system of the original."""
+    assert shown(found) == shown(motion) and found.system == motion.system and found.params == motion.params
+    assert jax.tree.structure(found) == jax.tree.structure(motion) and bool(found.result == lj.RESULTS.successful)
+    jax.tree.map(np.testing.assert_array_equal, (found.q, found.multipliers), (motion.q, motion.multipliers))
 
 
 def test_trajectories():
     """A copied trajectory knows its system, and JAX treats both as equal."""
-    motion = motion_of("rod pendulum")
-    for way, copied in WAYS.items():
-        found = copied(motion)
-        assert shown(found) == shown(motion) and found.system == motion.system, way
-        assert jax.tree.structure(found) == jax.tree.structure(motion) and found.params == motion.params
-        assert bool(found.result == lj.RESULTS.successful)
-        np.testing.assert_array_equal(found.multipliers["rod"], motion.multipliers["rod"])
+    for copied in WAYS.values():
+        same(copied(motion_of("rod pendulum")), motion_of("rod pendulum"))
 
 
 @pytest.mark.slow
@@ -80,4 +74,5 @@ def test_another_process():
     with multiprocessing.get_context("spawn").Pool(1, initializer=in_float64) as pool:
         motion = pool.apply(swing, (2.0,))
         same(motion, swing(2.0))
+        np.testing.assert_allclose(motion.q["x"], np.cos(2.0 * TS), atol=1e-8)
         assert pool.apply(shown, (motion,)) == shown(motion)
