@@ -177,6 +177,9 @@ def test_what_is_drawn():
         found.plot("theta")
 
 
+# Folds, none missed; no jump to another branch; where a branch stalls.
+
+
 def test_folds():
     """Two folds, passed in both directions; between them it is unstable, and on it b μ = c q + h q³ - e."""
     found, (b, c, e, h) = branches("folds"), (FOLDS[name] for name in "bceh")

@@ -252,6 +252,9 @@ def test_no_orbit_to_begin_with():
     assert "Fix: orbit = lj.periodic_orbit" in str(raised.value) and PARAMS["g"] > 0
 
 
+# With switches: sticking, slipping and bouncing.
+
+
 @pytest.mark.exhaustive
 def test_stick_slip():
     """The period along the belt's speed, and along μ until the start comes to a switch.

@@ -189,6 +189,9 @@ def test_it_draws_itself():
         modes[0].animate(lambda t, q, params: (q["R"], q["r"]), seconds=0.0)
 
 
+# Matrices on the constraint surface; verdicts of forces that are not conservative.
+
+
 def test_the_force_of_a_constraint_is_in_the_stiffness():
     """A rod pendulum in Cartesian coordinates gets g/l from λ·∂²g alone; L itself has no stiffness."""
     params = {"g": 9.8125, "l": 1.25}

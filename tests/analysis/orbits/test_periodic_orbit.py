@@ -214,6 +214,9 @@ def test_refused_in_words(system, given, error, words):
     assert "Fix:" in str(raised.value)
 
 
+# Shooting in parts, a stiff cycle, and where there is none.
+
+
 def inverted_lagrangian(t, q, v, p):
     """A pendulum by its angle from the upward vertical, pushed back and forth."""
     return 0.5 * v**2 - p["k"] * jnp.cos(q) + p["f"] * q * jnp.cos(t)
