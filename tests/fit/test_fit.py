@@ -86,7 +86,7 @@ def test_called_again_it_compiles_nothing(swinging):
 
 @pytest.mark.exhaustive
 def test_against_scipy(swinging):
-    """Estimates and covariance agree with SciPy's least squares with numerical slopes."""
+    """Estimates and covariance agree with SciPy's least squares with numerical slopes, and with other optimisers."""
     data = noisy(swinging[0])
     found = lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, bounds={"l": (0.0, None)})
     solve = jax.jit(
@@ -104,6 +104,14 @@ def test_against_scipy(swinging):
     np.testing.assert_allclose(found.chi2, 2 * theirs.cost, rtol=1e-8)
     assert abs(float(found.correlation[0, 1])) < 1 and float(found.correlation[1, 1]) == pytest.approx(1)
     assert int(found.freedom) == 96
+    # Another least-squares solver, and a minimiser with reverse-mode derivatives, end at the same point.
+    again = lambda optimiser, **more: lj.fit(
+        pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, optimiser=optimiser, **more
+    )
+    dogleg, bfgs = again(optx.Dogleg(rtol=1e-9, atol=1e-9)), again(optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
+    np.testing.assert_allclose(dogleg.values, found.values, rtol=1e-5)
+    np.testing.assert_allclose(bfgs.values, found.values, rtol=1e-3)
+    np.testing.assert_allclose(bfgs.sd, found.sd, rtol=1e-2)
     # Without sigma, errors estimated from the residuals give nearly the same. Residuals: what is left to the motion.
     alone = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, bounds={"l": (0.0, None)})
     np.testing.assert_allclose(alone.values, found.values, rtol=1e-6)
@@ -228,19 +236,6 @@ def test_outliers_priors_and_bounds(swinging):
         held = fit(data, bounds={"l": (1.3, 2.0)})
     assert any("'l' ended at a bound" in str(warning.message) for warning in told)
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
-
-
-@pytest.mark.exhaustive
-def test_other_optimisers(swinging):
-    """Another least-squares solver, and a minimiser with reverse-mode derivatives, end at the same point."""
-    data = noisy(swinging[0])
-    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
-    ours = fit()
-    dogleg = fit(optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
-    np.testing.assert_allclose(dogleg.values, ours.values, rtol=1e-5)
-    bfgs = fit(optimiser=optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
-    np.testing.assert_allclose(bfgs.values, ours.values, rtol=1e-3)
-    np.testing.assert_allclose(bfgs.sd, ours.sd, rtol=1e-2)
 
 
 @pytest.mark.exhaustive

@@ -165,10 +165,3 @@ def test_gradients_of_the_departure_time():
         got = jax.jit(mode(when))(params)
         for name, value in exact.items():
             assert float(got[name]) == pytest.approx(value, rel=1e-6, abs=1e-9), (mode.__name__, name)
-
-
-def test_the_scene_is_complete():
-    """Each case passes except the costly ones, which other tests cover; all misprints are listed."""
-    assert len(hoop.MISPRINTS) == 5
-    assert hoop._no_inertia().passed
-    assert hoop._refusal("", 1.25, -3.0).passed

@@ -86,18 +86,6 @@ def test_kapitza_on_a_rod():
 
 
 @pytest.mark.exhaustive
-def test_derivatives():
-    """The derivative of Mathieu's largest multiplier by a, both modes, against the discriminant D: μ + 1/μ = D."""
-    largest = lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi).largest
-    value, slope, _ = swing(np.append(1.0, A[1:]), np.append(0.25, Q[1:]))
-    mu = float(jax.jit(largest)(1.0))
-    # Here μ < -1, so `largest` is -μ.
-    exact = -float(jnp.trace(slope[0])) / (1 - mu**-2)
-    np.testing.assert_allclose(-mu - 1 / mu, jnp.trace(value[0]), rtol=1e-11)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(largest))(1.0), exact, rtol=1e-9)
-
-
-@pytest.mark.exhaustive
 def test_what_is_printed_and_drawn():
     """The summary has multipliers, verdict, Liouville's product and error; a flip and a pair are named."""
     found = lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": 1.0, "q": 0.25}, jnp.pi)

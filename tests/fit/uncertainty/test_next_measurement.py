@@ -233,16 +233,12 @@ def test_words(more, error, words):
         asked(**more)
 
 
-def test_words_before_anything_is_computed():
-    """Candidates without a number to compare them by, and a number while none is fitted."""
+def test_words_elsewhere(monkeypatch):
+    """Candidates without a number to compare them by, a number while none is fitted, and inside a program."""
     with pytest.raises(ValueError, match='shrink="g"'):
         lj.identifiability(fall, fallen, {"g": 9.81}, candidates={"a": fallen})
     with pytest.raises(ValueError, match="no parameter is fitted"):
         next_measurement._direction(problem_for([fallen], free=()), "g")
-
-
-def test_words_where_it_is_traced(monkeypatch):
-    """Inside a program it raises an error, since it needs numbers."""
     monkeypatch.setattr(
         import_module("lagjax.fit.identifiability"), "survey", lambda problem, u: Survey(None, problem.measured)
     )
