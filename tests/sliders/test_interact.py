@@ -48,7 +48,7 @@ def waves():
     return knobs_of(wave, {"omega": (0.0, 8.0)})
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_a_slider_moves_the_motion():
     """A trajectory at the slider's values is that in elliptic functions; another value compiles nothing."""
     knobs = knobs_of(swing, {"angle": (0.0, 3.0), "g": (1, 9)}, start={"angle": 1.0})

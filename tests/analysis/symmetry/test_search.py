@@ -82,7 +82,7 @@ def test_the_rails_in_both_frames():
     np.testing.assert_allclose(inside["Jacobi integral"](0.0, cross_rails.Q0, cross_rails.V0, params), h, rtol=1e-12)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_free_fall():
     """Of a falling stone also those with t, in words with its numbers."""
     stone = lj.symmetries(STONE, {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}, OF_STONE)
