@@ -67,17 +67,6 @@ def test_what_is_said_of_a_learned_mass_matrix(matrix, depends, comparison):
     assert ("comparison" in "".join(jumps.in_words() if jumps else [])) == comparison
 
 
-@pytest.mark.slow
-def test_what_is_said_of_networks():
-    """`lj.explain` says it of a mass matrix and a potential that are networks."""
-    one, other = jax.random.split(jax.random.key(0))
-    params = {"mass": Network(np.ones(2), key=one, out=3), "potential": Network(np.ones(2), key=other)}
-    system = lj.System(lambda t, q, v, p: 0.5 * v @ positive_definite(p["mass"](q)) @ v - p["potential"](q))
-    said = dict(lj.explain(system, 0.0, np.array([0.3, 0.2]), np.array([1.0, 0.0]), params).rows)
-    assert said["mass matrix"] == "positive definite, dense, depends on q[0], q[1]"
-    assert "jumps and kinks" not in said
-
-
 def test_damping_never_pushes():
     """With R = ½ vᵀ D(q) v the power -v·∂R/∂v is never positive; twin: with a D of v, R > 0 as well, it may push."""
     matrix = lambda x: positive_definite(jnp.array([x[0], -x[1], x[0] * x[1]]), floor=0.0)
@@ -88,13 +77,6 @@ def test_damping_never_pushes():
     q, v = np.random.default_rng(0).normal(size=(2, 200, 2)) * 2
     never, may = jax.jit(jax.vmap(of_both))(q, v)
     assert np.max(never) <= 0 and np.max(may) > 0.01
-
-
-def test_wrong_counts():
-    """Two numbers do not make a symmetric matrix; neither do zero numbers."""
-    for count in (0, 2, 4):
-        with pytest.raises(ValueError, match=r"n\(n\+1\)/2 numbers"):
-            positive_definite(np.zeros(count))
 
 
 def test_an_angle_comes_back():
@@ -127,7 +109,6 @@ def test_an_angle_comes_back():
         (lambda x: jnp.log(1 + jnp.exp(x)), "no finite curvature at 1000"),
         (jnp.tanh, None),
         (jax.nn.softplus, None),
-        *(pytest.param(right, None, marks=pytest.mark.slow) for right in (jax.nn.silu, jax.nn.gelu, jnp.sin)),
     ],
 )
 def test_activations_need_curvature(activation, words):
@@ -136,17 +117,18 @@ def test_activations_need_curvature(activation, words):
         _check_activation(activation)
 
 
-def test_other_mistakes():
-    """Errors for sizes, names and calls."""
+def test_mistakes():
+    """Errors for sizes, names, calls and counts: two numbers make no symmetric matrix, nor do none."""
     key = jax.random.key(0)
-    with pytest.raises(ValueError, match="must be positive"):
-        Network({"x": 0.0}, key=key)
-    with pytest.raises(ValueError, match="angles names 'y', but the coordinates are 'x'"):
-        Network({"x": 1.0}, angles="y", key=key)
-    with pytest.raises(ValueError, match="takes 2 numbers, but was given 3"):
-        Network(np.ones(2), key=key)(np.ones(3))
-    with pytest.raises(ValueError, match="nothing to disagree"):
-        disagreement(swing, [None], np.zeros(2), np.zeros(2))
+    for act, words in (
+        (lambda: Network({"x": 0.0}, key=key), "must be positive"),
+        (lambda: Network({"x": 1.0}, angles="y", key=key), "angles names 'y', but the coordinates are 'x'"),
+        (lambda: Network(np.ones(2), key=key)(np.ones(3)), "takes 2 numbers, but was given 3"),
+        (lambda: disagreement(swing, [None], np.zeros(2), np.zeros(2)), "nothing to disagree"),
+        *((lambda n=n: positive_definite(np.zeros(n)), r"n\(n\+1\)/2 numbers") for n in (0, 2, 4)),
+    ):
+        with pytest.raises(ValueError, match=words):
+            act()
 
 
 swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + jnp.cos(q))
@@ -163,10 +145,7 @@ def test_same_motion():
     assert abs(gauge(0.0, 0.5, 1.0, None) - plain(0.0, 0.5, 1.0, None)) > 1
     assert not wrong.same and wrong.worst in (0, 6) and "NO" in repr(wrong)
     assert not other(lambda t, q, v, p: 0.5 * v**2 + jnp.sqrt(q)).same
-
-
-def test_other_lagrangians_of_the_same_motion():
-    """For free motion v⁴ is as good as v², but their mass matrices are not proportional."""
+    # For free motion v⁴ is as good as v², but their mass matrices are not proportional.
     free, quartic = lj.System(lambda t, q, v, params: 0.5 * v**2), lj.System(lambda t, q, v, params: v**4)
     found = same_motion(free, quartic, Q, V + 3)
     assert found.same and np.isnan(found.ratio) and "not proportional" in repr(found)

@@ -35,7 +35,12 @@ def spring_lagrangian(t, q, v, p):
     return 0.5 * v**2 - 0.5 * q**2
 
 
-kepler = lj.System(kepler_lagrangian)
+def mathieu_lagrangian(t, q, v, p):
+    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and with large swings."""
+    return 0.5 * v**2 + (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * jnp.cos(q)
+
+
+kepler, mathieu = lj.System(kepler_lagrangian), lj.System(mathieu_lagrangian)
 duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
 DUFFING = {"b": 0.75, "f": 0.3125, "omega": 1.25, "c": 0.125}
 van_der_pol = lj.System(spring_lagrangian, force=lambda t, q, v, p: p["mu"] * (1 - q**2) * v)

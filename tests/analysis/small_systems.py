@@ -22,23 +22,11 @@ def free_chain_lagrangian(t, q, v, params):
     return 0.5 * params["m"] * jnp.sum(v**2) - 0.5 * params["k"] * jnp.sum(jnp.diff(q) ** 2)
 
 
-def foucault_lagrangian(t, q, v, params):
-    """An isotropic oscillator in a rotating frame."""
-    turn = params["turn"]
-    moving = (v["x"] - turn * q["y"]) ** 2 + (v["y"] + turn * q["x"]) ** 2
-    return 0.5 * moving - 0.5 * params["omega"] ** 2 * (q["x"] ** 2 + q["y"] ** 2)
-
-
 def spherical_lagrangian(t, q, v, params):
     """A spherical pendulum of unit mass, by the angle from the bottom and the azimuth."""
     length, g = params["l"], params["g"]
     kinetic = 0.5 * length**2 * (v["theta"] ** 2 + (jnp.sin(q["theta"]) * v["phi"]) ** 2)
     return kinetic + g * length * jnp.cos(q["theta"])
-
-
-def charge_lagrangian(t, q, v, params):
-    """A unit charge in a homogeneous magnetic field."""
-    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) + params["B"] * q["x"] * v["y"]
 
 
 def plane_lagrangian(t, q, v, params):
@@ -54,9 +42,7 @@ def follower(t, q, v, params):
 bead = lj.System(bead_lagrangian)
 chain = lj.System(chain_lagrangian)
 free_chain = lj.System(free_chain_lagrangian)
-foucault = lj.System(foucault_lagrangian)
 spherical = lj.System(spherical_lagrangian)
-charge = lj.System(charge_lagrangian)
 circulating = lj.System(
     plane_lagrangian,
     force=follower,

@@ -1,7 +1,5 @@
 """Poincaré sections, periods and turning points against elliptic integrals, Kepler's law and effective potentials."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +7,9 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
-from tests.analysis.closed_forms import slope_of_swinging, swinging
+from tests.analysis.closed_forms import swinging
 from tests.by_hand import by_hand
-from tests.systems import PARAMS, pendulum
+from tests.systems import PARAMS, cartesian_lagrangian, pendulum
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 bottom = lambda t, q, v, p: q
@@ -56,24 +54,6 @@ def test_pendulum(q0):
     assert "uncertain   no" in words and "error       of the times at most" in words
 
 
-@pytest.mark.exhaustive
-def test_derivatives_of_the_period():
-    """Derivatives of one period and of the mean period, by amplitude and length, forward and reverse."""
-
-    def period(x):
-        start = x[0], 0.0 * x[0], {"g": PARAMS["g"], "l": x[1]}
-        found = lj.periods(lj.poincare(pendulum, *start, section=bottom, ts=[0.0, 15.0], **TIGHT))
-        return jnp.stack([found[0], jnp.nanmean(found)])
-
-    x = np.array([2.5, PARAMS["l"]])
-    amplitude, l = 2.5, PARAMS["l"]
-    slopes = slope_of_swinging(amplitude), swinging(amplitude) / (2 * l)
-    forward, (value, pull) = jax.jacfwd(period)(x), jax.vjp(period, x)
-    np.testing.assert_allclose(value, swinging(amplitude), rtol=1e-9)
-    for found in (forward[0], forward[1], pull(jnp.array([1.0, 0.0]))[0], pull(jnp.array([0.0, 1.0]))[0]):
-        np.testing.assert_allclose(found, slopes, rtol=1e-8)
-
-
 def crossings(t, q=None, v=None, count=None):
     """Crossings at these times."""
     q, v = (t if x is None else x for x in (q, v))
@@ -94,129 +74,6 @@ def test_nothing_beyond_the_last_one_is_differentiated():
     np.testing.assert_array_equal([backward[:2], lanes[0, :2]], [[1.5, 2.0]] * 2)
 
 
-# Central motions.
-
-
-def central_lagrangian(t, q, v, p):
-    """A unit mass in a plane, attracted by -μ/r + ½ k r²."""
-    return 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + p["mu"] / q["r"] - 0.5 * p["k"] * q["r"] ** 2
-
-
-central = lj.System(central_lagrangian)
-TURNS = {"turn": lj.turning_points("r"), "nearest": lj.turning_points("r", direction=1)}
-
-
-def radial(r, speed, mu, k, span):
-    """The radial turning points of a mass thrown at right angles from a distance r."""
-    start = {"r": r, "phi": 0.0 * r}, {"r": 0.0 * r, "phi": speed / r}
-    return lj.integrate(central, *start, {"mu": mu, "k": k}, ts=[0.0, span], events=TURNS, **TIGHT).events
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("mu, k, speed", [(1.25, 0.0, 1.25), (0.0, 0.75, 1.25), (1.25, 0.75, 0.5), (0.5, 0.25, 1.5)])
-def test_radial_turning_points(mu, k, speed):
-    """They alternate between the roots of E = h²/(2r²) + U(r), that is of ½ k r⁴ - E r² - μ r + ½ h²."""
-    energy, h = 0.5 * speed**2 - mu + 0.5 * k, speed
-    roots = np.roots([0.5 * k, 0.0, -energy, -mu, 0.5 * h**2])
-    near, far = np.sort(roots[(abs(roots.imag) < 1e-9) & (roots.real > 0)].real)
-    found = radial(1.0, speed, mu, k, 30.0)
-    turns, nearest = found["turn"].found(), found["nearest"].found()
-    other = far if abs(near - 1) < 1e-9 else near
-    assert len(turns.t) > 2 and abs(far - near) > 0.1
-    np.testing.assert_allclose(turns.q["r"][0::2], other, rtol=1e-9)
-    np.testing.assert_allclose(turns.q["r"][1::2], 1.0, rtol=1e-9)
-    # Twin: with one direction there is only every second one, the nearest.
-    np.testing.assert_allclose(nearest.q["r"], near, rtol=1e-9)
-    np.testing.assert_array_equal(nearest.t, turns.t[int(other == far) :: 2][: len(nearest.t)])
-
-
-def kepler(speed, mu):
-    """T = 2π √(a³/μ), 1/a = 2/r - speed²/μ."""
-    return 2 * jnp.pi * (2 - speed**2 / mu) ** -1.5 / jnp.sqrt(mu)
-
-
-@pytest.mark.exhaustive
-def test_radial_periods():
-    """Radial periods obey Kepler's third law, or are half a spring's period; twin: with both forces neither holds."""
-    period = lambda mu, k, speed: np.asarray(lj.periods(radial(1.0, speed, mu, k, 30.0)["nearest"]))[:2]
-    np.testing.assert_allclose(period(1.25, 0.0, 1.25), kepler(1.25, 1.25), rtol=1e-9)
-    np.testing.assert_allclose(period(0.0, 0.75, 1.25), np.pi / np.sqrt(0.75), rtol=1e-9)
-    assert np.all(abs(period(1.25, 0.75, 1.25) / [float(kepler(1.25, 1.25)), np.pi / np.sqrt(0.75)] - 1) > 0.05)
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_keplers_period():
-    """Derivatives by the initial speed and by μ, forward and reverse."""
-    period = lambda x: lj.periods(radial(jnp.ones(()), x[0], x[1], 0.0, 30.0)["nearest"])[1]
-    x = jnp.array([1.25, 1.25])
-    exact = jax.grad(lambda x: kepler(*x))(x)
-    for mode in (jax.jacfwd, jax.grad):
-        np.testing.assert_allclose(mode(period)(x), exact, rtol=1e-7)
-
-
-# Sections of two degrees of freedom.
-
-
-def henon_heiles_lagrangian(t, q, v, p):
-    """Hénon & Heiles, U = ½ (x² + y²) + x² y - y³/3."""
-    x, y = q["x"], q["y"]
-    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * (x**2 + y**2) - x**2 * y + y**3 / 3
-
-
-henon_heiles = lj.System(henon_heiles_lagrangian)
-ENERGY = 1 / 12
-KEPT = 12
-plane = lj.Crossing(lambda t, q, v, p: q["x"], direction=1, terminal=False, most=KEPT)
-back = {"back": lj.Crossing(lambda t, q, v, p: q["x"], direction=-1, terminal=False)}
-
-
-def orbit(y, span=70.0, **settings):
-    """A motion of the energy 1/12 from (0, y), thrown along x."""
-    vx = jnp.sqrt(2 * (ENERGY - y**2 / 2 + y**3 / 3))
-    start = {"x": 0.0 * y, "y": y}, {"x": vx, "y": 0.0 * y}
-    return lj.poincare(henon_heiles, *start, section=plane, ts=np.array([0.0, span]), events=back, **settings)
-
-
-@pytest.mark.exhaustive
-def test_section_of_henon_and_heiles():
-    """On the section x = 0, vx > 0, and the energy is the start's; twin: crossings the other way are other points.
-
-    Crossings that are not kept are warned of.
-    """
-    with pytest.warns(lj.EventWarning, match="'section' happened 19 times, but only the first 12 are kept"):
-        section = orbit(0.125, span=120.0)
-    found, other = section.crossings.found(), lj.PoincareSection(section.trajectory, "back").crossings.found()
-    assert len(found.t) == KEPT and int(section.count) == 19
-    for crossed, sign in ((found, 1), (other, -1)):
-        np.testing.assert_allclose(crossed.q["x"], 0.0, atol=1e-14)
-        assert (sign * crossed.v["x"] > 0.1).all()
-        y, speed = crossed.q["y"], crossed.v["x"] ** 2 + crossed.v["y"] ** 2
-        np.testing.assert_allclose(0.5 * speed + y**2 / 2 - y**3 / 3, ENERGY, rtol=1e-8)
-    assert np.abs(found.q["y"][:, None] - other.q["y"][None, :]).min() > 1e-4
-    # The kinetic energy of y varies, so that a wrong energy would be seen.
-    assert np.ptp(0.5 * found.v["y"] ** 2) > 1e-3
-    np.testing.assert_allclose(section.t[:11], orbit(0.125).t[:11], rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_lanes():
-    """A batch equals a loop over its lanes, and prints and draws them."""
-    starts = jnp.array([0.125, -0.1, 0.2])
-    lanes = jax.jit(jax.vmap(lambda y: orbit(y, span=80.0)))(starts)
-    for i, y in enumerate(starts):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", lj.EventWarning)
-            alone = orbit(y, span=80.0)
-        assert int(lanes.count[i]) == int(alone.count)
-        for a, b in zip(jax.tree.leaves((lanes.t, lanes.q, lanes.v)), jax.tree.leaves((alone.t, alone.q, alone.v))):
-            np.testing.assert_allclose(a[i], b, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(lj.periods(lanes)[i], lj.periods(alone), rtol=1e-7)
-    words = repr(lanes)
-    assert "lanes       3" in words and f"{int(lanes.count.min())} to {int(lanes.count.max())} a lane" in words
-    (axis,) = lanes.plot().axes
-    assert len({line.get_color() for line in axis.lines}) == 3
-
-
 def in_a_plane(seed=0, count=4):
     """A section x = 0 of given numbers, with room for five, and y and its velocity there."""
     y, vy = numbers = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 5))
@@ -224,7 +81,8 @@ def in_a_plane(seed=0, count=4):
     state = lambda of_y: {"x": 0.0 * of_y, "y": of_y}
     recorded = {"section": crossings(1.0 + np.arange(5) + 0 * y, state(y), state(vy), count)}
     ends = state(np.array([0.5, 0.25])), state(np.array([-1.0, 1.0]))
-    return lj.PoincareSection(by_hand(henon_heiles, [0.0, 9.0], *ends, events=recorded)), numbers
+    made = by_hand(lj.System(cartesian_lagrangian), [0.0, 9.0], *ends, PARAMS, events=recorded)
+    return lj.PoincareSection(made), numbers
 
 
 def test_pictures():
@@ -247,22 +105,17 @@ def test_pictures():
 
 
 def test_what_is_printed():
-    """The print of one motion has counts, periods and doubts; it also works while traced."""
+    """One motion: counts, periods and doubts, also while traced; a batch: the range of counts, a colour a lane."""
     section, traced = in_a_plane()[0], []
     words = repr(section)
     assert "crossings   4, at t = 1, " in words and "period      1 on average, 1 to 1, standard deviation 0" in words
     assert "uncertain   no" in words and "error" not in words
     jax.eval_shape(lambda section: traced.append(repr(section)), section)
     assert traced == ["Poincaré section, being traced, room for 5 crossings"]
-
-
-def test_lanes_in_words_and_pictures():
-    """A batch prints the range of its counts, and draws each lane in its colour."""
     lanes = jax.tree.map(lambda *x: np.stack(x), *(in_a_plane(i, count)[0] for i, count in enumerate((4, 3, 2))))
     words = repr(lanes)
     assert "lanes       3" in words and "2 to 4 a lane" in words and "period      1 on average, 1 to 1" in words
-    (axis,) = lanes.plot().axes
-    assert len({line.get_color() for line in axis.lines}) == 3
+    assert len({line.get_color() for line in lanes.plot().axes[0].lines}) == 3
 
 
 def test_angles_within_half_turns():
@@ -312,22 +165,23 @@ def test_refused_in_words(given, error, words):
     assert "Fix:" in str(raised.value)
 
 
-def test_refused_elsewhere():
-    """Turning points are of a velocity by name, which several need; periods of other things, unrecorded events."""
+def test_turning_points_by_name():
+    """They are of a velocity by name, which several need."""
     velocity = lambda name, v: lj.turning_points(name).guard(0.0, v, v, None)
     assert velocity("r", {"phi": 1.0, "r": 2.0}) == 2.0 and velocity("q[1]", np.array([1.0, 2.0])) == 2.0
-    with pytest.raises(ValueError, match=r"There are q\[0\], q\[1\]") as raised:
-        velocity(None, np.ones(2))
-    assert 'lj.turning_points("q[0]")' in str(raised.value)
-    with pytest.raises(ValueError, match="turning points of 'x': there is none; there are phi, r"):
-        velocity("x", {"phi": 1.0, "r": 2.0})
-    with pytest.raises(TypeError, match="by its name, not as int"):
-        lj.turning_points(0)
     assert [getattr(lj.turning_points("r", direction=1), name) for name in ("direction", "terminal")] == [1, False]
-    section, _ = in_a_plane()
-    with pytest.raises(TypeError, match="not from a Trajectory"):
-        lj.periods(section.trajectory)
-    with pytest.raises(ValueError, match="only one crossing was kept"):
-        lj.periods(crossings(np.ones(1)))
-    with pytest.raises(ValueError, match="no event 'top'; recorded: 'section'"):
-        lj.PoincareSection(section.trajectory, "top")
+    traj = in_a_plane()[0].trajectory
+    for act, error, words in (
+        (
+            lambda: velocity(None, np.ones(2)),
+            ValueError,
+            r'There are q\[0\], q\[1\](?s:.*)lj.turning_points\("q\[0\]"\)',
+        ),
+        (lambda: velocity("x", {"phi": 1.0, "r": 2.0}), ValueError, "points of 'x': there is none; there are phi, r"),
+        (lambda: lj.turning_points(0), TypeError, "by its name, not as int"),
+        (lambda: lj.periods(traj), TypeError, "not from a Trajectory"),
+        (lambda: lj.periods(crossings(np.ones(1))), ValueError, "only one crossing was kept"),
+        (lambda: lj.PoincareSection(traj, "top"), ValueError, "no event 'top'; recorded: 'section'"),
+    ):
+        with pytest.raises(error, match=words):
+            act()

@@ -72,46 +72,6 @@ def test_two_balls_that_touch(q, v, right, count):
     assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
 
 
-@pytest.mark.exhaustive
-def test_bounces_that_accumulate_in_lanes():
-    """The same for lanes, under jit, and in a sweep."""
-    run = lambda h: lj.integrate(zeno, jnp.stack([-h, h]) / 2, jnp.zeros(2), {"g": 5.0, "d": 0.0}, ts=TS, throw=False)
-    traj = jax.jit(jax.vmap(run))(np.array([5.0, 4.0]))
-    assert np.isnan(traj.q[:, 2]).all() and np.isinf(traj.scaled_error).all() and np.isfinite(traj.q[:, 0]).all()
-    swept = lj.sweep(lambda point: run(point["h"]).q[-1, 1], {"h": np.array([5.0, 4.0])}, progress=False)
-    assert np.isnan(swept.values).all()
-
-
-row = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
-gaps = [
-    lj.Switch("fly", to="fly", when=lj.touches(lambda t, q, p, i=i: q[i + 1] - q[i] - 0.2, lambda s: 1.0 + 0 * s))
-    for i in range(2)
-]
-cradle = lj.Hybrid({"fly": row}, gaps)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "q, v, right, count",
-    [
-        ([-0.3, 0.1, 0.3], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2),
-        ([-0.3, -0.1, 0.3], [1.0, 1.0, 0.0], [0.0, 1.0, 1.0], 2),
-        # A gap of +5.6e-17, and none that closes.
-        ([0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0),
-        ([0.1, 0.3, 0.5], [-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], 0),
-        # Twin: what closes hits at once.
-        ([0.1, 0.3, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2),
-        ([0.1, 0.3, 0.5], [1.0, 0.0, -1.0], [-1.0, 0.0, 1.0], 3),
-    ],
-)
-def test_three_balls_that_touch(q, v, right, count):
-    """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
-    traj = lj.integrate(cradle, np.array(q), np.array(v), ts=[0.0, 0.5])
-    np.testing.assert_allclose(traj.v[-1], right, atol=1e-14)
-    assert isinstance(traj, lj.HybridTrajectory)
-    assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
-
-
 @pytest.mark.slow
 def test_steps_that_collapse():
     """A fall into a centre: nothing is finite after the failure; at(t) refuses."""

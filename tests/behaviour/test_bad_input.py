@@ -16,39 +16,28 @@ def refusal(kind, *parts):
     return pytest.raises(kind, match=pattern)
 
 
-def test_wrong_structure():
-    """v lacks one of q's coordinates."""
-    with refusal(ValueError, "structure of q", "theta"):
-        lj.integrate(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 0.0}, ts=TS)
+UPRIGHT, REST = {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": 0.0}
+# Others, which are mistakes of beginners, are in `test_first_minutes.py`: the call, the error and parts of its message.
+REFUSED = {
+    "another shape": (rod_pendulum, UPRIGHT | {"y": np.zeros(2)}, REST, ValueError, "'y'", r"\(2,\)"),
+    "a function": (sphere, {"psi": lambda: 1.0, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, TypeError, "a function"),
+    "a set": (sphere, {"psi": {1.0}, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, TypeError, "{1.0}", "Usual cause"),
+    **{f"nothing, {x!r}": (pendulum, x, x, ValueError, "q has no coordinates") for x in (None, {}, [], np.zeros(0))},
+    "NaN": (rod_pendulum, UPRIGHT, REST | {"y": np.nan}, ValueError, "'y' of v0 is nan"),
+    "off the rod": (
+        rod_pendulum, {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}, ValueError, "off the constraints", "'rod' = 0.138",
+        "d/dt 'rod'", "consistent_state",
+    ),
+    "the Lagrangian alone": (pendulum.lagrangian, 1.0, 0.0, TypeError, "lj.System"),
+}  # fmt: skip
 
 
-def test_wrong_shape():
-    """v has another shape than q: the message names the coordinate."""
-    with refusal(ValueError, "'y'", r"\(2,\)"):
-        lj.integrate(rod_pendulum, {"x": 1.0, "y": np.zeros(2)}, {"x": 0.0, "y": 0.0}, PARAMS, ts=TS)
-
-
-def test_no_numbers_in_the_start():
-    """A condition, text or a function as a coordinate is named, with what may have been meant."""
-    for start, words in ((True, "'psi' of q is bool"), ("1.0", "'1.0'"), (lambda: 1.0, "a function"), ({1.0}, "{1.0}")):
-        with refusal(TypeError, words, "Usual cause"):
-            lj.integrate(sphere, {"psi": start, "theta": 0.0}, {"psi": 0.0, "theta": 1.0}, ts=TS)
-    for start in (None, {}, [], np.zeros(0)):
-        with refusal(ValueError, "q has no coordinates"):
-            lj.integrate(pendulum, start, start, PARAMS, ts=TS)
-
-
-def test_nan_in_the_start():
-    """A NaN coordinate is named."""
-    with refusal(ValueError, "'y' of v0 is nan"):
-        lj.integrate(rod_pendulum, {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": np.nan}, PARAMS, ts=TS)
-
-
-def test_start_off_the_constraint():
-    """An inconsistent start is refused, with the residuals of positions and velocities and with the remedy."""
-    q0, v0 = {"x": 1.3, "y": 0.1}, {"x": 0.2, "y": -1.0}
-    with refusal(ValueError, "off the constraints", "'rod' = 0.138", "d/dt 'rod'", "consistent_state"):
-        lj.integrate(rod_pendulum, q0, v0, PARAMS, ts=TS)
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_refused(case):
+    """A start that is none, or is off the constraints, is named with a fix."""
+    system, q, v, kind, *parts = REFUSED[case]
+    with refusal(kind, *parts):
+        lj.integrate(system, q, v, PARAMS, ts=TS)
 
 
 @pytest.mark.exhaustive
@@ -73,9 +62,3 @@ def test_unreachable_constraint():
     system = lj.System(rod_pendulum.lagrangian, {"ghost": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + 1.0)})
     with refusal(ValueError, "no consistent state", "'ghost'"):
         lj.consistent_state(system, 0.0, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, PARAMS)
-
-
-def test_not_a_system():
-    """The Lagrangian itself is passed instead of the system."""
-    with refusal(TypeError, "lj.System"):
-        lj.integrate(pendulum.lagrangian, 1.0, 0.0, PARAMS, ts=TS)

@@ -106,20 +106,6 @@ def pushed(function, composition):
 
 
 @pytest.mark.exhaustive
-def test_a_curvature_in_closed_form():
-    """Of an oscillator of stiffness p·k: u·H·w is the second derivative by the stiffness, times (u·k)(w·k)."""
-    k = np.linspace(0.5, 1.5, P.size)
-    oscillator = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * (p @ k) * q**2)
-    loss = lambda p: jnp.sum(lj.integrate(oscillator, 0.5, 0.0, p, ts=TS, rtol=1e-10, estimate_error=False).q ** 2)
-    exact = lambda s: 0.25 * np.sum(np.cos(np.sqrt(s) * TS) ** 2)
-    found = jax.jit(lambda p: jax.jvp(jax.grad(loss), (p,), (W,))[1] @ U)(P + 0.2)
-    s, h = (P + 0.2) @ k, 1e-3
-    weights = np.array([-1, 16, -30, 16, -1]) / (12 * h**2)
-    second = sum(w * exact(s + i * h) for i, w in zip(range(-2, 3), weights))
-    np.testing.assert_allclose(found, second * (U @ k) * (W @ k), rtol=1e-6)
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("composition", ALL)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_compositions(motion, composition):

@@ -20,7 +20,7 @@ import pytest
 import lagjax as lj
 from lagjax.files import npz
 from lagjax.files import table as file_table
-from lagjax.sweep import chunks, metadata, result, store
+from lagjax.sweep import chunks, metadata, store
 from tests import mutated
 from tests.by_hand import with_problem
 from tests.mutated import describe, mutated_file, mutated_store
@@ -169,16 +169,18 @@ def good(tmp_path_factory):
     return folder
 
 
-def test_changed_files(good, tmp_path):
-    """Seventy changed trajectory files, some of which can be read."""
-    wrong, read = attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, range(70))
-    assert wrong == [] and 0 < read < 40
+@pytest.mark.parametrize("numbers", [range(70), pytest.param(range(1000, 1500), marks=pytest.mark.exhaustive)])
+def test_changed_files(good, tmp_path, numbers):
+    """Changed trajectory files, some of which can be read."""
+    wrong, read = attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, numbers)
+    assert wrong == [] and 0 < read < 0.6 * len(numbers)
 
 
-def test_changed_stores(good, tmp_path):
-    """Thirty changed stores, some of which can be read."""
-    wrong, read = attack_stores(good / "store", tmp_path, range(30))
-    assert wrong == [] and 0 < read < 25
+@pytest.mark.parametrize("numbers", [range(30), pytest.param(range(1000, 1300), marks=pytest.mark.exhaustive)])
+def test_changed_stores(good, tmp_path, numbers):
+    """Changed stores, some of which can be read."""
+    wrong, read = attack_stores(good / "store", tmp_path, numbers)
+    assert wrong == [] and 0 < read < 0.85 * len(numbers)
 
 
 def changed(good, path, change):
@@ -295,58 +297,16 @@ def by_link(path):
     (path / "n/c/1/0").symlink_to(path.parent / "moved")
 
 
-def bomb(path):
-    """A store with a block of a kilobyte that says it has 24 MB."""
-    data = mutated.Zstd(level=1).encode(bytes(24_000_000))
-    (path / "y/c/1/0/0").write_bytes(data + mutated.crc32c(data).to_bytes(4, "little"))
-    mutated.mark(path, "y", 1)
-
-
 @pytest.mark.exhaustive
-def test_stores_that_reach_out(good, tmp_path, monkeypatch):
-    """A store writes nothing, reads nothing outside of it, and takes no more memory than its files have room for.
-
-    Twins: without each check, or with an opening that restores metadata, it is told what happened.
-    """
+def test_a_store_that_claims_more(good, tmp_path, monkeypatch):
+    """It takes no more memory than its files have room for; twin: without that check it does."""
     read_store(good / "store")
-
-    def wrong_with(change):
-        folder = tmp_path / "attacked"
-        shutil.copytree(good / "store", folder / "store")
-        change(folder / "store")
-        wrong, _ = attempt(lambda: read_store(folder / "store"), folder, 20_000, inside=folder / "store")
-        shutil.rmtree(folder)
-        return " ".join(wrong)
-
-    changes = {"grid": lambda path: larger_grid(path, 1500), "outside": outside, "link": by_link, "bomb": bomb}
-    changes["metadata"] = lambda path: (path / "y/zarr.json").write_text("{")
-    for change in changes.values():
-        assert wrong_with(change) == ""
-    assert wrong_with(lambda path: None) == ""
-    with monkeypatch.context() as patch:
-        patch.setattr(store, "check_room", lambda *args: None)
-        assert "took " in wrong_with(changes["grid"])
-    with monkeypatch.context() as patch:
-        patch.setattr(store, "check_files", lambda path: 10**9)
-        assert "/moved" in wrong_with(changes["link"]) or "opened " in wrong_with(changes["link"])
-    with monkeypatch.context() as patch:
-        # An opening that restores: it writes, and outside of the store if names are not checked.
-        restoring = lambda path, about: dict(enumerate(metadata.restore(path, about)))
-        patch.setattr(result, "damaged", restoring)
-        assert "wrote " in wrong_with(changes["metadata"])
-        assert wrong_with(changes["outside"]) == ""
-        patch.setattr(metadata, "_is_inside", lambda name: True)
-        assert "outside" in wrong_with(changes["outside"])
-    with monkeypatch.context() as patch:
-        patch.setattr(store, "read_chunk", trusting)
-        assert "took " in wrong_with(changes["bomb"])
-
-
-def trusting(file, spec):
-    """Twin of `read_chunk`: it believes what a file says of itself."""
-    data = file.read_bytes()[:-4]
-    data = bytes(mutated.Zstd().decode(data)) if spec.compressed else data
-    return np.frombuffer(data, spec.dtype)[: int(np.prod(spec.chunk))].reshape(spec.chunk)
+    shutil.copytree(good / "store", tmp_path / "store")
+    larger_grid(tmp_path / "store", 1500)
+    attack = lambda: attempt(lambda: read_store(tmp_path / "store"), tmp_path, 20_000, inside=tmp_path / "store")[0]
+    assert attack() == []
+    monkeypatch.setattr(store, "check_room", lambda *args: None)
+    assert any(line.startswith("took ") for line in attack())
 
 
 def test_a_sweep_continues_inside_its_store(good, tmp_path):
@@ -365,19 +325,6 @@ def test_a_sweep_continues_inside_its_store(good, tmp_path):
     (tmp_path / "in" / "store" / "y" / "zarr.json").unlink()
     with pytest.warns(UserWarning, match="It has been restored"):
         assert again().ok.all()
-
-
-@pytest.mark.exhaustive
-def test_five_hundred_changed_files(good, tmp_path):
-    """The same for trajectories, longer."""
-    numbers = range(1000, 1500)
-    assert attack_files("trajectory", lj.load_trajectory, good / "trajectory.npz", tmp_path, numbers)[0] == []
-
-
-@pytest.mark.exhaustive
-def test_three_hundred_changed_stores(good, tmp_path):
-    """The same for stores, longer."""
-    assert attack_stores(good / "store", tmp_path, range(1000, 1300))[0] == []
 
 
 @pytest.mark.exhaustive

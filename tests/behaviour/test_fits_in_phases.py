@@ -32,22 +32,6 @@ def test_what_a_bounce_leaves():
     assert found.motion().events["switches"].count == 3
 
 
-KEPT = 0.8
-
-
-@pytest.mark.exhaustive
-def test_what_a_switch_reads_may_change(monkeypatch):
-    """A fit uses the current value of a global restitution: with another one the measurements no longer fit."""
-    reset = lambda t, q, v, params: -KEPT * v
-    system = lj.Hybrid({"flies": falling}, [lj.Switch("flies", to="flies", when=bounce.when, reset=reset)])
-    record = lj.Record(TS, q=bounced(9.81, 0.8), sigma=0.01)
-    found = lambda: float(lj.fit(system, record, {"g": 9.7}, restarts=0, progress=False).cost)
-    assert found() < 1e-9
-    monkeypatch.setitem(globals(), "KEPT", 0.6)
-    with pytest.warns(lj.FitWarning):
-        assert found() > 1.0
-
-
 def test_refused_in_words():
     """Windows, which would start in unknown phases, and an unknown phase are refused."""
     record = lj.Record(TS, q=bounced(9.81, 0.8))

@@ -291,43 +291,36 @@ def canvas_beside(svg: str, browser, tmp_path, text: str, *keys: str):
     return np.mean(np.abs(pixels(page, tmp_path)[:250] - by_python[:250])), label
 
 
-def test_the_canvas_shows_what_the_first_frame_does(browser, tmp_path):
-    """Painted by the script, a frame has the pixels of the SVG that Python paints, but for edges.
+TUMBLING = tumbling()[1].at(slice(40, 41))
+ALONE = Still(TUMBLING.finished(frames=True), (-60.0, 22.0))._repr_html_()
+FIRST = Animation(tumbling()[0][40:], tumbling()[1].at(slice(40, None)), 25.0, 0)._repr_html_()
 
-    Twins: seen from five degrees to the side, or with a sign wrong in the rotation, it has not.
+
+@pytest.mark.parametrize(
+    ("text", "label", "right", "wrong"),
+    [
+        (FIRST, "Motion in space of box, ball, wire, t = ", "2 * (x * y + w * z)", "2 * (x * y - w * z)"),
+        (ALONE, "Picture in space of box, ball, wire. ", '["mark", "gap"].includes(shape.kind)', "false"),
+    ],
+    ids=["first frame", "still"],
+)
+def test_the_canvas_shows_what_python_paints(browser, tmp_path, text, label, right, wrong):
+    """Painted by the script, a frame or a state has the pixels of the SVG that Python paints, but for edges.
+
+    Twins: seen from five degrees to the side, with a sign wrong in the rotation, or with marks behind what is before
+    them, it has not.
     """
-    t, motion = tumbling()
-    text = Animation(t[40:], motion.at(slice(40, None)), 25.0, 0)._repr_html_()
     svg = re.search(r"<svg.*?</svg>", text, re.DOTALL)
-    assert svg is not None
+    assert svg is not None and ("<button" in text) == (text is FIRST)
 
     def differ(text: str, *keys: str):
-        return canvas_beside(svg[0], browser, tmp_path, text, *keys)[0]
-
-    near, sign = differ(text), "2 * (x * y + w * z)"
-    assert near < 0.002 and text.count(sign) == 1
-    assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(sign, "2 * (x * y - w * z)")) > 3 * near
-
-
-def test_a_still(browser, tmp_path):
-    """A state has no controls, turns by keys, and shows marks inside of a box, as the SVG that Python paints.
-
-    Twin: with marks in their place, not in front, it does not.
-    """
-    _, motion = tumbling()
-    frame = motion.at(slice(40, 41))
-    text = Still(frame.finished(frames=True), (-60.0, 22.0))._repr_html_()
-    svg = re.search(r"<svg.*?</svg>", text, re.DOTALL)
-    assert svg is not None and "<button" not in text
-
-    def differ(text: str, *keys: str):
-        difference, label = canvas_beside(svg[0], browser, tmp_path, text, *keys)
-        assert label.startswith("Picture in space of box, ball, wire. ")
+        difference, said = canvas_beside(svg[0], browser, tmp_path, text, *keys)
+        assert said.startswith(label)
         return difference
 
-    near, ahead = differ(text), '["mark", "gap"].includes(shape.kind)'
-    assert near < 0.002 and text.count(ahead) == 1
-    assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(ahead, "false")) > 1.5 * near
+    near = differ(text)
+    assert near < 0.002 and text.count(right) == 1
+    assert differ(text, "ArrowRight") > 5 * near and differ(text.replace(right, wrong)) > 1.5 * near
 
 
 def test_a_film_in_space_turns_and_zooms(browser, tmp_path):
@@ -380,21 +373,4 @@ def test_a_film_in_space_turns_and_zooms(browser, tmp_path):
     assert page.run(f"{canvas}.ariaLabel").startswith("Motion in space of box, ball, wire, t = 1.00")
     page.press(" ")
     page.wait(f"!{canvas}.ariaLabel.includes('t = 1.00')")
-    assert page.complaints() == []
-
-
-def test_lanes_in_space(browser, tmp_path):
-    """A lane with twice the radius is drawn at twice the size; one without a motion says so."""
-    t, points = circle(3)
-    body, spec = film(t, {name: np.concatenate([x, 0 * x[..., :1]], axis=-1) for name, x in points.items()}, 25.0, 0)
-    html = fragment(body, {"film": spec}, film_scripts(spec), "window.show = film(root, spec.film);")
-    page = opened(browser, tmp_path, whole("Lanes", html), width=700)
-    blue = []
-    for lane in (0, 1):
-        page.run(f"show({lane})")
-        blue.append(np.sum(pixels(page, tmp_path)[..., 2] - pixels(page, tmp_path)[..., 0] > 0.5))
-    page.run("show(2)")
-    assert 1.4 < blue[1] / blue[0] < 2.1 and "no motion to draw" in page.run(
-        "document.querySelector('canvas').ariaLabel"
-    )
     assert page.complaints() == []

@@ -115,22 +115,3 @@ def test_failures_sweeps_and_fits_in_a_mode(mode):
     assert np.isclose(swept.values[0], np.cos(TS[-1]), atol=1e-8) and np.isnan(swept.values[1])
     assert np.allclose(stiff.q, np.cos(TS), atol=1e-6)
     assert np.isclose(found.params["k"], 1.5**2 * m, rtol=1e-4)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("half", exhaustive_but((jnp.float16,), (jnp.float16, jnp.bfloat16)))
-def test_networks_in_half_precision(half):
-    """Parameters in half precision give the motion of their values, and slopes in their dtype; twin: other values."""
-    stiffness = lambda t, q, v, params: 0.5 * v**2 - 0.5 * jnp.sum(params["w"] @ params["w"]) * q**2
-
-    def end(params, q0=np.float32(1.0)):
-        return lj.integrate(lj.System(stiffness), q0, np.float32(0.0), params, ts=TS).q[-1]
-
-    # 0.5 and 1.5 are exact in half precision.
-    w = {"w": jnp.array([0.5, 1.5], half)}
-    rate = np.sqrt(2.5)
-    slope = -TS[-1] * np.sin(rate * TS[-1]) / rate * np.array([0.5, 1.5])
-    found, slopes = jax.value_and_grad(end)(w)
-    assert found.dtype == jnp.float32 and np.isclose(found, np.cos(rate * TS[-1]), atol=1e-4)
-    assert slopes["w"].dtype == half and np.allclose(slopes["w"].astype(np.float32), slope, rtol=0.02)
-    assert not np.isclose(end({"w": jnp.array([0.5, 1.25], half)}), found, atol=1e-2)

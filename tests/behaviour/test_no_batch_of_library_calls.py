@@ -146,31 +146,3 @@ def test_no_batches_from_python(plain, tmp_path):
     texts = programs_of(EAGER, tmp_path, LAGJAX_PLAIN=plain)
     assert sum(len(calls_in(text)) for text in texts) > 0
     assert [batches_in(text) for text in texts if batches_in(text)] == []
-
-
-MECHANISM = """
-import jax
-jax.config.update("jax_enable_x64", True)
-import jax.numpy as jnp, numpy as np, lagjax as lj
-for count, pins in MECHANISMS:
-    turns = np.random.default_rng(count).uniform(-1.0, 1.0, count)
-    ends = np.cumsum(np.stack([np.cos(turns), np.sin(turns)], 1), axis=0)
-    q, pinned = jnp.asarray(ends[: count - pins]), jnp.asarray(ends[count - pins :])
-    rods = lambda t, q, p: jnp.sum(jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2)), append=pinned) ** 2, axis=1) - 1.0
-    system = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - jnp.sum(q[:, 1]), {"rods": lj.Holonomic(rods)})
-    motion = lj.integrate(system, q, jnp.zeros_like(q), ts=jnp.linspace(0.0, 0.05, 65), rtol=1e-6)
-    assert motion.multipliers["rods"].shape[1] == count
-    assert float(jnp.max(jnp.abs(lj.energy_ledger(motion).closure))) < 1e-6
-print("ended")
-"""
-
-
-# Chains of so many rods that hang from one end, and such whose other end is pinned too: (equations, pins there).
-MECHANISMS = [(count, 0) for count in range(8, 41)] + [(count, 1) for count in range(8, 41, 2)]
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("first", range(0, len(MECHANISMS), 2))
-def test_mechanisms_end(first, tmp_path):
-    """Fifty chains of 8 to 40 rods: motion and ledger end on two cores, and the energies close."""
-    programs_of(MECHANISM.replace("MECHANISMS", str(MECHANISMS[first : first + 2])), tmp_path)

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import saddle_point
-from lagjax.system import constraints
 from tests.by_numpy import by_numpy, equations
 from tests.tiers import exhaustive_but
 
@@ -82,7 +80,7 @@ def disk_exact(params, start, t):
 
 
 # A sledge on one blade: contact point (x, y), heading α, centre of mass at the distance a ahead of the blade; gravity g
-# along x. With g = 0 it is Chaplygin's sleigh, with a = 0 the skate on an incline.
+# along x. With g = 0 it is Chaplygin's sleigh.
 
 
 def sledge_lagrangian(t, q, v, params):
@@ -101,7 +99,6 @@ def blade(t, q, v, params):
 sledge = lj.System(sledge_lagrangian, {"blade": lj.Nonholonomic(blade)})
 # I = 3 m a² makes the sleigh's positions elementary: its heading is then 2 gd(s).
 SLEIGH = {"m": 1.25, "a": 0.5, "I": 3 * 1.25 * 0.5**2, "g": 0.0}
-SKATE = {"m": 1.25, "a": 0.0, "I": 0.625, "g": 9.8125}
 OUTPUTS = 21
 
 
@@ -121,35 +118,9 @@ def sleigh_exact(params, t, speed=1.5, first=-1.25):
     return jnp.stack([heading, x, y]), v, params["m"] * u * turn * (1 - a**2 / b**2)
 
 
-def skate_exact(params, t, turn=1.5, speed=0.0):
-    """(heading, x, y), their rates and λ of the skate: α = ω t, u̇ = g cos α; from rest a cycloid, across the slope.
-
-    Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, §I.3 and §III.2.
-    """
-    k, heading = params["g"] / turn, turn * t
-    u = speed + k * jnp.sin(heading)
-    x = (speed * jnp.sin(heading) + 0.5 * k * jnp.sin(heading) ** 2) / turn
-    y = (speed * (1 - jnp.cos(heading)) + k * (0.5 * heading - 0.25 * jnp.sin(2 * heading))) / turn
-    v = jnp.stack([turn * jnp.ones_like(t), u * jnp.cos(heading), u * jnp.sin(heading)])
-    return jnp.stack([heading, x, y]), v, params["m"] * (u * turn + params["g"] * jnp.sin(heading))
-
-
 def named(values):
     """A vector (heading, x, y) by name."""
     return dict(zip(("heading", "x", "y"), values))
-
-
-@pytest.mark.exhaustive
-def test_the_skate_does_not_go_downhill():
-    """From rest it never gets lower than g / (2 ω²), however long it slides: it drifts across, at g / (2 ω)."""
-    turn = 1.5
-    ts = np.linspace(0.0, 30.25 * np.pi / turn, OUTPUTS)
-    q, v, _ = by_numpy(skate_exact)(SKATE, ts, turn)
-    traj = lj.integrate(sledge, named(q[:, 0]), named(v[:, 0]), SKATE, ts=ts, rtol=1e-10, atol=1e-10)
-    lowest = SKATE["g"] / (2 * turn**2)
-    assert float(np.max(traj.q["x"])) < lowest * (1 + 1e-9)
-    assert float(np.min(traj.q["x"])) > -1e-8
-    np.testing.assert_allclose(traj.q["y"][-1], SKATE["g"] / (2 * turn) * (ts[-1] - 0.5 / turn), rtol=1e-10)
 
 
 # A particle that keeps its speed in a uniform field: a velocity constraint that is not linear in the velocity.
@@ -223,9 +194,7 @@ disk_form = lambda params, t: disk_exact(params, DISK_START, t)
 # The system, its velocity constraint and parameters, the closed form, the outputs, the errors that it would show.
 CLOSED = {
     "disk": (vertical_disk, disk_rolls, DISK | {"g": 6.25}, disk_form, np.linspace(0.0, 6.0, 25), (ALONG, ACROSS)),
-    "level disk": (vertical_disk, disk_rolls, DISK, disk_form, np.linspace(0.0, 6.0, 25), (ALONG, ACROSS)),
     "sleigh": (sledge, blade, SLEIGH, by_name(sleigh_exact), np.linspace(0.0, 4.0, OUTPUTS), (ALONG, ACROSS)),
-    "skate": (sledge, blade, SKATE, by_name(skate_exact), np.linspace(0.0, 4.0, OUTPUTS), (ALONG, ACROSS)),
     # Half of Chetaev's force does not change the motion of a single constraint but doubles μ.
     "cruise": (cruise, speed_kept, CRUISE, cruise_exact, np.array([0.0, 0.5, 1.0, 2.0]), (ALONG,)),
     "driven": (driven, driving, DRIVEN, driven_exact, np.linspace(0.0, 4.0, 9), (ALONG, ACROSS, "no d(phi)/dt")),
@@ -310,51 +279,6 @@ tilting_disk = lj.System(
 COIN = {"m": 1.25, "R": 0.5, "I1": 1.25 * 0.5**2 / 4, "I3": 1.25 * 0.5**2 / 2, "g": 9.8125}
 
 
-def steady_spin(params, tilt, turn):
-    """ω₃ of steady rolling: (I₃ + m R²) ω₃ Ω sin θ - I₁ Ω² sin θ cos θ + m g R cos θ = 0."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    weight = params["I1"] * turn**2 * s * c - params["m"] * params["g"] * params["R"] * c
-    return weight / ((params["I3"] + params["m"] * params["R"] ** 2) * turn * s)
-
-
-def coin_by_hand(params, y0, ts):
-    """The rolling disk reduced to (α, θ, ω_h, ω_d, ω_n, x, y), and its contact forces m (r̈ + g ẑ), by SciPy.
-
-    Angular momentum about the centre in the frame (h, d, n), the force of the contact eliminated:
-
-        (I₁ + m R²) u̇ = I₁ p² cot θ - (I₃ + m R²) p w - m g R cos θ
-        I₁ ṗ = I₃ u w - I₁ u p cot θ,    (I₃ + m R²) ẇ = m R² u p,    u = θ̇, p = α̇ sin θ, w = ω₃
-
-    Source: Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, §III.3 (a disk on a plane).
-    """
-    integrate = pytest.importorskip("scipy.integrate")
-    m, radius, first, third, g = (params[name] for name in ("m", "R", "I1", "I3", "g"))
-    inertia = m * radius**2
-
-    def rates(y):
-        heading, tilt, u, p, w = y[:5]
-        cot = np.cos(tilt) / np.sin(tilt)
-        du = (first * p**2 * cot - (third + inertia) * p * w - m * g * radius * np.cos(tilt)) / (first + inertia)
-        dp = third / first * u * w - u * p * cot
-        dw = inertia * u * p / (third + inertia)
-        sideways = -u * np.sin(tilt)
-        vx = radius * (-sideways * np.sin(heading) - w * np.cos(heading))
-        vy = radius * (sideways * np.cos(heading) - w * np.sin(heading))
-        return np.array([p / np.sin(tilt), u, du, dp, dw, vx, vy])
-
-    y = integrate.solve_ivp(lambda t, y: rates(y), (ts[0], ts[-1]), y0, "DOP853", ts, rtol=1e-13, atol=1e-13).y
-    heading, tilt, u, p, w = y[:5]
-    du, dw = rates(y)[[2, 4]]
-    # r̈ in the frame (h, d, n), then its components ahead, across and up.
-    ahead, along, axial = (
-        radius * part for part in (p * u - dw, -p * w * np.cos(tilt) / np.sin(tilt) - u**2, du + p * w)
-    )
-    across = along * np.cos(tilt) - axial * np.sin(tilt)
-    up = along * np.sin(tilt) + axial * np.cos(tilt)
-    c, s = np.cos(heading), np.sin(heading)
-    return y, m * np.stack([c * ahead - s * across, s * ahead + c * across, up + g])
-
-
 def coin_state(params, heading, tilt, u, p, w, x=0.0, y=0.0):
     """(q, v) of the rolling disk with angular velocity u h + p d + w n."""
     radius, turn, sideways = params["R"], p / np.sin(tilt), -u * np.sin(tilt)
@@ -371,203 +295,6 @@ def coin_state(params, heading, tilt, u, p, w, x=0.0, y=0.0):
     return q, v
 
 
-COIN_TS = np.linspace(0.0, 3.0, 16)
-
-
-@pytest.mark.exhaustive
-def test_tilted_disk_rolls_steadily():
-    """At the spin required by its tilt, a disk rolls on a circle; the contact carries m g, and m R ω₃ Ω inwards."""
-    tilt, turn = 1.125, 2.5
-    spin = steady_spin(COIN, tilt, turn)
-    q0, v0 = coin_state(COIN, 0.0, tilt, 0.0, turn * np.sin(tilt), spin)
-    traj = lj.integrate(tilting_disk, q0, v0, COIN, ts=COIN_TS, rtol=1e-11, atol=1e-11)
-    angle = turn * COIN_TS
-    c, s = np.cos(angle), np.sin(angle)
-    circle = -COIN["R"] * spin / turn
-    force = -COIN["m"] * COIN["R"] * spin * turn
-    expected = {
-        "heading": angle,
-        "tilt": np.full_like(angle, tilt),
-        "x": circle * s,
-        "y": circle * (1 - c),
-        "z": np.full_like(angle, COIN["R"] * np.sin(tilt)),
-    }
-    for name, values in expected.items():
-        np.testing.assert_allclose(traj.q[name], values, atol=1e-11, err_msg=name)
-    np.testing.assert_allclose(traj.multipliers["contact"], COIN["m"] * COIN["g"], rtol=1e-11)
-    np.testing.assert_allclose(traj.multipliers["rolling"], np.stack([-s, c], axis=-1) * force, atol=1e-10)
-    # With ω₃ of the opposite sign the relation does not hold, and the disk falls over.
-    fallen = lj.integrate(
-        tilting_disk, *coin_state(COIN, 0.0, tilt, 0.0, turn * np.sin(tilt), -spin), COIN, ts=COIN_TS[:16] / 20
-    )
-    assert np.max(np.abs(fallen.q["tilt"] - tilt)) > 0.05
-
-
-@pytest.mark.exhaustive
-def test_wobbling_disk():
-    """A disk that tilts while it rolls follows the reduced equations; λ and the rolling force balance its momentum."""
-    y0 = np.array([0.25, 1.25, 0.375, 1.5, -6.0, 0.0, 0.0])
-    y, force = coin_by_hand(COIN, y0, COIN_TS)
-    q0, v0 = coin_state(COIN, *y0)
-    run = lambda tol: lj.integrate(tilting_disk, q0, v0, COIN, ts=COIN_TS, rtol=tol, atol=tol)
-    tight, loose = run(TIGHT), run(LOOSE)
-    found = [tight.q["heading"], tight.q["tilt"], tight.v["tilt"], tight.q["x"], tight.q["y"]]
-    assert departure(found, y[[0, 1, 2, 5, 6]]) < 1e-10
-    assert departure(tight.multipliers["rolling"].T, force[:2]) < 1e-9
-    assert departure([tight.multipliers["contact"]], force[2:]) < 1e-9
-    # The disk really wobbles, and so does the contact force.
-    assert np.ptp(y[1]) > 0.05 and np.ptp(force[2]) > 1.0
-    assert float(tight.drift()) < 1e-10
-    assert float(loose.residual()) < ROUND_OFF
-
-
-# A ball on a turntable whose speed changes: explicit time in a rolling constraint.
-
-
-def ball_lagrangian(t, q, v, params):
-    """L = ½ m (ẋ² + ẏ²) + ½ I |ω|², Euler's angles: |ω|² = θ̇² + φ̇² + ψ̇² + 2 φ̇ ψ̇ cos θ."""
-    centre = 0.5 * params["m"] * (v["x"] ** 2 + v["y"] ** 2)
-    angular = v["theta"] ** 2 + v["phi"] ** 2 + v["psi"] ** 2 + 2 * v["phi"] * v["psi"] * jnp.cos(q["theta"])
-    return centre + 0.5 * params["beta"] * params["m"] * params["a"] ** 2 * angular
-
-
-def table_speed(t, params):
-    """Ω(t) = Ω₀ + Ω₁ cos(ν t)."""
-    return params["mean"] + params["swing"] * jnp.cos(params["nu"] * t)
-
-
-def rolls_on_table(t, q, v, params):
-    """ṙ - a ω × ẑ = Ω(t) ẑ × r."""
-    c, s = jnp.cos(q["phi"]), jnp.sin(q["phi"])
-    omega_x = v["theta"] * c + v["psi"] * jnp.sin(q["theta"]) * s
-    omega_y = v["theta"] * s - v["psi"] * jnp.sin(q["theta"]) * c
-    turn, a = table_speed(t, params), params["a"]
-    return jnp.stack([v["x"] - a * omega_y + turn * q["y"], v["y"] + a * omega_x - turn * q["x"]])
-
-
-turntable = lj.System(ball_lagrangian, {"rolling": lj.Nonholonomic(rolls_on_table)})
-TABLE = {"m": 1.5, "a": 0.25, "beta": 0.4, "mean": 3.0, "swing": 1.25, "nu": 2.0}
-
-
-def ball_exact(params, ts, start, rate):
-    """z = x + i y, ż, z̈ of the ball's centre: ż - i k Ω(t) z is constant, k = β / (1 + β) (2/7 for a solid ball)."""
-    k, mean, swing, nu = params["beta"] / (1 + params["beta"]), params["mean"], params["swing"], params["nu"]
-    turned = lambda t: k * (mean * t + swing * np.sin(nu * t) / nu)
-    speed, change = k * (mean + swing * np.cos(nu * ts)), -k * swing * nu * np.sin(nu * ts)
-    constant = rate - 1j * speed[0] * start
-    nodes, weights = np.polynomial.legendre.leggauss(60)
-    history = np.array([t / 2 * np.sum(weights * np.exp(-1j * turned(t / 2 * (1 + nodes)))) for t in ts])
-    z = np.exp(1j * turned(ts)) * (start + constant * history)
-    dz = 1j * speed * z + constant
-    return z, dz, 1j * (change * z + speed * dz)
-
-
-@pytest.mark.exhaustive
-def test_ball_on_a_turntable_of_varying_speed():
-    """The ball's centre turns at 2/7 of the table's speed, even while that changes; λ is the friction m r̈."""
-    ts = np.linspace(0.0, 4.0, 17)
-    start, rate = 0.5 + 0.25j, 0.375 - 0.5j
-    z, dz, ddz = ball_exact(TABLE, ts, start, rate)
-    # i a (ω_x + i ω_y) = i Ω z - ż, with φ = 0: ω = (θ̇, -ψ̇ sin θ, φ̇ + ψ̇ cos θ).
-    omega = (1j * (TABLE["mean"] + TABLE["swing"]) * start - rate) / (1j * TABLE["a"])
-    theta, upright = 1.5, 0.75
-    psi_rate = -omega.imag / np.sin(theta)
-    q0 = {"phi": 0.0, "psi": 0.0, "theta": theta, "x": start.real, "y": start.imag}
-    v0 = {
-        "phi": upright - psi_rate * np.cos(theta),
-        "psi": psi_rate,
-        "theta": omega.real,
-        "x": rate.real,
-        "y": rate.imag,
-    }
-    run = lambda tol: lj.integrate(turntable, q0, v0, TABLE, ts=ts, rtol=tol, atol=tol)
-    tight, loose = run(TIGHT), run(LOOSE)
-    np.testing.assert_allclose(tight.q["x"] + 1j * tight.q["y"], z, atol=1e-10)
-    np.testing.assert_allclose(tight.v["x"] + 1j * tight.v["y"], dz, atol=1e-10)
-    np.testing.assert_allclose(tight.multipliers["rolling"] @ np.array([1, 1j]), TABLE["m"] * ddz, atol=1e-10)
-    np.testing.assert_allclose(tight.v["phi"] + tight.v["psi"] * np.cos(tight.q["theta"]), upright, atol=1e-10)
-    assert float(loose.residual()) < ROUND_OFF
-    # Without ∂phi/∂t the centre would turn at the mean speed: the swing must matter here.
-    steady = ball_exact(TABLE | {"swing": 0.0, "mean": TABLE["mean"] + TABLE["swing"]}, ts, start, rate)[0]
-    assert np.max(np.abs(steady - z)) > 0.3
-
-
-# A disk rolling inside a circle: the centre on a circle of radius ρ by a holonomic constraint, rolling by its velocity.
-
-
-def inside_lagrangian(t, q, v, params):
-    """L = ½ m (ẋ² + ẏ²) + ½ I φ̇² - m g y."""
-    m = params["m"]
-    return 0.5 * m * (v["x"] ** 2 + v["y"] ** 2) + 0.5 * params["I"] * v["angle"] ** 2 - m * params["g"] * q["y"]
-
-
-def on_circle(t, q, params):
-    """x² + y² - ρ²."""
-    return q["x"] ** 2 + q["y"] ** 2 - params["rho"] ** 2
-
-
-def rolls_inside(t, q, v, params):
-    """ρ θ̇ + R φ̇ = 0, written in x and y."""
-    return (q["x"] * v["y"] - q["y"] * v["x"]) / params["rho"] + params["R"] * v["angle"]
-
-
-rolling_inside = lj.System(
-    inside_lagrangian, {"circle": lj.Holonomic(on_circle), "rolling": lj.Nonholonomic(rolls_inside)}
-)
-INSIDE = {"m": 1.5, "rho": 1.25, "R": 0.25, "I": 0.0625, "g": 9.8125}
-
-
-@pytest.mark.exhaustive
-def test_semi_holonomic_rolling_over_a_long_run():
-    """After 100 swings ρ θ + R φ is unchanged within the tolerance, though only its rate is constrained."""
-    special = pytest.importorskip("scipy.special")
-    m, rho, radius, g = (INSIDE[name] for name in ("m", "rho", "R", "g"))
-    inertia = INSIDE["I"] / radius**2
-    rate, highest = np.sqrt(m * g / ((m + inertia) * rho)), 2.0
-    k = np.sin(highest / 2)
-    ts = np.linspace(0.0, 400 * special.ellipk(k**2) / rate, 401) * (1 + 1e-3)
-    # A pendulum released from rest: sin(θ/2) = k cd(w t), θ̇ = -2 k k' w sd(w t).
-    sn, cn, dn, _ = special.ellipj(rate * ts, k**2)
-    angle = 2 * np.arcsin(k * cn / dn)
-    turn = -2 * rate * k * np.sqrt(1 - k**2) * sn / dn
-    q0 = {"angle": 0.0, "x": rho * np.sin(highest), "y": -rho * np.cos(highest)}
-    v0 = {"angle": 0.0, "x": 0.0, "y": 0.0}
-    run = lambda tol: lj.integrate(rolling_inside, q0, v0, INSIDE, ts=ts, rtol=tol, atol=tol)
-    tight, loose = run(TIGHT), run(LOOSE)
-    found = np.arctan2(tight.q["x"], -tight.q["y"])
-    np.testing.assert_allclose(found, angle, atol=3e-7)
-    friction = inertia * rho * rate**2 * np.sin(angle)
-    np.testing.assert_allclose(tight.multipliers["rolling"], friction, atol=1e-6)
-    normal = -m * (rho * turn**2 + g * np.cos(angle)) / (2 * rho)
-    np.testing.assert_allclose(tight.multipliers["circle"], normal, atol=4e-6)
-    for traj, allowed in ((tight, 1e-8), (loose, 1e-2)):
-        invariant = rho * np.arctan2(traj.q["x"], -traj.q["y"]) + radius * np.asarray(traj.q["angle"])
-        assert np.max(np.abs(invariant - rho * highest)) < allowed
-        assert float(traj.residual()) < ROUND_OFF
-
-
-@pytest.mark.exhaustive
-def test_gradient_of_rolling_in_reverse():
-    """d(place + friction)/d(m, R, I, g, start) of the disk on an incline, reverse mode, is the closed form's."""
-    weights = np.array([0.75, -1.25, 0.5, 1.5])
-
-    def exact(params, start):
-        q, _, force = disk_exact(params, start, jnp.asarray([2.5]))
-        return weights @ jnp.concatenate([q["x"], q["y"], force[0]])
-
-    def final(params, start):
-        q0, v0, _ = jax.tree.map(lambda curve: curve[0], disk_exact(params, start, jnp.zeros(1)))
-        ts = np.array([0.0, 2.5])
-        traj = lj.integrate(vertical_disk, q0, v0, params, ts=ts, rtol=TIGHT, atol=TIGHT)
-        return weights @ jnp.stack([traj.q["x"][-1], traj.q["y"][-1], *traj.multipliers["rolling"][-1]])
-
-    at = (DISK | {"g": 6.25}, DISK_START)
-    expected = jax.jacfwd(exact, argnums=(0, 1))(*at)
-    for found, wanted in zip(jax.jit(jax.grad(final, argnums=(0, 1)))(*at), expected):
-        for name, value in wanted.items():
-            np.testing.assert_allclose(found[name], value, atol=1e-10, err_msg=name)
-
-
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("mode, options", [(jax.jacrev, {}), (jax.jacfwd, {"adjoint": diffrax.ForwardMode()})])
 def test_gradients_of_cruising(mode, options):
@@ -578,40 +305,3 @@ def test_gradients_of_cruising(mode, options):
     found, expected = jax.jit(mode(final))(CRUISE), jax.jacfwd(exact)(CRUISE)
     for name in CRUISE:
         np.testing.assert_allclose(found[name], expected[name], atol=2e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "flaw", exhaustive_but(("half Chetaev",), (None, "half Chetaev", "no d(phi)/dt", "no (d phi/dq) v"))
-)
-def test_an_error_in_the_equations_would_show(flaw, monkeypatch):
-    """With one of the usual errors built into the library itself, the driven particle leaves its closed form."""
-
-    def rows(model, t, x, u):
-        level = lambda t, x, u: constraints.velocity_residual(model, t, x, u)
-        time = jnp.where(flaw == "no d(phi)/dt", 0.0, jnp.ones_like(t))
-        along = jnp.where(flaw == "no (d phi/dq) v", 0.0, u)
-        _, rate = jax.jvp(lambda t, x: level(t, x, u), (t, x), (time, along))
-        return constraints.ConstraintRows(jax.jacfwd(level, argnums=2)(t, x, u), -rate)
-
-    solved = saddle_point.solve_saddle_point
-
-    def acting(*equations):
-        # One constraint's force does not depend on a factor in Aᵀ; its multiplier does.
-        a, multiplier = solved(*equations)
-        return a, multiplier / (0.5 if flaw == "half Chetaev" else 1.0)
-
-    linear = saddle_point.linear_equations
-    monkeypatch.setattr(saddle_point, "linear_equations", lambda *state: (linear(*state)[0], rows(*state)))
-    monkeypatch.setattr(saddle_point, "solve_saddle_point", acting)
-    # The parameters differ by `of`, so that the compiled programs of the true equations are not reused.
-    system = lj.System(thrown, {"drive": lj.Nonholonomic(driving)})
-    ts = np.linspace(0.0, 4.0, 9)
-    q, v, force = by_numpy(driven_exact)(DRIVEN, ts)
-    # A method that is not ours: the written-out equations would use their own elimination, not this one.
-    method = diffrax.Dopri8(scan_kind="lax")
-    traj = lj.integrate(
-        system, q[:, 0], v[:, 0], DRIVEN | {"of": str(flaw)}, ts=ts, rtol=TIGHT, atol=TIGHT, method=method
-    )
-    off = departure([traj.q.T, traj.v.T, traj.multipliers["drive"]], [q, v, force])
-    assert off < 1e-9 if flaw is None else off > 1.0

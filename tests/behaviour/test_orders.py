@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from jax.flatten_util import ravel_pytree
 
 import lagjax as lj
 from lagjax.numerics.methods.radau import SimplifiedNewton
@@ -121,9 +120,7 @@ OTHERS = [
     (diffrax.HalfSolver(diffrax.Heun()), 2, (100, 200, 400)),
 ]
 name_of = lambda value: type(value).__name__ if isinstance(value, diffrax.AbstractSolver) else None
-TIERS = {
-    ("Tsit5", "free"): pytest.mark.slow,
-}
+TIERS = {("Tsit5", "free"): pytest.mark.slow}
 
 
 def cases():
@@ -159,59 +156,3 @@ def test_a_lower_order_would_be_seen(exact, form, method, order, steps):
     lower = with_lower_weights(method)
     measured = orders(exact[form], steps, lambda n: computed(form, run(form, lower, 1 / n)))
     assert not any(within(order, measured)), measured
-
-
-@pytest.mark.exhaustive
-def test_cubic_outputs_would_be_seen(exact):
-    """Failing twin: the same steps with cubic outputs between them (as diffrax's Kvaerno5 has) show order four."""
-    every_second = {name: value[1::2] for name, value in exact["constrained"].items()}
-
-    def interpolated(n):
-        before = np.floor(OUTPUTS[1::2] * n) / n
-        around = run("constrained", diffrax.Tsit5(), 1 / n, np.concatenate([[0.0], *zip(before, before + 1 / n)]))
-        a = jax.vmap(lambda t, q, v: lj.accelerations(double_rods, t, q, v, DOUBLE_PARAMS)[0])(
-            around.t, around.q, around.v
-        )
-        s = ((OUTPUTS[1::2] - before) * n)[:, None]
-        return states(cubic(around.q, around.v, s, 1 / n), cubic(around.v, a, s, 1 / n))
-
-    measured = orders(every_second, FAST[0][2], interpolated)
-    assert not any(within(5, measured)) and max(measured.values()) < 4 + CLAIM, measured
-
-
-def cubic(y, slope, s, h):
-    """Hermite's cubic at the fractions s of the steps whose ends follow the start in y."""
-
-    def one(y, slope):
-        y0, y1, d0, d1 = y[1::2], y[2::2], h * slope[1::2], h * slope[2::2]
-        return np.asarray(y0 + s * d0 + s**2 * (3 * (y1 - y0) - 2 * d0 - d1) + s**3 * (2 * (y0 - y1) + d0 + d1))
-
-    return jax.tree.map(one, y, slope)
-
-
-@pytest.mark.exhaustive
-def test_gradients_through_a_thousand_constrained_steps():
-    """d(final state, multipliers)/d(parameters, start): finite, forward is reverse to 1e-8, a difference to 1e-6."""
-
-    def outcome(x):
-        q0, v0 = rods_from_angles(x["angles"], x["rates"], x["params"])
-        traj = lj.integrate(
-            double_rods, q0, v0, x["params"], ts=np.array([0.0, 8.0]), method=diffrax.Tsit5(), dt0=jnp.asarray(0.008),
-            stepsize_controller=diffrax.ConstantStepSize(), max_steps=1024, throw=False,
-        )  # fmt: skip
-        final = ravel_pytree((traj.end.q, traj.end.v, traj.end.multipliers))[0]
-        return final, traj.stats["num_accepted_steps"]
-
-    angles, rates = DOUBLE_SWING
-    x, unflatten = ravel_pytree({"angles": angles, "rates": rates, "params": DOUBLE_PARAMS})
-    final = jax.jit(lambda x: outcome(unflatten(x)))
-    assert int(final(x)[1]) in (1000, 1001)
-    forward, reverse = (jax.jit(jac(lambda x: final(x)[0]))(x) for jac in (jax.jacfwd, jax.jacrev))
-    assert np.all(np.isfinite(forward)) and np.all(np.isfinite(reverse))
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
-
-    # Fourth order on the same grid: its own error is near 1e-8 of the largest derivative.
-    step = 2.0**-10
-    at = jax.jit(lambda k: jax.lax.map(lambda e: final(x + k * step * e)[0], jnp.eye(x.size)))
-    difference = ((8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)).T
-    np.testing.assert_allclose(forward, difference, rtol=1e-6, atol=1e-6 * np.max(np.abs(forward)))

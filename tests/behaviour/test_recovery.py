@@ -1,4 +1,4 @@
-"""Fits of every scene find the truth, with the correct uncertainties."""
+"""Fits of scenes find the truth, with the correct uncertainties."""
 
 import jax
 import jax.numpy as jnp

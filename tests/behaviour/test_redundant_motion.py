@@ -1,31 +1,17 @@
 """Motion under redundant constraints: motion, derivatives and batches are those of the system without redundancy."""
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.mechanics.test_saddle_point import DOOR_STATE, RATE, door, twice
-from tests.systems import PARAMS, cartesian_lagrangian, rod, rod_pendulum
+from tests.mechanics.test_saddle_point import DOOR_STATE, RATE, door
+from tests.systems import PARAMS, cartesian_lagrangian, rod
 from tests.tiers import exhaustive_but
 
 TOLERANCE = 1e-10
 START = ({"x": 1.0, "y": 0.75}, {"x": -1.5, "y": 2.0})
-
-
-@pytest.mark.exhaustive
-def test_pendulum_on_two_rods():
-    """A rod given twice moves the pendulum as one does, and the two share its force in the ratio of their scales."""
-    ts = np.linspace(0.0, 5.0, 6)
-    run = lambda system: lj.integrate(system, *START, PARAMS, ts=ts, rtol=TOLERANCE, atol=TOLERANCE)
-    one, two = run(rod_pendulum), run(twice(-0.5))
-    for name in one.q:
-        np.testing.assert_allclose(two.q[name], one.q[name], atol=1e-9)
-    np.testing.assert_allclose(two.multipliers["rod"], one.multipliers["rod"] / 1.25, rtol=1e-8)
-    np.testing.assert_allclose(two.multipliers["again"], -0.5 * two.multipliers["rod"], rtol=1e-12)
-    assert float(two.residual()) < 1e-15
 
 
 @pytest.mark.exhaustive
@@ -45,47 +31,6 @@ def test_door_swings_like_its_angle(drift):
     np.testing.assert_allclose(outward[:, 0], np.cos(angle.q), atol=1e-8)
     np.testing.assert_allclose(outward[:, 1], np.sin(angle.q), atol=1e-8)
     assert float(traj.residual()) < (1e-14 if drift == "project" else 1e-7)
-
-
-def outcome(system, x):
-    """The end of the pendulum on its rods, and the total force of the rods."""
-    q = {"x": 0.8 * x["l"], "y": 0.6 * x["l"]}
-    v = {"x": -0.6 * x["v"], "y": 0.8 * x["v"]}
-    traj = lj.integrate(
-        system, q, v, {"g": x["g"], "l": x["l"]}, ts=np.array([0.0, 0.75]), rtol=TOLERANCE, atol=TOLERANCE, throw=False
-    )
-    return jnp.stack([traj.q["x"][-1], sum(scale * traj.multipliers[name][-1] for name, scale in SCALES.items())])
-
-
-SCALES = {"rod": 1.0, "again": 3.0}
-two_rods = lj.System(
-    cartesian_lagrangian,
-    {"rod": lj.Holonomic(rod), "again": lj.Holonomic(lambda t, q, params: 3.0 * rod(t, q, params))},
-)
-
-
-@pytest.mark.exhaustive
-def test_derivatives_in_lanes():
-    """Reverse derivatives of end and force, in a batch, are the forward ones of the pendulum in its angle."""
-    lanes = {"g": jnp.array([9.8, 5.0]), "l": jnp.array([1.25, 2.0]), "v": jnp.array([2.5, -1.0])}
-    one = lambda x: jnp.stack(outcome_of_one(x))
-    got = jax.vmap(jax.jacrev(lambda x: outcome(two_rods, x)))(lanes)
-    expected = jax.vmap(jax.jacfwd(one))(lanes)
-    for name in lanes:
-        assert np.all(np.isfinite(got[name]))
-        np.testing.assert_allclose(got[name], expected[name], atol=1e-7)
-
-
-def outcome_of_one(x):
-    """The pendulum in its angle: cos(angle) = x/l from the x axis, and the force that its rod exerts over 2 l."""
-    by_angle = lj.System(lambda t, q, v, params: 0.5 * params["l"] * v**2 - params["g"] * jnp.sin(q))
-    traj = lj.integrate(
-        by_angle, jnp.arctan2(0.6, 0.8), x["v"] / x["l"], {"g": x["g"], "l": x["l"]},
-        ts=np.array([0.0, 0.75]), rtol=1e-11, atol=1e-11, throw=False,
-    )  # fmt: skip
-    angle, rate = traj.q[-1], traj.v[-1]
-    inward = x["l"] * rate**2 - x["g"] * jnp.sin(angle)
-    return x["l"] * jnp.cos(angle), -inward / (2 * x["l"])
 
 
 @pytest.mark.exhaustive

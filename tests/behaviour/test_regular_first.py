@@ -1,6 +1,5 @@
 """Sweeps first assume regular motions: lanes that are not settled are computed entirely with the robust program."""
 
-import contextlib
 import threading
 from collections import Counter
 
@@ -73,16 +72,6 @@ def compiled(monkeypatch, request):
     return count
 
 
-@contextlib.contextmanager
-def all_robust(monkeypatch):
-    """Run sweeps with the robust program from the start."""
-    with monkeypatch.context() as changed:
-        changed.setattr(batch_program, "REGULAR_FIRST", lambda _: REGULAR_FIRST(False))
-        PROGRAMS.clear()
-        yield
-    PROGRAMS.clear()
-
-
 @pytest.mark.exhaustive
 @not_plain
 def test_lanes_that_are_not_regular(compiled):
@@ -94,14 +83,6 @@ def test_lanes_that_are_not_regular(compiled):
     np.testing.assert_array_equal(settled, BOTH["k"] > 1)
     np.testing.assert_array_equal(np.isnan(values), ~settled)
     assert not np.isin(status.result[~settled], batch_program.TRUSTED).any()
-
-
-@pytest.mark.exhaustive
-def test_where_all_are_regular(compiled):
-    """No robust program is compiled if all motions are regular."""
-    swept = quiet(first_coordinate, DEFINITE)
-    np.testing.assert_allclose(swept.values, exact(DEFINITE["k"]), rtol=1e-7)
-    assert swept.ok.all() and compiled == {"regular": 1}
 
 
 @pytest.mark.parametrize(("axes", "kinds"), [(DEFINITE, {"regular": 1}), (BOTH, {"regular": 1, "robust": 1})])
@@ -167,17 +148,9 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(
-    "derivative", exhaustive_but((jax.grad,), (jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f))))
-)
-def test_derivatives(derivative, compiled):
-    """Both modes, and `vmap` inside, give the exact derivatives. Twin: the first program alone gives NaN."""
-    motion = lambda k: saddle_motion(k).q[-1, 0]
-
-    def run(point):
-        many = jnp.stack([point["k"], 2.5 + 0.0 * point["k"]])
-        return derivative(motion)(many)[0] if derivative not in (jax.grad, jax.jacfwd) else derivative(motion)(many[0])
-
+def test_derivatives(compiled):
+    """In lanes inside of `run` they are exact. Twin: the first program alone gives NaN."""
+    run = lambda point: jax.vmap(jax.grad(lambda k: saddle_motion(k).q[-1, 0]))(jnp.stack([point["k"], 2.5]))[0]
     step = 1e-5
     slopes = (exact(BOTH["k"] + step) - exact(BOTH["k"] - step)) / (2 * step)
     np.testing.assert_allclose(quiet(run).values, slopes, rtol=1e-5)
@@ -210,57 +183,6 @@ def test_many_chunks_and_workers(compiled):
     program.irregular.clear()
     quiet(first_coordinate, many, chunk=4, workers=1)
     assert calls["regular"] == 1
-
-
-@pytest.mark.exhaustive
-def test_in_turn_and_resweep(compiled):
-    """Lanes one after the other, and points run again."""
-    swept = quiet(first_coordinate, layout="map")
-    np.testing.assert_allclose(swept.values, exact(BOTH["k"]), rtol=1e-7)
-    again = swept.resweep(lambda point: 2 * first_coordinate(point), where=BOTH["k"] < 3)
-    np.testing.assert_allclose(again.values, exact(BOTH["k"]) * np.where(BOTH["k"] < 3, 2, 1), rtol=1e-7)
-
-
-@pytest.mark.exhaustive
-def test_in_a_store(tmp_path, compiled):
-    """Same values; the store is recognised even when the first program is no longer called."""
-    pytest.importorskip("zarr")
-    path, whole = tmp_path / "sweep", quiet(first_coordinate, chunk=3)
-    half = quiet(first_coordinate, chunk=3, store=path, part=(0, 2))
-    assert half.ran == 3 and half.ok.sum() == 3
-    assert irregular_programs()
-    done = quiet(first_coordinate, chunk=3, store=path, part=(1, 2))
-    assert done.ran == 3 and done.ok.all()
-    np.testing.assert_allclose(done.values, whole.values, rtol=1e-13)
-    PROGRAMS.clear()
-    assert quiet(first_coordinate, chunk=3, store=path).ran == 0
-
-
-rod = lambda t, q, p: q["x"] ** 2 + q["y"] ** 2 - 1.0
-doubled = lj.System(
-    lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2 + v["z"] ** 2) - p["g"] * q["y"],
-    {"rod": lj.Holonomic(rod), "other": lj.Holonomic(lambda t, q, p: jnp.where(p["twice"], rod(t, q, p), q["z"]))},
-)
-
-
-@pytest.mark.exhaustive
-def test_a_constraint_written_twice(monkeypatch):
-    """Dependent constraints and invalid starts: values and statuses match those of the robust program alone."""
-
-    def values(point):
-        still = {"x": 0.0, "y": 0.0, "z": 0.0}
-        params = {"g": 9.81, "twice": point["twice"]}
-        traj = lj.integrate(doubled, still | {"x": point["x"]}, still, params, ts=jnp.linspace(0, 1, 3))
-        return traj.q["y"], traj.multipliers["rod"]
-
-    axes = {"twice": np.array([True, False]), "x": np.array([1.0, 1.2, np.nan])}
-    swept = quiet(values, axes)
-    with all_robust(monkeypatch):
-        expected = quiet(values, axes)
-    np.testing.assert_array_equal(swept.status.result, expected.status.result)
-    assert swept.ok[:, 0].all()
-    for found, other in zip(swept.values, expected.values):
-        np.testing.assert_allclose(found, other, rtol=1e-9, atol=1e-12)
 
 
 def test_a_fit_takes_nothing_for_regular():

@@ -50,27 +50,6 @@ def test_any_number_of_outputs(how):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("width", (16, 32, 63, 64, 65, 128))
-def test_networks_of_any_width(width):
-    """A network in `params` and one closed over, with derivatives, against SciPy with the network not rewritten."""
-    survives(f"""
-net = eqx.nn.MLP(2, "scalar", {width}, 2, activation=jnp.tanh, key=jax.random.key(0))
-energy = lambda q, v, net: 0.5 * v @ v - 0.5 * q @ q - 0.1 * net(q)
-given, closed = lj.System(lambda t, q, v, p: energy(q, v, p)), lj.System(lambda t, q, v, p: energy(q, v, net))
-q0, ts = jnp.array([0.3, 0.1]), np.linspace(0.0, 0.9, 3)
-from scipy.integrate import solve_ivp
-rate = jax.jit(lambda y: jnp.concatenate([y[2:], jax.grad(lambda q: energy(q, y[2:], net))(y[:2])]))
-start = np.array([0.3, 0.1, 0.0, 0.0])
-exact = solve_ivp(lambda t, y: np.asarray(rate(y)), (0, 0.9), start, "DOP853", ts, rtol=1e-12, atol=1e-12).y[:2].T
-agrees(lj.integrate(given, q0, jnp.zeros(2), net, ts=ts).q, exact)
-agrees(lj.integrate(closed, q0, jnp.zeros(2), ts=ts).q, exact)
-slope = jax.jit(jax.grad(lambda k: lj.integrate(given, k * q0, jnp.zeros(2), net, ts=ts).q[-1, 0]))(1.0)
-step = lambda k: lj.integrate(given, k * q0, jnp.zeros(2), net, ts=ts).q[-1, 0]
-agrees(slope, (step(1 + 1e-4) - step(1 - 1e-4)) / 2e-4, 1e-6)
-""")
-
-
-@pytest.mark.exhaustive
 def test_mass_matrices_and_tables_of_any_size():
     """Around 16 coordinates, whose matrix products have 4,096 multiplications, and tables around 10 kB."""
     survives("""

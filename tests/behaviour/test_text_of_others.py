@@ -4,9 +4,13 @@ import html
 import re
 
 import numpy as np
+import pytest
 
 import lagjax as lj
 from lagjax.analysis.formulations.latex import written
+from lagjax.display import plots
+from lagjax.display.printable import by_line, printable
+from lagjax.system import coordinates
 
 BAD = "a$\\frac$\x1b[2J</script><!--<b>\u202e"
 
@@ -29,3 +33,23 @@ def test_in_a_formula():
     for name in (BAD, "}\\input{x}", "}{", "\\", "$", "a_b^c"):
         assert re.fullmatch(r"(\\(mathrm|square|alpha)|[\w{}_,])+", written(name)), name
         assert written(name).count("{") == written(name).count("}")
+
+
+def test_in_a_terminal():
+    """Control characters and those that turn the direction are escaped; others, of any alphabet, are not."""
+    assert printable("a\x1b[2J\u202eb\nc") == "a\\x1b[2J\\u202eb\\nc" and by_line("a\nb\r") == "a\nb\\r"
+    assert printable("θ, ё and 速度") == "θ, ё and 速度"
+    assert all(name.isprintable() for name in coordinates.names({BAD: 1.0, "x": {BAD: 2.0}}))
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2, {BAD: lj.Holonomic(lambda t, q, params: q)})
+    assert repr(system).isprintable() and "\\x1b[2J" in repr(system)
+
+
+def test_in_a_plot():
+    """A dollar is no formula, which could not be read; twin: without the decorator it cannot."""
+    name = "$\\undefined{$"
+    t = np.arange(3.0)
+    panels = {name: {name: t, "y": t}}
+    for figure in (plots.time_series(t, panels), plots.lines(name, t, {name: t}, t > 1)):
+        assert len(getattr(figure, "_repr_png_")()) > 1000
+    with pytest.raises(ValueError, match="undefined"):
+        getattr(plots.time_series, "__wrapped__")(t, panels)._repr_png_()

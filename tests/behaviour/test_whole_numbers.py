@@ -131,12 +131,3 @@ def test_whole_parameters_stay():
     """An integer in params stays an integer: it may set a shape."""
     counted = lj.System(lambda t, q, v, params: 0.5 * v**2 - sum(q**i for i in range(1, params["n"])))
     assert float(lj.accelerations(counted, 0, 1, 0, {"n": 3})[0]) == -3.0
-
-
-@pytest.mark.slow
-def test_a_routhian_by_itself():
-    """The Routhian for Python numbers equals R = L - p v with the cyclic velocity v = p."""
-    free = lj.System(lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - q["x"] ** 2)
-    reduced = lj.routhian(free, "y").lagrangian
-    for q, v in (({"x": 1}, {"x": 2}), ({"x": 1.0}, {"x": 2.0})):
-        assert float(reduced(0, q, v, {"params": {}, "momenta": {"y": 3}})) == 0.5 * 4 - 1 - 0.5 * 9

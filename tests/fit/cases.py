@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import lagjax as lj
 from lagjax.fit.problem import residuals
 from lagjax.fit.problem.arguments import problem_of
-from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions, rolling_hoop, sliding_wedge, sphere_geodesic
+from lagjax.scenes import rolling_hoop, sliding_wedge, sphere_geodesic
 
 
 class Case(NamedTuple):
@@ -140,20 +140,8 @@ CASES = {
         lambda traj: {"q": {"theta": traj.q["theta"]}, "multipliers": {"contact": traj.multipliers["contact"]}},
         {"q": 0.005, "multipliers": 0.1},
     ),
-    "bead": Case(
-        bead_on_hoop.system, bead_on_hoop.PARAMS, {"omega": 1.1, "g": 0.9}, 0.7, 0.3, np.linspace(0.0, 4.0, 100), of_q,
-        {"q": 0.01},
-    ),
-    "dumbbell": Case(
-        mass_distributions.SYSTEMS["dumbbell"], mass_distributions.PARAMS["dumbbell"], {"M1": 1.1, "M2": 0.9},
-        *mass_distributions.ORBITS["dumbbell"][:2], np.linspace(0.0, 4.0, 60), of_q, {"q": 0.02},
-    ),
     "wedge": Case(
         sliding_wedge.system, WEDGE, {"M": 1.1, "alpha": 0.9}, *ON_WEDGE,
         np.linspace(0.0, 2.0, 50), of_q, {"q": 0.005},
-    ),
-    "cross-rails": Case(
-        cross_rails.rotating_system, cross_rails.PARAMS, {"K": 1.1, "k": 0.9, "omega": 1.05}, {"R": 1.5, "r": 0.2},
-        {"R": 0.0, "r": 0.5}, np.linspace(0.0, 4.0, 60), of_q, {"q": 0.01},
     ),
 }  # fmt: skip

@@ -13,7 +13,6 @@ from scipy.optimize import least_squares
 
 import lagjax as lj
 from lagjax.fit.result.warnings import caveats
-from lagjax.fit.search import search
 from lagjax.scenes import rolling_hoop
 from tests.counting import compiles
 from tests.fit.cases import CASES, FREE, GUESS, HUNG, PENDULUM, TS, hung, noisy, pendulum, swing, swung
@@ -87,7 +86,7 @@ def test_called_again_it_compiles_nothing(swinging):
 
 @pytest.mark.exhaustive
 def test_against_scipy(swinging):
-    """Estimates and covariance agree with SciPy's least squares with numerical slopes."""
+    """Estimates and covariance agree with SciPy's least squares with numerical slopes, and with other optimisers."""
     data = noisy(swinging[0])
     found = lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, bounds={"l": (0.0, None)})
     solve = jax.jit(
@@ -105,10 +104,19 @@ def test_against_scipy(swinging):
     np.testing.assert_allclose(found.chi2, 2 * theirs.cost, rtol=1e-8)
     assert abs(float(found.correlation[0, 1])) < 1 and float(found.correlation[1, 1]) == pytest.approx(1)
     assert int(found.freedom) == 96
-    # Without sigma, errors estimated from the residuals give nearly the same.
+    # Another least-squares solver, and a minimiser with reverse-mode derivatives, end at the same point.
+    again = lambda optimiser, **more: lj.fit(
+        pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, optimiser=optimiser, **more
+    )
+    dogleg, bfgs = again(optx.Dogleg(rtol=1e-9, atol=1e-9)), again(optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
+    np.testing.assert_allclose(dogleg.values, found.values, rtol=1e-5)
+    np.testing.assert_allclose(bfgs.values, found.values, rtol=1e-3)
+    np.testing.assert_allclose(bfgs.sd, found.sd, rtol=1e-2)
+    # Without sigma, errors estimated from the residuals give nearly the same. Residuals: what is left to the motion.
     alone = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, bounds={"l": (0.0, None)})
     np.testing.assert_allclose(alone.values, found.values, rtol=1e-6)
     np.testing.assert_allclose(float(alone.noise), np.sqrt(float(found.chi2) / 96) * 0.01, rtol=1e-4)
+    np.testing.assert_allclose(alone.motion().q, data + alone.residuals()["q"], atol=1e-8)
 
 
 @pytest.mark.slow
@@ -183,7 +191,7 @@ def test_observation_velocity_and_end():
 
 @pytest.mark.exhaustive
 def test_a_long_record_wants_a_growing_horizon():
-    """A fit of 27 periods at once ends in a wrong minimum; growing parts, joined windows and many starts do not."""
+    """A fit of 27 periods at once ends in a wrong minimum; growing parts and joined windows do not."""
     ts = np.linspace(0.0, 60.0, 1500)
     known = PENDULUM | {"c": 0.01}
     truth = lj.integrate(pendulum, 1.0, 0.0, known, ts=ts)
@@ -195,18 +203,10 @@ def test_a_long_record_wants_a_growing_horizon():
     np.testing.assert_allclose(joined.values, found.values, rtol=1e-5)
     np.testing.assert_allclose(joined.sd, found.sd, rtol=0.02)
     assert joined.freedom == found.freedom
-    apart = fit(0.9, window=5.0, joined=False)
-    np.testing.assert_allclose(apart.values, [1.25], rtol=0.01)
-    assert float(apart.sd[0]) > 2 * float(found.sd[0])
     # Twin: at once and without restarts the search fails.
     with pytest.warns(lj.FitWarning, match="residuals of 'q' are not measurement errors"):
         lost = fit(0.9, grow=False, restarts=0)
     assert lost.rms()["q"] > 0.1
-    # Many starts succeed.
-    best = fit(1.15, grow=False, restarts=30, spread=0.3)
-    np.testing.assert_allclose(best.values, found.values, rtol=1e-5)
-    assert best.costs is not None and len(best.costs) == 31
-    assert int(np.sum(best.costs > 2 * best.cost)) > 5
 
 
 @pytest.mark.exhaustive
@@ -236,61 +236,6 @@ def test_outliers_priors_and_bounds(swinging):
         held = fit(data, bounds={"l": (1.3, 2.0)})
     assert any("'l' ended at a bound" in str(warning.message) for warning in told)
     assert float(held.values[1]) == pytest.approx(1.3, abs=1e-5) and held.at_bounds() == ["l"]
-
-
-@pytest.mark.exhaustive
-def test_outliers_from_far(swinging, monkeypatch):
-    """With outliers, even as the first value, a robust loss still gets from a bad guess to the truth."""
-    rng = np.random.default_rng(2)
-    wild = swinging[0] + 0.002 * rng.normal(size=100)
-    wild[::7] += rng.normal(size=15)
-    guess, start = GUESS | {"l": 1.9}, {"q0": 0.3, "v0": 2.0}
-    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=wild, sigma=0.002, **start), guess, free=FREE, **more)
-    found = fit(loss="cauchy")
-    assert bool(found.converged) and np.max(found.sd) < 1e-3 and abs(float(found.q0[0]) - 1.0) < 0.005
-    np.testing.assert_allclose(found.values, [0.05, 1.25], atol=3 * np.max(found.sd))
-    # Without a guess of the start, it is not read off the outlier.
-    start.clear()
-    np.testing.assert_allclose(fit(loss="huber").values, [0.05, 1.25], atol=4 * np.max(found.sd))
-    # Twin: with an ordinary error of one sigma from the beginning, all data look like outliers.
-    start.update({"q0": 0.3, "v0": 2.0})
-    monkeypatch.setattr(search, "_ordinary", lambda *state: 1.0)
-    with pytest.warns(lj.FitWarning) as told:
-        # Another number of iterations makes it trace again.
-        astray = fit(loss="cauchy", iterations=99, restarts=0)
-    assert any("times as large as sigma says" in str(warning.message) for warning in told)
-    assert not np.allclose(astray.values, found.values, atol=0.1)
-
-
-@pytest.mark.exhaustive
-def test_inside_a_program(swinging):
-    """Fits of many measurements in one program give the same as one by one."""
-    data = np.stack([noisy(swinging[0], seed=i) for i in range(3)])
-
-    def estimate(x):
-        return lj.fit(pendulum, lj.Record(TS, q=x, q0=1.0, v0=0.0), GUESS, free=FREE).values
-
-    together = jax.jit(jax.vmap(estimate))(data)
-    np.testing.assert_allclose(together[1], estimate(data[1]), rtol=1e-7)
-    assert np.ptp(np.asarray(together)[:, 1]) > 1e-5
-
-
-@pytest.mark.exhaustive
-def test_other_optimisers(swinging):
-    """Another least-squares solver, and minimisers with reverse-mode derivatives, end at the same point."""
-    import optax
-
-    data = noisy(swinging[0])
-    fit = lambda **more: lj.fit(pendulum, lj.Record(TS, q=data, sigma=0.01), GUESS, free=FREE, **more)
-    ours = fit()
-    dogleg = fit(optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
-    np.testing.assert_allclose(dogleg.values, ours.values, rtol=1e-5)
-    bfgs = fit(optimiser=optx.BFGS(rtol=1e-6, atol=1e-6), iterations=300)
-    np.testing.assert_allclose(bfgs.values, ours.values, rtol=1e-3)
-    np.testing.assert_allclose(bfgs.sd, ours.sd, rtol=1e-2)
-    adam = optx.OptaxMinimiser(optax.adam(0.02), rtol=1e-5, atol=1e-5)
-    slow = lj.fit(pendulum, lj.Record(TS, q=data), GUESS, free=FREE, optimiser=adam, iterations=2000, grow=False)
-    np.testing.assert_allclose(slow.values[1], ours.values[1], rtol=1e-2)
 
 
 @pytest.mark.exhaustive

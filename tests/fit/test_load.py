@@ -1,6 +1,5 @@
 """Fits saved to files and loaded bit for bit, with the functions passed again."""
 
-import warnings
 from collections.abc import Callable
 
 import equinox as eqx
@@ -70,25 +69,6 @@ def test_saved_and_loaded(tmp_path):
         lj.load_trajectory(path)
 
 
-@pytest.mark.exhaustive
-def test_constraints_and_options(tmp_path):
-    """Starts on constraints are available without the system; options with functions are passed again."""
-    rod = lj.System(
-        lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"],
-        {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - 1.0)},
-    )
-    t, events = np.linspace(0.0, 0.4, 9), {"low": lj.Crossing(lambda t, q, v, params: q["x"])}
-    motion = lj.integrate(rod, {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {"g": 9.81}, ts=t)
-    record = lj.Record(t, q=jax.tree.map(lambda x: np.asarray(x) + NOISE[:9], motion.q), sigma=1e-3)
-    found = lj.fit(rod, record, {"g": 9.0}, events=events)
-    found.save(tmp_path / "fit.npz")
-    without, again = lj.load_fit(tmp_path / "fit.npz"), lj.load_fit(tmp_path / "fit.npz", rod, events=events)
-    assert repr(without) == repr(found) == repr(again)
-    for whole in (without, again):
-        assert jax.tree.map(float, whole.q0) == jax.tree.map(float, found.q0)
-    np.testing.assert_array_equal(again.motion().q["x"], found.motion().q["x"])
-
-
 class Own(eqx.Module):
     """A module of the user's, with a layer in a list, and an activation."""
 
@@ -115,16 +95,6 @@ def networks():
     }
 
 
-def with_networks(t, q, v, params):
-    """A spring with a potential and a mass of networks."""
-    net, x = params["net"], q["x"][None]
-    dense = net["flax"]["params"]["Dense_0"]
-    numbers = [net["mlp"](x), net["linear"](x), net["in turn"](x), net["conv"](x[None]), net["own"](x)]
-    numbers += [net["learned"](q), jnp.tanh(x @ dense["kernel"] + dense["bias"])]
-    mass = lj.learned.positive_definite(net["mass"](q))[0, 0]
-    return 0.5 * mass * v["x"] ** 2 - 0.5 * params["k"] * q["x"] ** 2 - 0.01 * sum(map(jnp.sum, numbers))
-
-
 @pytest.mark.slow
 def test_networks_alone():
     """Networks of eight kinds come back from JSON and arrays; twin: without a class of the user's they do not."""
@@ -135,25 +105,3 @@ def test_networks_alone():
     assert eqx.tree_equal(nets, again) and again["own"].activation is jnp.sin
     with pytest.raises(ValueError, match="(?s)class .*Own"):
         read()
-
-
-@pytest.mark.exhaustive
-def test_networks(tmp_path):
-    """A fit and a motion with networks of eight kinds come back and go on; twin: without a class of the user's, not."""
-    path, system, params = tmp_path / "fit.npz", lj.System(with_networks), {"net": networks(), "k": 3.5}
-    record = lj.Record(T, q={"x": np.cos(2.0 * T) + NOISE}, sigma=1e-3, q0={"x": 1.0}, v0={"x": 0.0})
-    with warnings.catch_warnings():
-        # Two steps do not end a search.
-        warnings.simplefilter("ignore", lj.FitWarning)
-        found = lj.fit(system, record, params, iterations=2, rtol=1e-6)
-    found.save(path)
-    with pytest.raises(ValueError, match=r"(?s)class .*Own.*Fix: classes=\[Own\]"):
-        lj.load_fit(path, system)
-    again = lj.load_fit(path, system, classes=[Own])
-    assert jax.tree.structure(found.params) == jax.tree.structure(again.params)
-    np.testing.assert_array_equal(again.values, found.values)
-    traj, more = found.motion(), again.motion()
-    np.testing.assert_array_equal(traj.q["x"], more.q["x"])
-    more.save(tmp_path / "traj.npz")
-    last = lj.load_trajectory(tmp_path / "traj.npz", system, classes=[Own])
-    np.testing.assert_array_equal(last.at(0.7).q["x"], traj.at(0.7).q["x"])

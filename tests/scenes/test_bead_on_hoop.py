@@ -13,8 +13,6 @@ from lagjax.mechanics.lagrangian import jacobi_integral, momentum
 from lagjax.report import relative_error
 from lagjax.scenes import bead_on_hoop as scene
 from lagjax.scenes.potentials import agm
-from lagjax.system.constraints import Holonomic
-from lagjax.system.system import System
 from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
 
@@ -115,35 +113,6 @@ def test_every_reference_value():
         assert float(value) == pytest.approx(reference(key), rel=1e-12, abs=0), key
 
 
-def test_misprints_are_seen():
-    """The source's p_ψ for L_z, its harmonic motion at ω = ω0 and its bead in the center are all wrong."""
-    rate, torque = rate_of_balance(FAST, *STATE, second(FAST, *STATE)), reference("s3.state.torque")
-    assert float(rate.L_z) == pytest.approx(torque, rel=1e-12)
-    assert abs(float(rate.p_psi) - torque) > 0.5 * abs(torque)
-    # Not harmonic: the period goes as one over the amplitude.
-    long, short = (by_numpy(scene.exact_period)(CRITICAL, 2.0**-n) for n in (11, 10))
-    assert short / long == pytest.approx(0.5)
-    # On the rim: the distance from the axis is a sin α, which tends to a, not to 0.
-    assert np.sin(by_numpy(scene.equilibrium_angle)(FAST | {"omega": 1e6})) == pytest.approx(1.0)
-    assert scene.MISPRINTS and all("\n" not in line for line in scene.MISPRINTS)
-
-
-def test_exact_motion_obeys_equation_13():
-    """The closed form is a solution: ψ̈ = sin ψ (ω² cos ψ - ω0²) in each regime; a missing term is detected."""
-    both = by_numpy(lambda params, psi, t: jax.jvp(lambda t: scene.exact_motion(params, psi, t), (t,), (1.0,)))
-    for params, psi in ((SLOW, 2.0), (FAST, 1.0), (FAST, OUTER), (FAST, 2.5), (CRITICAL, 1.0)):
-        off, angle, rate, right = [], 0.0, 0.0, 0.0
-        for t in np.linspace(0.1, 2.0, 5):
-            (angle, rate), (slope, bend) = both(params, psi, t)
-            np.testing.assert_allclose(slope, rate, rtol=1e-9, atol=1e-11)
-            pull = params["g"] / params["a"]
-            right = np.sin(angle) * (params["omega"] ** 2 * np.cos(angle) - pull)
-            np.testing.assert_allclose(bend, right, rtol=1e-9, atol=1e-9)
-            off.append(abs(bend + pull * np.sin(angle)))
-        assert max(off) > 0.1
-    np.testing.assert_allclose(second(params, angle, rate), right, rtol=1e-9, atol=1e-9)
-
-
 def test_torque_is_the_multiplier():
     """The motor's multiplier is τ = 2 m a² ω sin ψ cos ψ ψ̇ = dL_z/dt and ω τ = dE/dt; a flipped sign is detected."""
     balance = by_numpy(scene.balance)
@@ -168,23 +137,6 @@ def test_torque_is_the_multiplier():
         assert turned == pytest.approx((0.0, 0.0), abs=1e-15)
         # L_z of the hoop at the angle θ is the momentum of θ; E - ω L_z is the Jacobi integral of ψ alone.
         assert of_systems(q, v, params) == pytest.approx((float(state.L_z), float(state.h)))
-
-
-def test_normal_forces_are_multipliers():
-    """In spherical coordinates with the constraint r = a, its multiplier is N_r, and the motor's is a sin ψ N_perp."""
-
-    def lagrangian(t, q, v, params):
-        speed_squared = v["r"] ** 2 + (q["r"] * v["psi"]) ** 2 + (q["r"] * jnp.sin(q["psi"]) * v["theta"]) ** 2
-        return 0.5 * params["m"] * speed_squared + params["m"] * params["g"] * q["r"] * jnp.cos(q["psi"])
-
-    hoop = Holonomic(lambda t, q, params: q["r"] - params["a"])
-    free = System(lagrangian, constraints={"hoop": hoop, "motor": Holonomic(scene.motor)})
-    psi, psi_rate = STATE
-    q, v = {"r": 0.75, "psi": psi, "theta": 0.0}, {"r": 0.0, "psi": psi_rate, "theta": 6.0}
-    multipliers = equations(free, 0.0, q, v, FAST).multipliers
-    assert float(multipliers["hoop"]) == pytest.approx(reference("s3.state.N_r"), rel=1e-12)
-    sideways = float(multipliers["motor"]) / (FAST["a"] * np.sin(psi))
-    assert sideways == pytest.approx(reference("s3.state.N_perp"), rel=1e-12)
 
 
 def test_speed_zero_amplitude_and_reversal():
@@ -212,41 +164,3 @@ def test_constraint_holds_for_a_thousand_periods():
     state = by_numpy(scene.balance)(SLOW, *got)
     assert np.ptp(state.h) < 1e-6 * np.max(np.abs(state.h))
     assert np.ptp(state.E) > 0.05 * np.max(np.abs(state.E))
-
-
-def _exact_final(params):
-    """ψ, ψ̇ and the motor's torque at t = 1.25."""
-    psi, psi_rate = scene.exact_motion(params, 1.0, 1.25)
-    return jnp.stack([psi, psi_rate, scene.balance(params, psi, psi_rate).torque])
-
-
-def _final(params):
-    """ψ and ψ̇ at t = 1.25, by integration."""
-    ts = jnp.array([0.0, 1.25])
-    end = integrate(scene.system, 1.0, 0.0, params, ts=ts, rtol=1e-10, atol=1e-10).end
-    return jnp.stack([end.q, end.v])
-
-
-def _driven_final(params):
-    """The same for the driven bead, and the motor's multiplier."""
-    start, ts = scene.driven_start(params, 1.0), jnp.array([0.0, 1.25])
-    end = integrate(scene.driven_system, *start, params, ts=ts, rtol=1e-10, atol=1e-10).end
-    return jnp.stack([end.q["psi"], end.v["psi"], end.multipliers["motor"]])
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize(
-    ("derivative", "function"), [(jax.jacrev, _final), (jax.jacrev, _driven_final), (jax.jacfwd, _driven_final)]
-)
-def test_gradients(derivative, function):
-    """The final state's, and the motor's torque's, in m, a, g and ω, agree with the elliptic functions' to 1e-6."""
-    params = jax.tree.map(jnp.asarray, FAST)
-    got, exact = jax.jit(derivative(function))(params), jax.jacfwd(_exact_final)(params)
-    largest = max(float(jnp.max(jnp.abs(column))) for column in exact.values())
-    for name, column in exact.items():
-        # The state does not depend on m: its zero is compared with the size of the other columns.
-        expected = column[: got[name].size]
-        np.testing.assert_allclose(got[name], expected, rtol=1e-6, atol=1e-9 * largest, err_msg=name)
-    # Twin: the gradient through the state alone differs: the torque contains ω.
-    explicit = _exact_final(FAST)[2] / FAST["omega"]
-    assert abs(float(explicit)) > 1e-3 * abs(float(exact["omega"][2]))

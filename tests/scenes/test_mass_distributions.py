@@ -9,13 +9,11 @@ import mpmath
 import numpy as np
 import pytest
 
-from lagjax.integrate.integrate import integrate
 from lagjax.report import relative_error
 from lagjax.scenes import mass_distributions as scene
 from lagjax.scenes import potentials
 from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference
-from tests.tiers import exhaustive_but
 
 HELIX_POINTS = ((1.5, 0.75, 2.0), (0.5, 0.75, 2.0), (1.25, 3.0, 0.5), (0.75, 1.0, 8.0))
 # For s > a the reference used K_n instead of K_n' (mpmath's besselk ignores derivative=1): checked below.
@@ -192,29 +190,3 @@ def test_euler_integral():
     assert abs(rates(scene.euler_integral, "dumbbell", q, v, rod=2.0)) > 1e-3
     turned = lambda params, q, v: scene.euler_integral(params | {"M1": -params["M1"]}, q, v)
     assert abs(rates(turned, "dumbbell", q, v, rod=0.0)) > 1e-2
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("mode", exhaustive_but((jax.grad,), (jax.jacfwd, jax.grad)))
-def test_gradient_of_the_final_state(mode):
-    """The gradient of a final state inside the ellipse by G, ρ, a, b: both modes against the closed form."""
-    params = jax.tree.map(jnp.asarray, scene.PARAMS["elliptic cylinder"])
-    q0, v0 = scene.INSIDE
-
-    def final(params):
-        ts = jnp.array([0.0, 2.0])
-        orbit = integrate(scene.SYSTEMS["elliptic cylinder"], q0, v0, params, ts=ts, rtol=1e-10, atol=1e-10)
-        return orbit.q["x"][-1] + orbit.v["y"][-1]
-
-    def exact(params):
-        q, v = scene.exact_inside_ellipse(params, q0, v0, 2.0)
-        return q["x"] + v["y"]
-
-    expected = jax.jit(jax.jacfwd(exact))(params)
-    assert relative_error(jax.jit(mode(final))(params), expected) < 1e-8
-    assert relative_error(expected, expected | {"a": expected["b"], "b": expected["a"]}) > 0.1
-
-
-def test_misprints():
-    """The misprints are listed."""
-    assert any("2π L_z" in line for line in scene.MISPRINTS)

@@ -9,10 +9,9 @@ import pytest
 from scipy import special
 
 from lagjax.scenes import mass_distributions as scene
-from lagjax.scenes import potentials
 from lagjax.scenes.potentials import agm, jacobi_elliptic
 from tests.by_numpy import by_numpy
-from tests.scenes.test_mass_distributions import cylindrical, in_field
+from tests.scenes.test_mass_distributions import in_field
 
 
 @pytest.mark.parametrize(
@@ -81,45 +80,23 @@ def test_homogeneous_in_all_lengths(name, degree, lengths):
     np.testing.assert_allclose([first, second], [degree * value, degree**2 * value], rtol=1e-11, atol=1e-11)
 
 
-def test_no_nan_at_special_points():
-    """Gradients are finite, and zero by symmetry, on the sheet, the axes and in the centre of a ball."""
-    for name, q in (
-        ("plane", (0.5, 0.5, 0.0)),
-        ("cylinder", (0.0, 0.0, 0.0)),
-        ("finite cylinder", (0.0, 0.0, 0.0)),
-        ("elliptic cylinder", (0.0, 0.0, 0.0)),
-    ):
-        assert all(abs(x) < 1e-13 for x in in_field(name, *q)[1].values()), name
-    for name, q in (
-        ("half plane", (0.0, 1.0, 0.0)),
-        ("half plane", (0.0, -1.0, 0.0)),
-        ("cylinder", (1.25, 0.0, 0.0)),
-        ("finite cylinder", (1.25, 0.0, 0.75)),
-        ("finite cylinder", (0.0, 0.0, 0.75)),
-        ("finite cylinder", (1e100, 0.0, 0.0)),
-        ("elliptic cylinder", (2.0, 0.0, 0.0)),
-        ("dumbbell", (0.0, 0.0, 1.5)),
-        ("helix", (0.0, 0.0, 0.0)),
-    ):
-        assert all(np.isfinite(x) for x in in_field(name, *q)[1].values()), name
+SPECIAL = {
+    "plane": [(0.5, 0.5, 0.0)],
+    "half plane": [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0)],
+    "cylinder": [(0.0, 0.0, 0.0), (1.25, 0.0, 0.0)],
+    "finite cylinder": [(0.0, 0.0, 0.0), (1.25, 0.0, 0.75), (0.0, 0.0, 0.75), (1e100, 0.0, 0.0)],
+    "elliptic cylinder": [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0)],
+    "dumbbell": [(0.0, 0.0, 1.5)],
+    "helix": [(0.0, 0.0, 0.0)],
+}
 
 
-def test_field_through_the_lid():
-    """g_z = -∂Φ/∂z passes the lid z = b without a jump, for s inside and outside."""
-    for s in (0.5, 2.0):
-        below, on, above = (cylindrical("finite cylinder", s, 0.75 + dz)[2] for dz in (-1e-9, 0, 1e-9))
-        assert abs(on - below) < 2e-8 and abs(on - above) < 2e-8
-
-
-def test_screw_symmetry_of_the_potential():
-    """Φ is unchanged by z + hε/2π with φ + ε, at every ε; not by z + hε with φ + ε, which h p_z + L_z generates."""
-    h, (x, y, z) = scene.PARAMS["helix"]["h"], (1.5, 0.375, 0.25)
-    start = in_field("helix", x, y, z)[0]
-    for angle in (0.1, 1.0, 2.5):
-        c, s = np.cos(angle), np.sin(angle)
-        moved = c * x - s * y, s * x + c * y
-        assert abs(in_field("helix", *moved, z + h * angle / (2 * np.pi))[0] - start) < 1e-13
-        assert abs(in_field("helix", *moved, z + h * angle)[0] - start) > 1e-2
+@pytest.mark.parametrize("name", SPECIAL)
+def test_no_nan_at_special_points(name):
+    """Gradients are finite on sheets, edges, axes and in the centre of a ball, and zero where all is symmetric."""
+    fields = [np.array(list(in_field(name, *q)[1].values())) for q in SPECIAL[name]]
+    assert np.isfinite(fields).all()
+    assert name in ("half plane", "dumbbell", "helix") or np.max(np.abs(fields[0])) < 1e-13
 
 
 def test_jacobi_functions_against_scipy():
@@ -134,9 +111,3 @@ def test_jacobi_functions_against_scipy():
     # dn(u | -n) = 1 / dn(√(1 + n) u | n / (1 + n))
     negative = by_numpy(jacobi_elliptic)(u[:, 0], -3.0, 4.0)[2]
     np.testing.assert_allclose(negative, 1 / special.ellipj(2 * u[:, 0], 0.75)[2], rtol=1e-13)
-
-
-def test_the_gradient_as_compiled():
-    """`gradient` is that of the potential."""
-    q, params = scene.vector(0.5, 0.25, 1.0), scene.PARAMS["plane"]
-    np.testing.assert_allclose(potentials.gradient(potentials.plane, q, params)["z"], 2 * np.pi * 0.75, rtol=1e-15)

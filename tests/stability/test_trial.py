@@ -72,3 +72,11 @@ def test_a_wrong_derivative_is_found():
     ignorant = lambda q0, v0, params, ts: oscillator.exact(q0, v0, jax.lax.stop_gradient(params), ts)
     wrong = replace(by_frequency, exact=ignorant).attempt()
     assert wrong.verdict == SILENTLY_WRONG and wrong.error == right.error
+
+
+def test_stability_function():
+    """R of Bogacki & Shampine's method is 1 + z + z²/2 + z³/6, stable up to √3 on the imaginary axis."""
+    z = np.array([0.3 - 2.0j, 1.5j])
+    np.testing.assert_allclose(oscillator.amplification(diffrax.Bosh3(), z), 1 + z + z**2 / 2 + z**3 / 6, rtol=1e-14)
+    assert oscillator.stable_limit(diffrax.Bosh3()) == pytest.approx(3**0.5, rel=1e-3)
+    assert oscillator.stable_limit(diffrax.Kvaerno5()) == np.inf

@@ -7,7 +7,8 @@ import pytest
 from scipy import special
 
 import lagjax as lj
-from lagjax.work_precision.over_horizons import STEPS, Needed
+from lagjax.work_precision.over_horizons import Needed
+from tests.by_hand import swing
 from tests.systems import PARAMS, pendulum
 
 RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
@@ -15,25 +16,19 @@ RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
 PERIOD = float(4 * special.ellipk(0.5) / RATE)
 
 
-def swing(t):
-    """Its motion: θ = 2 asin(k cd), its rate -2 k k' ω sd."""
-    sn, cn, dn, _ = special.ellipj(RATE * np.asarray(t), 0.5)
-    return 2 * np.arcsin(np.sqrt(0.5) * cn / dn), -RATE * sn / dn
-
-
 @pytest.mark.slow
 def test_what_is_needed_is_the_first_that_is_enough():
     """Each method's rtol or dt0 gives the error against the closed form, and the next rougher one does not."""
-    methods = [lj.Nystrom12(), lj.Splitting(6)]
+    methods, motion = [lj.Nystrom12(), lj.Splitting(6)], lambda t: swing(t, np.pi / 2, RATE)
     found = lj.horizons(
-        pendulum, np.pi / 2, 0.0, PARAMS, period=PERIOD, periods=(10, 300), methods=methods, reference=swing
+        pendulum, np.pi / 2, 0.0, PARAMS, period=PERIOD, periods=(10, 300), methods=methods, reference=motion
     )
     largest = np.pi / 2, np.sqrt(2) * RATE
     ts = np.append(0.0, PERIOD * (299 + np.linspace(0.125, 1.0, 8)))
 
     def error(method, **options):
         traj = lj.integrate(pendulum, np.pi / 2, 0.0, PARAMS, ts=ts, method=method, estimate_error=False, **options)
-        return max(np.max(np.abs(x - y)) / unit for x, y, unit in zip((traj.q, traj.v), swing(ts), largest))
+        return max(np.max(np.abs(x - y)) / unit for x, y, unit in zip((traj.q, traj.v), motion(ts), largest))
 
     adapting, equal = found.rows[300.0]["Nystrom12"], found.rows[300.0]["Splitting(6)"]
     assert error(methods[0], rtol=adapting.setting) == pytest.approx(adapting.error, rel=0.05) and adapting.error < 1e-3
@@ -90,8 +85,3 @@ def test_bad_horizons():
         lj.work_precision(pendulum, 1.0, 0.0, PARAMS, ts=[0.0, 1.0], methods=[lj.Gauss(2)])
     with pytest.raises(TypeError, match="outside jit"):
         jax.jit(lambda q: lj.horizons(pendulum, q, 0.0, PARAMS, period=2.0).error)(jnp.asarray(1.0))
-
-
-def test_steps_are_from_long_to_short():
-    """A ladder of steps ends where round-off begins for order 6, at thousands in a period."""
-    assert STEPS[0] < 3 and STEPS[-1] > 2000 and all(a < b for a, b in zip(STEPS, STEPS[1:]))

@@ -11,7 +11,8 @@ from scipy import special
 
 import lagjax as lj
 from lagjax.work_precision.result import Curve, Point
-from tests.systems import PARAMS, pendulum
+from tests import by_hand
+from tests.systems import PARAMS, pendulum, rod_pendulum
 
 # The room hands out a function of this name.
 module = import_module("lagjax.work_precision.work_precision")
@@ -20,9 +21,8 @@ RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
 
 
 def swing(t, rate=RATE):
-    """A pendulum released at rest from the horizontal: θ = 2 asin(k cd), its rate -2 k k' ω sd."""
-    sn, cn, dn, _ = special.ellipj(rate * np.asarray(t), 0.5)
-    return 2 * np.arcsin(np.sqrt(0.5) * cn / dn), -rate * sn / dn
+    """A pendulum released at rest from the horizontal."""
+    return by_hand.swing(t, np.pi / 2, rate)
 
 
 def compared(start=np.pi / 2, ts=TS, **options):
@@ -149,13 +149,6 @@ def test_nothing_in_reach_is_said(made_up, monkeypatch):
             compared(methods=[lj.Tsit5()], tolerances=(1e-6,), reference=swing, max_steps=3)
 
 
-@pytest.mark.exhaustive
-def test_nothing_in_reach_is_said_with_its_reason():
-    """The same with a motion."""
-    with pytest.raises(RuntimeError, match=r"no method reached the end.*Tsit5"):
-        compared(methods=[lj.Tsit5()], tolerances=(1e-6,), reference=swing, max_steps=3)
-
-
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
@@ -193,3 +186,61 @@ def test_the_reference_of_its_own_says_how_far_it_can_be_trusted(found):
     for point in found.points:
         assert point.trusted == (point.error > 2 * found.reference.error)
     assert "WARNING" not in repr(found)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_default_methods_and_their_orders():
+    """The default of `integrate` comes first; each method shows its order; Tsit5's is not Dopri8's; all agree."""
+    found = compared()
+    assert list(found.curves) == ["Nystrom12", "Dopri8", "Tsit5"]
+    # The error of an oscillation's amplitude has one order more.
+    for name, order in (("Tsit5", 5), ("Dopri8", 8), ("Nystrom12", 12)):
+        assert order - 1 < found[name].order < order + 2.5
+    assert all(point.ended_well and point.seconds > 0 for point in found.points)
+    assert all(curve.compile_seconds > 0 for curve in found.curves.values()) and found.call_seconds > 0
+    assert found.reference.agrees and 10 <= found.reference.digits <= 14 and "WARNING" not in repr(found)
+
+
+def test_nystrom_methods_are_for_accelerations_without_velocities():
+    """With constraints a Nyström method is refused."""
+    start = {"x": 1.25, "y": 0.0}, {"x": 0.0, "y": 0.0}
+    with pytest.raises(ValueError, match="method 'Nystrom12' is for accelerations.*there are constraints"):
+        lj.work_precision(rod_pendulum, *start, PARAMS, ts=TS, methods=[lj.Nystrom12()])
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-5])
+def test_a_wrong_reference_is_found_out(made_up, off):
+    """If solves agree with each other but not with the reference, its error is reported; twin: the right reference."""
+    wrong = lambda ts: swing(ts, (1 + off) * RATE)
+    found = compared(methods=[lj.Dopri8()], tolerances=(1e-6, 1e-9, 1e-10), reference=wrong)
+    if off:
+        assert not found.reference.agrees and 1e-5 < found.reference.error < 1e-3
+        assert not any(point.trusted for point in found["Dopri8"].points[1:])
+        assert "WARNING" in repr(found) and "not to be trusted" in repr(found)
+    else:
+        assert found.reference.agrees and found.reference.error < 1e-9
+        assert found["Dopri8"].points[0].trusted and "WARNING" not in repr(found)
+        with pytest.raises(ValueError, match="no method stays within 1e-16: the nearest is Dopri8"):
+            found.best(error=1e-16)
+
+
+def test_a_motion_that_amplifies_is_said_to(made_up):
+    """From 1e-9 next to the top, two methods no longer agree after 25 s."""
+    found = compared(np.pi - 1e-9, np.array([0.0, 25.0]), methods=[lj.Dopri8()], tolerances=(1e-6, 1e-12))
+    assert not found.reference.agrees and found.reference.digits <= 7
+    assert "WARNING" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("reference", "error", "words"),
+    [
+        ((np.zeros(4),), TypeError, "two things"),
+        ((np.zeros(4), {"theta": np.zeros(4)}), ValueError, "velocities are not in the structure of v0"),
+        ((np.zeros(2), np.zeros(4)), ValueError, r"shape \(2,\) at 'q', but \(4,\) is needed"),
+    ],
+)
+def test_a_reference_that_does_not_fit(made_up, reference, error, words):
+    """The reference must have the structure and shapes of the motion at its times."""
+    with pytest.raises(error, match=words):
+        compared(methods=[lj.Tsit5()], tolerances=(1e-3,), reference=reference)

@@ -1,6 +1,7 @@
 """Branches of equilibria: folds, crossings and the loss of stability, against closed forms, with derivatives."""
 
 from functools import cache
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,19 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.scenes import cross_rails
-from tests.analysis.steady_systems import BUCKLING, COLUMN, EXCHANGE, FOLDS, PITCHFORK, column, forms  # fmt: skip
+from lagjax.analysis.continuation.arclength import Path, Tracer
+from lagjax.scenes import bead_on_hoop, cross_rails
+from tests.analysis.steady_systems import (  # fmt: skip  # fmt: skip
+    BUCKLING,
+    COLUMN,
+    ENDS,
+    EXCHANGE,
+    FOLDS,
+    FORMS,
+    PITCHFORK,
+    column,
+    forms,
+)
 from tests.by_numpy import by_numpy
 
 CRITICAL = 1e-10
@@ -21,8 +33,7 @@ def branches(kind, to=0.75):
     """Branches of a normal form along μ."""
     params, start = {
         "pitchfork": (PITCHFORK, 0.0), "from the side": (PITCHFORK | {"mu": 1.0}, 0.6), "exchange": (EXCHANGE, 0.0),
-        "folds": (FOLDS, -0.9), "later": (PITCHFORK | {"c": 0.5 + 1e-3}, 0.0),
-        "earlier": (PITCHFORK | {"c": 0.5 - 1e-3}, 0.0),
+        "folds": (FOLDS, -0.9),
     }[kind]  # fmt: skip
     return lj.continue_equilibria(forms, params, start, along="mu", to=-1.0 if kind == "from the side" else to)
 
@@ -59,14 +70,6 @@ def test_pitchfork(kind):
     np.testing.assert_allclose([found.first, found.last], [1.0, -1.0] if kind == "from the side" else [-1.0, 0.75])
 
 
-def test_derivatives_are_those_of_other_runs():
-    """Twin of the derivatives: a step in c moves the critical parameter as predicted; a wrong sign is seen."""
-    later, earlier = (branches(kind).critical[0].parameter for kind in ("later", "earlier"))
-    slope = branches("pitchfork").critical[0].derivative["c"]
-    np.testing.assert_allclose(slope, (later - earlier) / 2e-3, rtol=1e-7)
-    assert abs(slope + (later - earlier) / 2e-3) > 0.1
-
-
 def test_exchange_of_stability():
     """Two branches cross transcritically at μ = c/a, and neither folds."""
     found, (a, c, d) = branches("exchange"), (EXCHANGE[name] for name in "acd")
@@ -89,9 +92,7 @@ def test_column():
     assert [c.kind for c in found.critical] == ["pitchfork", "pitchfork"] and len(found) == 3
     for critical, factor in zip(found.critical, BUCKLING):
         check(critical, lambda p, factor=factor: factor * p["c"] / p["l"], COLUMN, "P")
-    stable = [b.stable for b in found.branches]
-    assert stable[1].all() and not stable[2].any()
-    assert lj.continue_equilibria(column, COLUMN, np.zeros(2), along="P", to=6.0, crossings=False).status != ""
+    assert found[1].stable.all() and not found[2].stable.any()
 
 
 @pytest.mark.exhaustive
@@ -100,9 +101,7 @@ def test_cross_rails():
     params = cross_rails.PARAMS
     system = cross_rails.rotating_system
 
-    def root(name):
-        return lambda p: jnp.sqrt(p[name] / p["m"])
-
+    root = lambda name: lambda p: jnp.sqrt(p[name] / p["m"])
     found = lj.continue_equilibria(system, params | {"omega": 1.0}, {"R": 0.8, "r": 0.0}, along="omega", to=9.0)
     assert [c.kind for c in found.critical] == ["line of equilibria", "escape"]
     check(found.critical[0], root("k"), params, "omega")
@@ -137,10 +136,32 @@ def test_closed_curve_and_folds_of_a_side_branch():
 # Printed results and messages.
 
 
-def test_no_start_and_no_program():
-    """Without an equilibrium there is no branch; and inside a compiled program its points cannot be counted."""
-    with pytest.raises(ValueError, match="no equilibrium was found from the start"):
-        lj.continue_equilibria(forms, EXCHANGE | {"mu": 1.0, "d": 0.0, "c": np.nan}, 0.5, along="mu", to=2.0)
+BEAD = lambda **change: lj.continue_equilibria(
+    bead_on_hoop.system, bead_on_hoop.PARAMS, 1.0, **{"along": "omega", "to": 8.0} | change
+)
+NOWHERE = EXCHANGE | {"mu": 1.0, "d": 0.0, "c": np.nan}
+
+
+@pytest.mark.parametrize(
+    "act, words",
+    [
+        (lambda: BEAD(along="speed"), "along='speed' is no number in params; there are 'a', 'g', 'm' and 'omega'"),
+        (lambda: BEAD(to=6.0), "leaves the parameter 'omega' no range: it starts at 6"),
+        (lambda: BEAD(velocity=1.0), "L depends on 'q'"),
+        (
+            lambda: lj.continue_equilibria(forms, NOWHERE, 0.5, along="mu", to=2.0),
+            "no equilibrium was found from the start",
+        ),
+    ],
+)
+def test_bad_input(act, words):
+    """Errors name what is wrong."""
+    with pytest.raises(ValueError, match=words):
+        act()
+
+
+def test_not_in_a_program():
+    """Inside a compiled program the points of a branch cannot be counted."""
     with pytest.raises(TypeError, match="JAX is tracing"):
         jax.eval_shape(lambda mu: lj.continue_equilibria(forms, EXCHANGE | {"mu": mu}, 0.0, along="mu", to=2.0), 1.0)
 
@@ -154,3 +175,58 @@ def test_what_is_drawn():
     assert {"stable", "unstable", "pitchfork"} <= set(axis.get_legend_handles_labels()[1])
     with pytest.raises(ValueError, match="names no coordinate"):
         found.plot("theta")
+
+
+# Folds, none missed; no jump to another branch; where a branch stalls.
+
+
+def test_folds():
+    """Two folds, passed in both directions; between them it is unstable, and on it b μ = c q + h q³ - e."""
+    found, (b, c, e, h) = branches("folds"), (FOLDS[name] for name in "bceh")
+    assert [critical.kind for critical in found.critical] == ["fold", "fold"] and len(found) == 1
+    turn = lambda p, side: (2 / 3 * p["c"] * side * jnp.sqrt(-p["c"] / (3 * p["h"])) - p["e"]) / p["b"]
+    for critical, side in zip(found.critical, (1, -1)):
+        check(critical, lambda p, side=side: turn(p, side), FOLDS, "mu", names=("mu", *"bceh"))
+    branch, edge = found[0], np.sqrt(-c / (3 * h))
+    off = np.abs(np.abs(branch.q) - edge) > 1e-6
+    np.testing.assert_array_equal(branch.stable[off], np.abs(branch.q[off]) > edge)
+    np.testing.assert_allclose(branch.parameter, (c * branch.q + h * branch.q**3 - e) / b, rtol=1e-11, atol=1e-11)
+    assert "ends at the end of the range" in repr(found) and "fold" in repr(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("e", [1e-3, pytest.param(1e-6, marks=pytest.mark.exhaustive)])
+def test_nearly_a_pitchfork(e):
+    """With a small push there is no crossing, steps do not jump to the other branch, and the branch stays stable."""
+    pushed = FORMS | {"a": 1.0, "h": 1.0, "e": e}
+    found = lj.continue_equilibria(forms, pushed, 0.0, along="mu", to=0.8)
+    assert len(found) == 1 and not found.critical and found[0].stable.all() and found[0].q[-1] > 0.8
+    back = lj.continue_equilibria(forms, pushed | {"mu": 0.8}, -0.9, along="mu", to=-1.0)
+    # The other branch folds where mu³ = 27 e²/4.
+    (critical,) = back.critical
+    assert critical.kind == "fold"
+    np.testing.assert_allclose(critical.parameter, np.cbrt(6.75 * e**2), rtol=1e-10)
+    np.testing.assert_allclose(critical.derivative["e"], 2 / 3 * np.cbrt(6.75 / e), rtol=1e-8)
+
+
+def test_a_branch_that_stalls():
+    """It stops where L is undefined, says so, and returns its points so far; twin: a shorter range is completed."""
+    found = lj.continue_equilibria(forms, ENDS, 0.0, along="mu", to=3.0)
+    assert len(found[0]) > 10 and "Newton's method does not converge" in found[0].status
+    np.testing.assert_allclose([found[0].parameter[-1], found[0].q[-1]], 1.0, atol=1e-2)
+    assert lj.continue_equilibria(forms, ENDS, 0.0, along="mu", to=0.9)[0].status == "the end of the range"
+
+
+def test_a_path_that_comes_back_is_closed():
+    """Within a step of its start and in the same direction; twins: the other direction, a step away, too few points."""
+    circle = np.linspace(0.0, 2 * np.pi, 41)
+    tracer = SimpleNamespace(weights=np.ones(2))
+
+    def closes(angles, turned=1.0, step=0.2):
+        along = [np.array([-np.sin(a), np.cos(a)]) for a in angles]
+        along[-1] = turned * along[-1]
+        points = [SimpleNamespace(z=5.0 + np.array([np.cos(a), np.sin(a)]), tangent=v) for a, v in zip(angles, along)]
+        return Tracer.closes(tracer, Path(points), step)
+
+    assert closes(circle) and closes(circle[:-1], step=0.16)
+    assert not (closes(circle, -1.0) or closes(circle[:-1], step=0.15) or closes(circle[::8]))

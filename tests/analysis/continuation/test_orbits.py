@@ -1,5 +1,6 @@
 """Branches of cycles: against elliptic integrals, Mathieu's boundaries, SciPy's shooting and averaging."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from lagjax.analysis.continuation.arclength import BranchPoint
 from lagjax.analysis.continuation.orbit_result import CriticalOrbit
 from lagjax.analysis.continuation.orbits import _zero
 from tests.analysis import closed_forms as known
-from tests.systems import PARAMS, pendulum
+from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, block, bounce_of, bouncing, stick_slip
+from tests.systems import PARAMS, pendulum, rod_pendulum
 
 UNIT = {"g": 1.0, "l": 1.0}
 
@@ -58,6 +60,21 @@ def test_pendulum_by_its_amplitude():
     by_period = lj.continue_orbits(orbit, along="period", to=9.0)
     np.testing.assert_allclose(by_period.period, by_period.parameter, rtol=1e-12)
     np.testing.assert_allclose(by_period.period, known.swinging(by_period.q, UNIT), rtol=1e-11)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("along, to", [("energy", 0.9), ("l", 3.0)])
+def test_pendulum_on_a_rod(along, to):
+    """With a constraint: along the energy, and along the rod's length at constant energy; the rod keeps its length."""
+    start = {"x": np.sin(1.0), "y": -np.cos(1.0)}, {"x": 0.0, "y": 0.0}
+    orbit = lj.periodic_orbit(rod_pendulum, start, 6.7, UNIT | {"m": 1.0})
+    branch = lj.continue_orbits(orbit, along=along, to=to)
+    energy, length = (branch.parameter, 1.0) if along == "energy" else (-np.cos(1.0), branch.parameter)
+    np.testing.assert_allclose(
+        branch.period, known.swinging(np.arccos(-energy / length), UNIT | {"l": length}), rtol=1e-10
+    )
+    np.testing.assert_allclose(np.hypot(branch.q["x"], branch.q["y"]), length, rtol=1e-12)
+    assert branch.status == "the end of the range" and branch.stable.all()
 
 
 @pytest.mark.exhaustive
@@ -116,10 +133,7 @@ DRIVEN = known.DUFFING | {"omega": 0.5}
 
 @pytest.mark.exhaustive
 def test_resonance_curve():
-    """Both folds, every orbit and its stability agree with SciPy's shooting; amplitudes are near harmonic balance.
-
-    Twin: a state off by a millionth is not SciPy's orbit, and beyond the folds there is only one orbit.
-    """
+    """Both folds, every orbit and its stability agree with SciPy's shooting; it is drawn. Twin: a millionth off."""
     orbit = lj.periodic_orbit(known.duffing, (0.4, 0.0), 2 * np.pi / DRIVEN["omega"], DRIVEN)
     branch = lj.continue_orbits(orbit, along="omega", to=3.0)
     assert [c.kind for c in branch.critical] == ["fold", "fold"] and branch.status == "the end of the range"
@@ -134,32 +148,30 @@ def test_resonance_curve():
         assert np.abs(z + 1e-6 - exact).max() > 1e-8
         assert bool(branch.stable[i]) == bool(np.abs(found).max() < 1)
         np.testing.assert_allclose(np.sort(np.abs(found)), np.sort(np.abs(branch.multipliers[i])), rtol=1e-6)
-    # One harmonic: (1 - ω² + 3/4 b A²)² A² + (c ω A)² = f².
-    near = np.arange(0, upper.index)[branch.parameter[: upper.index] > 1.0]
-    amplitude, omega = branch.high[near], branch.parameter[near]
-    b, f, _, c = DRIVEN.values()
-    force = np.sqrt((1 - omega**2 + 0.75 * b * amplitude**2) ** 2 + (c * omega) ** 2) * amplitude
-    assert np.mean(np.abs(force / f - 1)) < 0.5
-
-    def one_harmonic(omega):
-        """A² of the balance."""
-        roots = np.roots([(0.75 * b) ** 2, 1.5 * b * (1 - omega**2), (1 - omega**2) ** 2 + (c * omega) ** 2, -(f**2)])
-        return np.sqrt(np.sort(roots[np.abs(roots.imag) < 1e-9].real))
-
-    grid = np.linspace(1.0, 2.0, 4001)
-    several = grid[[len(one_harmonic(w)) == 3 for w in grid]]
-    np.testing.assert_allclose([lower.parameter, upper.parameter], [several[0], several[-1]], rtol=0.01)
     # SciPy's orbits at the folds have the double multiplier 1, which is off by the root of the orbits' error.
     for fold in branch.critical:
         omega = float(fold.parameter)
         z = np.array([branch.q[fold.index], branch.v[fold.index]])
         found = np.linalg.eigvals(monodromy(known.duffing_rate(DRIVEN | {"omega": omega}), 2 * np.pi / omega, z))
         assert np.abs(found - 1).min() < 1e-6 and np.abs(found - 1).max() > 0.1
-
-
-def mathieu_lagrangian(t, q, v, p):
-    """x'' + (a - 2 q cos 2t) x = 0, a pendulum on a moving pivot near rest; and with large swings."""
-    return 0.5 * v**2 + (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * jnp.cos(q)
+    (axis,) = branch.plot().axes
+    dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
+    assert dashes == {"-", "--"} and axis.get_ylabel() == "largest q" and axis.get_xlabel() == "omega"
+    assert {"stable", "unstable", "fold"} <= set(axis.get_legend_handles_labels()[1])
+    assert branch.plot("period").axes[0].get_ylabel() == "period" and "fold" in repr(branch)
+    short = lj.continue_orbits(orbit, along="omega", to=1.7, most_points=5)
+    assert short.status == "the limit of 5 points" and len(short) == 5
+    along = lambda name, to=1.0: lj.continue_orbits(orbit, along=name, to=to)
+    for act, error, words in (
+        (lambda: branch.plot("theta"), ValueError, "names no coordinate; there are q, and 'period'"),
+        (lambda: along("speed"), ValueError, "along='speed' is no number in params; there are 'b', 'c', 'f' and"),
+        (lambda: along("period"), ValueError, "along='period': the system depends on time"),
+        (lambda: along("omega", 0.5), ValueError, "leaves the parameter 'omega' no range: it starts at 0.5"),
+        (lambda: jax.jit(lambda x: lj.continue_orbits(x, along="omega", to=1.0).period)(orbit), TypeError, "JAX is"),
+        (lambda: branch[len(branch)], IndexError, "branch\\[0\\] to branch"),
+    ):
+        with pytest.raises(error, match=words):
+            act()
 
 
 @pytest.mark.slow
@@ -168,7 +180,7 @@ def test_tongues_of_a_parametric_pendulum():
 
     Twin: the characteristic values of another q differ.
     """
-    system, q = lj.System(mathieu_lagrangian), 0.25
+    system, q = known.mathieu, 0.25
     orbit = lj.periodic_orbit(system, (0.0, 0.0), np.pi, {"a": 0.1, "q": q})
     branch = lj.continue_orbits(orbit, along="a", to=10.0)
     edges = lambda q: np.array([edge(n, q) for n in (1, 2, 3) for edge in (special.mathieu_b, special.mathieu_a)])
@@ -183,21 +195,6 @@ def test_tongues_of_a_parametric_pendulum():
 
 
 # Cycles of autonomous systems.
-
-
-@pytest.mark.exhaustive
-def test_van_der_pol_family():
-    """Periods are those in the literature; at μ = 0, where all circles are orbits, the multiplier passes 1."""
-    orbit = lj.periodic_orbit(known.van_der_pol, (2.0, 0.0), 6.5, {"mu": 1})
-    branch = lj.continue_orbits(orbit, along="mu", to=10.0)
-    np.testing.assert_allclose(branch.period[[0, -1]], [known.VAN_DER_POL[1.0], known.VAN_DER_POL[10.0]], atol=2e-8)
-    assert branch.stable.all() and not branch.critical
-    back = lj.continue_orbits(orbit, along="mu", to=-1.0)
-    (critical,) = back.critical
-    assert critical.kind == "branch point" and abs(float(critical.parameter)) < 1e-9
-    off = np.abs(back.parameter) > 1e-6
-    np.testing.assert_array_equal(back.stable[off], back.parameter[off] > 0)
-    np.testing.assert_allclose(back.period[-1], back.period[0], rtol=1e-11)
 
 
 @pytest.mark.exhaustive
@@ -221,21 +218,28 @@ def test_a_cycle_that_shrinks_and_one_that_folds():
 
 
 @pytest.mark.exhaustive
-def test_torus_of_a_driven_van_der_pol():
-    """With less drive entrainment is lost: a pair passes the unit circle, as SciPy's multipliers do."""
-    lagrangian = lambda t, q, v, p: known.spring_lagrangian(t, q, v, p) + p["f"] * q * jnp.cos(2 * t)
-    system = lj.System(lagrangian, force=known.van_der_pol.force)
-    orbit = lj.periodic_orbit(system, (-2.0, 0.0), np.pi, {"f": 6.0, "mu": 0.5})
-    branch = lj.continue_orbits(orbit, along="f", to=0.5)
-    (torus,) = branch.critical
-    assert torus.kind == "torus" and branch.stable[0] and not branch.stable[-1]
-    f = float(torus.parameter)
-    rate = lambda t, y: [y[1], -y[0] + 0.5 * (1 - y[0] ** 2) * y[1] + f * np.cos(2 * t)]
-    _, found = shot(rate, np.pi, np.array([branch.q[torus.index], branch.v[torus.index]]) + 1e-4)
-    np.testing.assert_allclose(np.abs(found), 1.0, atol=1e-8)
-    # Liouville's formula gives the size there: ∮ (1 - q²)/2 dt = 0; twin: not elsewhere.
-    of = lambda i: np.prod(np.abs(branch.multipliers[i]))
-    assert abs(of(torus.index) - 1) < 1e-11 < abs(of(torus.index + 2) - 1)
+def test_combination_resonance():
+    """Two oscillators coupled by a drive near the sum of their frequencies: two pairs meet, by SciPy's multipliers."""
+
+    def lagrangian(t, q, v, p):
+        springs = 0.5 * (q[0] ** 2 + p["k"] * q[1] ** 2)
+        return 0.5 * v @ v - springs - p["e"] * jnp.cos(p["omega"] * t) * q[0] * q[1]
+
+    params = {"k": 2.0, "e": 0.25, "omega": 2.1}
+    orbit = lj.periodic_orbit(lj.System(lagrangian), (np.zeros(2), np.zeros(2)), 2 * np.pi / 2.1, params)
+    branch = lj.continue_orbits(orbit, along="omega", to=2.7)
+    assert [c.kind for c in branch.critical] == ["torus", "torus"]
+
+    def growth(omega):
+        coupling = lambda t: params["e"] * np.cos(omega * t)
+        rate = lambda t, y: [y[2], y[3], -y[0] - coupling(t) * y[1], -params["k"] * y[1] - coupling(t) * y[0]]
+        return np.abs(np.linalg.eigvals(monodromy(rate, 2 * np.pi / omega, np.zeros(4), 1.0))).max() - 1
+
+    first, second = (float(c.parameter) for c in branch.critical)
+    assert first < 1 + np.sqrt(2.0) < second
+    for edge, out in ((first, -1), (second, 1)):
+        assert growth(edge + out * 1e-6) < 1e-5 < growth(edge - out * 1e-6) < 1e-2
+    assert "a pair at ±" in repr(branch)
 
 
 # Plots and messages.
@@ -246,3 +250,42 @@ def test_no_orbit_to_begin_with():
     with pytest.raises(TypeError, match="needs a periodic orbit, not System") as raised:
         lj.continue_orbits(pendulum, along="g", to=2.0)  # type: ignore
     assert "Fix: orbit = lj.periodic_orbit" in str(raised.value) and PARAMS["g"] > 0
+
+
+# With switches: sticking, slipping and bouncing.
+
+
+@pytest.mark.exhaustive
+def test_stick_slip():
+    """The period along the belt's speed, and along μ until the start comes to a switch.
+
+    The block sticks from x = (2μ - μ_s)/k on, which is the start's x, 0.1, at μ = 0.575. Twin: the period moves.
+    """
+    orbit = lj.periodic_orbit(block, (0.1, 0.25), 1.1 * stick_slip(BELT), BELT)
+    branch = lj.continue_orbits(orbit, along="V", to=0.6)
+    assert branch.status == "the end of the range" and branch.stable.all()
+    exact = [stick_slip(BELT | {"V": V}) for V in branch.parameter]
+    np.testing.assert_allclose(branch.period, exact, rtol=1e-10)
+    np.testing.assert_allclose(branch.multipliers, np.tile([1.0, 0.0], (len(branch), 1)), atol=1e-9)
+    assert np.ptp(exact) > 0.5 and branch[1].switches is None
+    ended = lj.continue_orbits(orbit, along="mu", to=0.7)
+    exact = [stick_slip(BELT | {"mu": mu}) for mu in ended.parameter]
+    np.testing.assert_allclose(ended.period, exact, rtol=1e-10)
+    np.testing.assert_allclose(ended.parameter[-1], 0.575, atol=1e-3)
+    assert "the start comes to a switch" in ended.status
+    # The largest x is that of the slip, about x = μ/k with the amplitude of its start.
+    k, V, mu, static = BELT.values()
+    at, reach = mu / k, np.hypot((static - mu) / k, V / k**0.5)
+    np.testing.assert_allclose([ended.high[0], ended.low[0]], [at + reach, at - reach], atol=1e-5)
+
+
+@pytest.mark.exhaustive
+def test_bouncing_ball():
+    """A multiplier passes -1 at the amplitude of the closed form; a drive that only the guard sees is refused."""
+    orbit, _ = bounce_of(bouncing, 0.07)
+    branch = lj.continue_orbits(orbit, along="A", to=1.02 * FLIPS)
+    (flip,) = branch.of_kind("period doubling")
+    np.testing.assert_allclose(flip.parameter, FLIPS, rtol=1e-9)
+    assert branch.stable[0] and not branch.stable[-1]
+    with pytest.raises(ValueError, match="the period of the drive changes with it"):
+        lj.continue_orbits(orbit, along="omega", to=8.5)

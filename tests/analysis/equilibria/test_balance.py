@@ -52,30 +52,6 @@ def test_shortest_multipliers():
 
 
 @pytest.mark.exhaustive
-def test_roots_have_derivatives():
-    """Derivatives of a damped pendulum's s = -c/2 ± i√(±g - c²/4), both modes, also on a rod; twin: with another c."""
-    damped = lj.System(
-        lambda t, q, v, p: 0.5 * v**2 + p["g"] * jnp.cos(q), dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
-    )
-    params = {"g": 9.81, "c": 0.5}
-    at = lambda p: lj.equilibria(damped, p, starts=[0.3, 3.0]).eigenvalues
-    below = lambda p: jnp.imag(at(p)[0, 0])
-    frequency, fastest = np.sqrt(9.81 - 0.0625), np.sqrt(9.81 + 0.0625)
-    slope = jax.jit(jax.jacfwd(at))(params)
-    np.testing.assert_allclose(slope["g"][:, 0], [0.5j / frequency, 0.5 / fastest], atol=1e-10)
-    np.testing.assert_allclose(slope["c"][:, 0], [-0.5 - 0.125j / frequency, -0.5 + 0.125 / fastest], atol=1e-10)
-    np.testing.assert_allclose(jax.grad(below)(params)["g"], 0.5 / frequency, rtol=1e-10)
-    assert abs(jax.grad(below)(params | {"c": 1.0})["g"] - 0.5 / frequency) > 1e-4
-    g = 9.8125
-
-    def on_a_rod(l):
-        found = lj.equilibria(rod_pendulum, {"m": 1.5, "g": g, "l": l}, starts=[{"x": 0.3, "y": -1.2}])
-        return jnp.nansum(jnp.abs(jnp.imag(found.eigenvalues))) / 2
-
-    np.testing.assert_allclose(jax.grad(on_a_rod)(1.25), -0.5 * np.sqrt(g / 1.25**3), rtol=1e-9)
-
-
-@pytest.mark.exhaustive
 def test_roots_are_those_of_the_linearisation():
     """Two derivations agree: gyroscopic, holonomic and velocity constraints, all kinds of forces."""
     rng = np.random.default_rng(3)

@@ -26,13 +26,15 @@ def words(found):
     return ["stable" if stable else "undecided" if undecided else "unstable" for stable, undecided in named]
 
 
-ELSEWHERE = ({}, {"at": 0.75}, {"friction": 0.5})
-ORDERS = [(4, -1.0, "unstable"), (4, 1.0, "stable"), (3, 1.0, "unstable"), (6, -1.0, "unstable")]
-SOON = [(*ORDERS[0], {}), (*ORDERS[1], ELSEWHERE[1]), (*ORDERS[2], ELSEWHERE[2])]
-LATER = [pytest.param(*x, y, marks=pytest.mark.exhaustive) for x in ORDERS for y in ELSEWHERE if (*x, y) not in SOON]
-
-
-@pytest.mark.parametrize("power, factor, verdict, changes", [*SOON, *LATER])
+@pytest.mark.parametrize(
+    "power, factor, verdict, changes",
+    [
+        (4, -1.0, "unstable", {}),
+        (4, 1.0, "stable", {"at": 0.75}),
+        (3, 1.0, "unstable", {"friction": 0.5}),
+        pytest.param(6, -1.0, "unstable", {"at": 0.75, "friction": 0.5}, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_hills_of_any_order(power, factor, verdict, changes):
     """V = c q^k at 0 and elsewhere: one equilibrium from all starts, stable exactly for even k and c > 0."""
     found = hill({power: factor}, **changes)
@@ -90,8 +92,7 @@ ON_A_LINE = lj.System(
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("at", [0.0, 1.0])
-def test_a_multiple_root_on_a_constraint(at):
+def test_a_multiple_root_on_a_constraint(at=1.0):
     """V = c (x - a)^k on a line, with and without weight across it: one rest, at a, stable exactly for c > 0."""
     starts = [{"x": at + 0.3, "y": at}, {"x": at - 0.5, "y": at + 0.1}]
     for x4, x6, stable in ((1.0, 0.0, True), (-1.0, 0.0, False), (0.0, 1.0, True), (0.0, -1.0, False)):

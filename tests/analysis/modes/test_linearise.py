@@ -9,19 +9,13 @@ import pytest
 import lagjax as lj
 from lagjax.analysis.modes.linearise import _changed, _singular
 from lagjax.analysis.modes.reduced_matrices import Raw
+from lagjax.scenes import cross_rails
 from lagjax.system import coordinates
 from tests.analysis import small_systems as small
 from tests.analysis.modes.test_normal_modes import EQUAL
 from tests.systems import rod_pendulum
 
 FREE = lj.System(lambda t, q, v, params: 0.5 * v**2)
-
-
-def test_what_is_held():
-    """A mass held by a constraint has no motion, which is an error."""
-    held = lj.System(FREE.lagrangian, {"wall": lj.Holonomic(lambda t, q, params: q - 1.0)})
-    with pytest.raises(ValueError, match="leave no motion at all"):
-        lj.normal_modes(held, 0.0, 1.0, 0.0, None)
 
 
 @pytest.mark.slow
@@ -60,18 +54,28 @@ def test_what_is_singular_and_what_changes():
     assert _changed(parts(), parts(position=later)) == ("the matrix of positions", 0, 1, 0.0, 0.25)
 
 
-def test_off_the_constraints():
-    """A violated constraint is named."""
-    with pytest.raises(ValueError, match="constraint 'rod'"):
-        lj.linearise(rod_pendulum, 0.0, {"x": 0.0, "y": -1.0}, {"x": 0.0, "y": 0.0}, {"g": 9.8125, "l": 1.25})
+HELD = lj.System(FREE.lagrangian, {"wall": lj.Holonomic(lambda t, q, params: q - 1.0)})
+SWAYING = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (1 + 0.1 * jnp.cos(t)) * q**2)
+MASSLESS = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - 0.5 * (q["a"] ** 2 + q["b"] ** 2))
+OFF, STILL, NONE = {"x": 0.0, "y": -1.0}, {"x": 0.0, "y": 0.0}, {"a": 0.0, "b": 0.0}
+RAILS = cross_rails.rotating_system, {"R": 1.0, "r": 0.0}, {"R": 0.0, "r": 0.0}, cross_rails.PARAMS
 
 
-@pytest.mark.slow
-def test_messages():
-    """No mass, explicit time: each error is clear."""
-    massless = lj.System(lambda t, q, v, params: 0.5 * v["a"] ** 2 - 0.5 * (q["a"] ** 2 + q["b"] ** 2))
-    with pytest.raises(ValueError, match="mass matrix is singular in coordinate 'b'"):
-        lj.linearise(massless, 0.0, {"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, None)
-    parametric = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (1 + 0.1 * jnp.cos(t)) * q**2)
-    with pytest.raises(ValueError, match="change along the motion: the matrix of positions"):
-        lj.linearise(parametric, 0.0, 0.0, 0.0, None)
+@pytest.mark.parametrize(
+    "system, q, v, params, error, words",
+    [
+        (HELD, 1.0, 0.0, None, ValueError, "leave no motion at all"),
+        (rod_pendulum, OFF, STILL, {"g": 9.8125, "l": 1.25}, ValueError, "constraint 'rod'"),
+        (*RAILS, ValueError, "not an equilibrium: 'R' accelerates by"),
+        (small.bead, True, 0, None, TypeError, "bool"),
+        pytest.param(MASSLESS, NONE, NONE, None, ValueError, "singular in coordinate 'b'", marks=pytest.mark.slow),
+        pytest.param(
+            SWAYING, 0.0, 0.0, None, ValueError, "change along the motion: the matrix of pos", marks=pytest.mark.slow
+        ),
+    ],
+    ids=["held", "off the rod", "no equilibrium", "a truth", "without mass", "explicit time"],
+)
+def test_what_is_refused(system, q, v, params, error, words):
+    """Where there is no steady motion the error says why."""
+    with pytest.raises(error, match=words):
+        lj.linearise(system, 0.0, q, v, params)

@@ -4,19 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, linalg, special
+from scipy import linalg, special
 
 import lagjax as lj
-from tests.analysis.closed_forms import VAN_DER_POL, van_der_pol
-from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum
-
-
-def mathieu_lagrangian(t, q, v, p):
-    """x'' + (a - 2 q cos 2t) x = 0."""
-    return 0.5 * v**2 - 0.5 * (p["a"] - 2 * p["q"] * jnp.cos(2 * t)) * q**2
-
-
-mathieu = lj.System(mathieu_lagrangian)
+from tests.analysis.closed_forms import mathieu, slope_of_swinging, swinging
+from tests.systems import DRIVEN_PARAMS, PARAMS, cartesian_lagrangian, driven, pendulum, rod_pendulum
 
 
 @jax.jit
@@ -73,68 +65,24 @@ def test_verdict_across_boundaries():
     assert narrow.sum() == 4 and not swing(np.where(narrow, A - WIDTH / 2, A), Q)[2][narrow].any()
 
 
-def kapitza_lagrangian(t, q, v, p):
-    """A pendulum by its angle from the upward vertical, its pivot moving up and down as A cos Ωt."""
-    at = lambda t, q: jnp.stack([p["l"] * jnp.sin(q), p["A"] * jnp.cos(p["Omega"] * t) + p["l"] * jnp.cos(q)])
-    place, speed = jax.jvp(at, (t, q), (jnp.ones_like(t), v))
-    return 0.5 * speed @ speed - p["g"] * place[1]
-
-
 def moving_rod(t, q, p):
     """The rod from the moving pivot."""
     return q["x"] ** 2 + (q["y"] - p["A"] * jnp.cos(p["Omega"] * t)) ** 2 - p["l"] ** 2
 
 
 SHAKEN = {"g": 9.8125, "l": 0.25, "A": 0.025}
-ON_A_ROD = {"x": 0.0, "y": SHAKEN["A"] + SHAKEN["l"]}, {"x": 0.0, "y": 0.0}
-UPRIGHT = [
-    (lj.System(kapitza_lagrangian), (0.0, 0.0)),
-    (lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(moving_rod)}), ON_A_ROD),
-]
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("system, start", UPRIGHT, ids=["angle", "rod"])
-def test_kapitza(system, start):
+def test_kapitza_on_a_rod():
     """Upright it is stable exactly where a > a_0(q), a = -4g/(lΩ²), q = 2A/l, near A²Ω² = 2gl; twin: not just below."""
+    shaken = lj.System(cartesian_lagrangian, {"rod": lj.Holonomic(moving_rod)})
+    start = {"x": 0.0, "y": SHAKEN["A"] + SHAKEN["l"]}, {"x": 0.0, "y": 0.0}
     edge = np.sqrt(-4 * SHAKEN["g"] / SHAKEN["l"] / special.mathieu_a(0, 2 * SHAKEN["A"] / SHAKEN["l"]))
-    at = lambda Omega: lj.floquet(system, 0.0, *start, SHAKEN | {"Omega": Omega}, 2 * jnp.pi / Omega)
-    found = jax.jit(jax.vmap(at))(edge * np.array([1 - 1e-6, 1 + 1e-6]))
-    assert list(found.stable) == [False, True]
+    at = lambda Omega: lj.floquet(shaken, 0.0, *start, SHAKEN | {"Omega": Omega}, 2 * jnp.pi / Omega)
+    assert list(jax.jit(jax.vmap(at))(edge * np.array([1 - 1e-6, 1 + 1e-6])).stable) == [False, True]
     # The boundary is near the limit of fast drives from the averaged equations.
     assert abs((SHAKEN["A"] * edge) ** 2 / (2 * SHAKEN["g"] * SHAKEN["l"]) - 1) < 0.01
-
-
-@pytest.mark.exhaustive
-def test_van_der_pol():
-    """The cycle attracts; the multiplier is e^∮μ(1-q²)dt by SciPy; twin: under the other sign of μ it repels."""
-    orbit = lj.periodic_orbit(van_der_pol, (2.0, 0.0), 6.5, {"mu": 1.0})
-    found = lj.floquet(van_der_pol, 0.0, orbit.q, orbit.v, {"mu": 1.0}, orbit.period)
-    np.testing.assert_allclose(orbit.period, VAN_DER_POL[1.0], rtol=1e-12)
-
-    def rate(t, y):
-        return [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]
-
-    end = integrate.solve_ivp(rate, [0, VAN_DER_POL[1.0]], [orbit.q, orbit.v, 0.0], rtol=1e-12, atol=1e-13).y[2, -1]
-    assert found.trivial.tolist() == [True, False] and bool(found.attracts)
-    np.testing.assert_allclose(found.multipliers[1], np.exp(end), rtol=1e-8)
-    np.testing.assert_allclose(found.product, found.liouville, rtol=1e-7)
-    # Backward in time the cycle is the same, but repels.
-    away = lj.floquet(van_der_pol, 0.0, orbit.q, -orbit.v, {"mu": -1.0}, orbit.period)
-    np.testing.assert_allclose(away.multipliers[1], np.exp(-end), rtol=1e-8)
-    assert not bool(away.stable) and "above 1" in away.verdict
-
-
-@pytest.mark.exhaustive
-def test_derivatives():
-    """The derivative of Mathieu's largest multiplier by a, both modes, against the discriminant D: μ + 1/μ = D."""
-    largest = lambda a: lj.floquet(mathieu, 0.0, 0.0, 0.0, {"a": a, "q": 0.25}, jnp.pi).largest
-    value, slope, _ = swing(np.append(1.0, A[1:]), np.append(0.25, Q[1:]))
-    mu = float(jax.jit(largest)(1.0))
-    # Here μ < -1, so `largest` is -μ.
-    exact = -float(jnp.trace(slope[0])) / (1 - mu**-2)
-    np.testing.assert_allclose(-mu - 1 / mu, jnp.trace(value[0]), rtol=1e-11)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(largest))(1.0), exact, rtol=1e-9)
 
 
 @pytest.mark.exhaustive
@@ -173,3 +121,47 @@ def test_refused_in_words():
         lj.floquet(pendulum, 0.0, 2.0, 0.0, PARAMS)
     with pytest.raises(TypeError, match="a lj.System or a periodic orbit, not dict"):
         lj.floquet(PARAMS)
+
+
+@pytest.mark.exhaustive
+def test_liouville_on_a_rod():
+    """R = ½ c v² gives the product e^(-cT) of the one freedom (without a rod: `test_damped_and_driven`)."""
+    c, period = 0.375, 1.25
+    start = {"x": 0.0, "y": -PARAMS["l"]}, {"x": 0.0, "y": 0.0}
+    drag = lambda t, q, v, p: 0.5 * p["c"] * (v["x"] ** 2 + v["y"] ** 2)
+    rod = lj.System(rod_pendulum.lagrangian, dict(rod_pendulum.constraints), dissipation=drag)
+    on_rod = lj.floquet(rod, 0.0, *start, PARAMS | {"c": c}, period)
+    assert on_rod.multipliers.shape == (2,)
+    np.testing.assert_allclose(on_rod.liouville, np.exp(-c * period), rtol=1e-11)
+    np.testing.assert_allclose(on_rod.product, np.exp(-c * period), rtol=1e-10)
+
+
+@pytest.mark.exhaustive
+def test_equations_that_fail():
+    """A degenerate L and a NaN parameter are named in the message, also in the search for an orbit."""
+    massless = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2 - q["x"] ** 2 - (q["y"] - q["x"]) ** 2)
+    start = {"x": 1.0, "y": 1.0}, {"x": 0.0, "y": 0.0}
+    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
+        lj.floquet(massless, 0.0, *start, None, 1.0)
+    with pytest.raises(ValueError, match="the mass matrix is singular in coordinate 'y'"):
+        lj.periodic_orbit(massless, start, 4.0)
+    with pytest.raises(ValueError, match="L is nan at t = 0"):
+        lj.periodic_orbit(pendulum, (1.0, 0.0), 2.0, PARAMS | {"g": np.nan})
+
+
+def test_pendulum():
+    """M = 1 + (dT/dE) f dEᵀ in closed form, and both multipliers are 1 for a known reason."""
+    amplitude = 2.0
+    found = lj.floquet(pendulum, 0.0, amplitude, 0.0, PARAMS, swinging(amplitude))
+    g_over_l = PARAMS["g"] / PARAMS["l"]
+    slope = slope_of_swinging(amplitude)
+    # With v = 0, f = (0, -g/l sin q). A start shifted by dq returns after T + T'dq, so after T it is off by -f T' dq.
+    exact = np.array([[1.0, 0.0], [slope * g_over_l * np.sin(amplitude), 1.0]])
+    np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
+    np.testing.assert_array_equal(found.multipliers, [1.0, 1.0])
+    assert found.trivial.all() and "1 (along the motion), 1 (across energies)" in repr(found)
+    assert bool(found.stable) and "linearly stable" in found.verdict
+    # Twin: at the equilibrium no multiplier is trivial; they are e^{±i ω T}.
+    rest = lj.floquet(pendulum, 0.0, 0.0, 0.0, PARAMS, 1.0)
+    np.testing.assert_allclose(rest.multipliers, np.exp([1j * np.sqrt(g_over_l), -1j * np.sqrt(g_over_l)]), rtol=1e-9)
+    assert not rest.trivial.any()

@@ -1,13 +1,13 @@
-"""Lyapunov exponents against closed forms of linear systems, sums from damping, and SciPy for chaos."""
+"""Lyapunov exponents against closed forms of linear systems, sums from damping, published chaos; through switches."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate
 
 import lagjax as lj
 from lagjax.analysis.orbits.lyapunov import _estimates
+from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, PERIOD, E, block, bounce, bouncing, stick_slip
 from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, pendulum, rod_pendulum
 
@@ -113,34 +113,13 @@ def thrown(energy, y, vy):
     return np.array([0.0, y]), np.array([np.sqrt(2 * energy - y**2 + 2 * y**3 / 3 - vy**2), vy])
 
 
-def by_scipy(start, times):
-    """The largest exponent over `times`, by the variational equations and renormalisation."""
-
-    def rate(t, w):
-        x, y, u, v, a, b, c, d = w
-        force = [-x - 2 * x * y, -y - x**2 + y**2]
-        return [u, v, *force, c, d, -(1 + 2 * y) * a - 2 * x * b, -2 * x * a - (1 - 2 * y) * b]
-
-    state, tangent, grown = np.concatenate(start), np.array([1.0, 0.5, -0.25, 0.75]), []
-    for a, b in zip(times[:-1], times[1:]):
-        end = integrate.solve_ivp(rate, [a, b], [*state, *tangent], method="DOP853", rtol=1e-9, atol=1e-10).y[:, -1]
-        state, size = end[:4], np.linalg.norm(end[4:])
-        tangent = end[4:] / size
-        grown.append(np.log(size))
-    quarter = len(grown) // 4
-    return np.sum(grown[quarter:]) / (times[-1] - times[quarter])
-
-
 @pytest.mark.exhaustive
 def test_henon_heiles():
-    """The motion is chaotic at E = 1/6 and regular at 1/12; SciPy's exponents agree within the uncertainty."""
+    """The motion is chaotic at E = 1/6, with the published exponent, and regular at 1/12."""
     ts = np.linspace(0.0, 1500.0, 751)
     for energy, y, vy, sensitive in ((1 / 6, -0.2, 0.1, True), (1 / 12, 0.1, 0.0, False)):
-        start = thrown(energy, y, vy)
-        found = lj.lyapunov_exponents(henon_heiles, *start, ts=ts, count=4)
+        found = lj.lyapunov_exponents(henon_heiles, *thrown(energy, y, vy), ts=ts, count=4)
         assert bool(found.sensitive) == sensitive
-        independent = by_scipy(start, np.linspace(0.0, 1500.0, 151))
-        assert abs(float(found.exponents[0]) - independent) < 2 * float(found.uncertainty[0])
         # Exponents come in pairs; two are zero: along the motion, and across energies.
         pairs = found.exponents + found.exponents[::-1]
         np.testing.assert_allclose(pairs, 0.0, atol=float(np.max(found.uncertainty)))
@@ -150,19 +129,33 @@ def test_henon_heiles():
         assert not sensitive or abs(found.exponents[0] - 0.13) < found.uncertainty[0]
 
 
-def duffing_lagrangian(t, q, v, p):
-    """A driven mass in a double well."""
-    return 0.5 * v**2 + 0.5 * q**2 - 0.25 * q**4 + p["f"] * q * jnp.cos(t)
+BALL = {"A": 1.8 * FLIPS, "omega": 8.0, "e": E}
 
 
 @pytest.mark.exhaustive
-def test_lanes_of_the_driven_duffing():
-    """Lanes over the drive's strength agree with single runs, chaotic or not; their exponents sum to -c."""
-    duffing = lj.System(duffing_lagrangian, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2)
-    ts = np.linspace(0.0, 600.0, 301)
-    run = lambda f: lj.lyapunov_exponents(duffing, 1.0, 0.0, {"f": f, "c": 0.25}, ts=ts, count=2)
-    lanes = jax.jit(jax.vmap(run))(jnp.array([0.1, 0.4]))
-    np.testing.assert_allclose(jnp.sum(lanes.exponents, axis=1), -0.25, atol=1e-7)
-    assert list(lanes.sensitive) == [False, True] and "neighbours part in 1 of them" in repr(lanes)
-    alone = run(0.1)
-    np.testing.assert_allclose(lanes.exponents[0], alone.exponents, atol=1e-6)
+def test_ball_on_a_table():
+    """Below the flip log|μ|/T of the orbit's multipliers, of which trace and product are known; far above it, chaos.
+
+    At each impact areas shrink by e², which the sum of the exponents shows.
+    """
+    ts = np.arange(301) * PERIOD
+    t, q, v, trace = bounce(0.07)
+    regular = lj.lyapunov_exponents(bouncing, q, v, BALL | {"A": 0.07}, ts=t + ts, count=2)
+    exact = np.log(np.abs(np.roots([1.0, -trace, E**2]))) / PERIOD
+    np.testing.assert_array_less(np.abs(regular.exponents - np.sort(exact)[::-1]), regular.uncertainty)
+    np.testing.assert_allclose(jnp.sum(regular.exponents), 2 * np.log(E) / PERIOD, atol=1e-9)
+    chaotic = lj.lyapunov_exponents(bouncing, 2 * BALL["A"] + 0.5, 0.3, BALL, ts=ts, count=2)
+    assert bool(chaotic.sensitive) and not bool(regular.sensitive)
+    assert np.isnan(chaotic.liouville) and "Liouville" not in repr(chaotic)
+
+
+@pytest.mark.exhaustive
+def test_a_block_that_sticks():
+    """Along a cycle the exponent is zero; across it neighbours meet, -inf, as the multiplier 0 says."""
+    found = lj.lyapunov_exponents(block, 0.1, 0.25, BELT, ts=np.linspace(0.0, 10 * stick_slip(BELT), 101), count=2)
+    assert bool(found.ended) and abs(found.exponents[0]) < found.uncertainty[0]
+    assert found.exponents[1] == -np.inf and found.uncertainty[1] == 0
+    assert "-inf" in repr(found) and "neighbours meet" in repr(found)
+    # From the time at which growth is counted to a whole number of periods later, nothing has grown.
+    np.testing.assert_allclose(np.sum(found.growth[30:90, 0]), 0.0, atol=1e-7)
+    found.plot()

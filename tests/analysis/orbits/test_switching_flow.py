@@ -1,12 +1,10 @@
 """Orbits with switches: bouncing, sticking and slipping, walking and striking, by closed forms and SciPy."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, optimize
+from scipy import integrate
 
 import lagjax as lj
 
@@ -32,8 +30,7 @@ def falling(t, q, v, p):
 
 bouncing = lj.Hybrid({"flying": lj.System(falling)}, [lj.Switch("flying", to="flying", when=table, reset=bounced)])
 bouncing_by_element = lj.System(
-    falling,
-    elements={"table": lj.Contact(lambda t, q, p: table(t, q, None, p), restitution=lambda p: p["e"])},
+    falling, elements={"table": lj.Contact(lambda t, q, p: table(t, q, None, p), restitution=lambda p: p["e"])}
 )
 OMEGA, E = 8.0, 0.8
 PERIOD = 2 * np.pi / OMEGA
@@ -127,24 +124,6 @@ def test_derivatives_and_lanes():
     np.testing.assert_allclose(jax.jit(jax.grad(start))(0.07), slope[1], rtol=1e-9)
 
 
-@pytest.mark.exhaustive
-def test_derivatives_of_multipliers():
-    """The derivative by A of the trace of M, in both modes, against the closed form. Twin: a table of another A."""
-    t, q, v, _ = bounce(0.07)
-
-    def trace(A):
-        orbit = lj.periodic_orbit(bouncing, (q, v), PERIOD, {"A": A, "omega": OMEGA, "e": E}, t=t)
-        return jnp.sum(lj.floquet(orbit).multipliers.real)
-
-    def exact(A):
-        curved = G - A * OMEGA**2 * jnp.sin(jnp.arccos(PUSHES / (A * OMEGA)))
-        return -2 * E + (1 + E) ** 2 * curved / G
-
-    slope = jax.grad(exact)(0.07)
-    np.testing.assert_allclose([jax.jacfwd(trace)(0.07), jax.grad(trace)(0.07)], [slope, slope], rtol=1e-10)
-    assert abs(slope - jax.grad(exact)(0.0707)) > 0.1
-
-
 # A mass on a belt: the spring pulls it off where it reaches the force of sticking.
 
 
@@ -182,44 +161,6 @@ def test_stick_slip():
         assert found.trivial.tolist() == [True, False] and bool(found.attracts)
         assert "belt sticks" in repr(orbit) and "0 within the errors of M, as after sticking" in repr(found)
         assert isinstance(orbit.trajectory, lj.HybridTrajectory)
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_a_period():
-    """The derivative by μ of the period of sticking and slipping, in both modes. Twin: that of the wait alone."""
-    period = lambda mu: lj.periodic_orbit(block, (0.1, 0.25), 6.5, BELT | {"mu": mu}).period
-    h = 1e-6
-    slope = (stick_slip(BELT | {"mu": 0.5 + h}) - stick_slip(BELT | {"mu": 0.5 - h})) / (2 * h)
-    np.testing.assert_allclose([jax.jacfwd(period)(0.5), jax.grad(period)(0.5)], [slope, slope], rtol=1e-8)
-    assert abs(slope + 2 / BELT["k"] / BELT["V"]) > 0.1
-
-
-def stribeck(speed, p):
-    """Friction that falls with the speed."""
-    return p["mu"] + (p["static"] - p["mu"]) * jnp.exp(-speed / p["slow"])
-
-
-@pytest.mark.exhaustive
-def test_stick_slip_with_a_stribeck_curve():
-    """The period by SciPy, which follows the slip; twin: with the constant friction the period is another."""
-    system = lj.System(block_lagrangian, elements={"belt": lj.Friction(against_belt, stribeck, normal=1.0)})
-    p = BELT | {"slow": 0.3}
-    mu, static, V, k = p["mu"], p["static"], p["V"], p["k"]
-
-    def rate(t, y):
-        return [y[1], -k * y[0] + mu + (static - mu) * np.exp(-(V - y[1]) / p["slow"])]
-
-    sticks: Any = lambda t, y: y[1] - V
-    sticks.terminal, sticks.direction = True, 1
-    # It starts at the end of sticking, where the acceleration is zero, too.
-    slip = integrate.solve_ivp(
-        rate, [0, 20], [static / k, V], events=sticks, method="DOP853", rtol=1e-13, atol=1e-14, max_step=0.01
-    )
-    exact = slip.t[-1] + (static / k - slip.y[0, -1]) / V
-    orbit = lj.periodic_orbit(system, (0.1, V), exact, p)
-    np.testing.assert_allclose(orbit.period, exact, rtol=1e-9)
-    np.testing.assert_allclose(lj.floquet(orbit).multipliers, [1.0, 0.0], atol=1e-9)
-    assert abs(exact - stick_slip(BELT)) > 1e-2
 
 
 # A rimless wheel that walks down a slope.
@@ -270,9 +211,6 @@ def test_rimless_wheel():
         lj.periodic_orbit(wheel, (1.0, 2.0), exact, WHEEL)
 
 
-# An oscillator that strikes a wall.
-
-
 def driven(t, q, v, p):
     """A unit mass on a spring with a driving force."""
     return 0.5 * v**2 - 0.5 * q**2 + p["f"] * q * jnp.cos(p["omega"] * t)
@@ -285,46 +223,3 @@ def damping(t, q, v, p):
 
 wall = lj.Stop(lambda t, q, p: q, high=0.1, restitution=lambda p: p["e"])
 striking = lj.System(driven, dissipation=damping, elements={"wall": wall})
-STRIKES = {"f": 0.75, "omega": 2.0, "c": 0.125, "e": 0.7}
-
-
-@pytest.mark.exhaustive
-def test_impact_oscillator():
-    """One impact in a period: the solution between impacts is known, and that of M: two flows and the saltation matrix.
-
-    Shaw & Holmes, *J. Sound Vib.* 90 (1983) 129. Twin: without saltation, R = diag(1, -e), M is another.
-    """
-    f, omega, c, e = STRIKES.values()
-    period, own = 2 * np.pi / omega, np.sqrt(1 - c**2 / 4)
-    response = f / (1 - omega**2 + 1j * c * omega)
-
-    def steady(t):
-        at = response * np.exp(1j * omega * t)
-        return np.array([at.real, (1j * omega * at).real])
-
-    def flow(t):
-        s, k = np.sin(own * t), np.cos(own * t)
-        return np.exp(-c * t / 2) * np.array([[k + c / 2 / own * s, s / own], [-s / own, k - c / 2 / own * s]])
-
-    def left(unknown):
-        phase, speed = unknown
-        end = steady(phase) + flow(period) @ (np.array([0.1, -e * speed]) - steady(phase))
-        return end - [0.1, speed]
-
-    phase, speed = optimize.root(left, [1.0, 2.0], tol=1e-14).x
-    assert speed > 0 and np.abs(left([phase, speed])).max() < 1e-12
-    after = 0.4 * period
-    at = phase + after
-    q, v = steady(at) + flow(after) @ (np.array([0.1, -e * speed]) - steady(phase))
-    orbit = lj.periodic_orbit(striking, (q + 0.01, v - 0.01), period, STRIKES, t=at)
-    np.testing.assert_allclose([orbit.q, orbit.v], [q, v], atol=1e-11)
-
-    accelerations = [f * np.cos(omega * phase) - 0.1 - c * u for u in (speed, -e * speed)]
-    reset = np.diag([1.0, -e])
-    before, beyond = np.array([speed, accelerations[0]]), np.array([-e * speed, accelerations[1]])
-    saltation = reset + np.outer(beyond - reset @ before, [1.0, 0.0]) / speed
-    exact = flow(after) @ saltation @ flow(period - after)
-    found = lj.floquet(orbit)
-    np.testing.assert_allclose(found.monodromy, exact, atol=1e-9)
-    np.testing.assert_allclose(found.product, e**2 * np.exp(-c * period), rtol=1e-9)
-    assert np.abs(flow(after) @ reset @ flow(period - after) - exact).max() > 0.1

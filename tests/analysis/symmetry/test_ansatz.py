@@ -42,3 +42,10 @@ def test_a_wave_that_travels():
     wave = lj.System(lambda t, q, v, p: 0.5 * v**2 - jnp.cos(p["k"] * q - p["w"] * t))
     found = lj.symmetries(wave, 0.3, 0.5, {"k": 2.1, "w": 3.3})
     assert list(found) == ["w p_q - k Jacobi integral with w = 3.3, k = 2.1"]
+
+
+def test_a_weak_disturbance_is_seen():
+    """A field of 1e-6 breaks rotations, and the gap shows that it is small."""
+    disturbed = lambda size: lj.System(lambda t, q, v, p: KEPLER.lagrangian(t, q, v, p) + size * q[0])
+    found = lj.symmetries(disturbed(1e-6), *IN_SPACE, OF_KEPLER)
+    assert list(found) == ["L_x", "Jacobi integral"] and found.gap < 1e10

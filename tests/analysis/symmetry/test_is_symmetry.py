@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.scenes import cross_rails, sliding_wedge
-from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_STONE, ON_PLANE, RADIUS, falling, rolling
+from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, falling, rolling
 
 
 @pytest.mark.exhaustive
@@ -41,19 +41,16 @@ def test_a_moving_constraint_does_work():
         assert lj.is_symmetry(hoop, wrong, *state, params).broken_by() == ["constraint 'plane'"]
 
 
-@pytest.mark.exhaustive
-def test_under_vmap_and_in_a_sweep():
+@pytest.mark.slow
+def test_in_lanes():
     """A rotation is a symmetry of two springs only at the ratio one, to round-off; else the rate is (k_x - k_y) x y."""
-    springs = lambda t, q, v, p: 0.5 * v @ v - 0.5 * (q[0] ** 2 + p["ratio"] * q[1] ** 2)
-    system = lj.System(springs)
-    q, v = np.array([1.0, 0.5]), np.array([0.25, 0.125])
-    test = lambda point: lj.is_symmetry(system, lj.Generator.rotation("z"), q, v, point)
-    swept = lj.sweep(lambda p: (test(p).residual, test(p).rate), {"ratio": np.array([0.5, 1.0, 2.0])}, progress=False)
-    residual, rate = swept.values
-    assert residual[1] < 1e-14 and min(residual[0], residual[2]) > 0.1
-    np.testing.assert_allclose(rate, (1.0 - np.array([0.5, 1.0, 2.0])) * q[0] * q[1], atol=1e-14)
-    batch = jax.vmap(lambda ratio: test({"ratio": ratio}))(jnp.array([0.5, 1.0]))
-    assert batch.holds.tolist() == [False, True] and "1 of 2 lanes" in repr(batch)
+    system = lj.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * (q[0] ** 2 + p["ratio"] * q[1] ** 2))
+    state, ratio = (np.array([1.0, 0.5]), np.array([0.25, 0.125])), np.array([0.5, 1.0, 2.0])
+    turned = lambda ratio: lj.is_symmetry(system, lj.Generator.rotation("z"), *state, {"ratio": ratio})
+    found = jax.vmap(turned)(ratio)
+    assert found.residual[1] < 1e-14 and min(found.residual[0], found.residual[2]) > 0.1
+    np.testing.assert_allclose(found.rate, (1.0 - ratio) * 0.5, atol=1e-14)
+    assert found.holds.tolist() == [False, True, False] and "1 of 3 lanes" in repr(found)
 
 
 def test_energy_in_one_frame_and_not_in_the_other():
@@ -73,8 +70,11 @@ def test_energy_in_one_frame_and_not_in_the_other():
 def test_float32_and_a_force_that_reacts():
     """In float32 a rotation passes within round-off; Coulomb friction breaks the momentum at the predicted rate."""
     q, v = (x.astype(np.float32) for x in IN_SPACE)
-    found = lj.is_symmetry(KEPLER, lj.Generator.rotation("z"), q, v, {"m": np.float32(1.25), "k": np.float32(2.0)})
+    params = {name: np.float32(x) for name, x in OF_KEPLER.items()}
+    found = lj.is_symmetry(KEPLER, lj.Generator.rotation("z"), q, v, params)
     assert found and found.residual.dtype == np.float32
+    all_of_them = lj.symmetries(KEPLER, q, v, params)
+    assert list(all_of_them) == ["L_x", "L_y", "L_z", "Jacobi integral"] and 1e3 < all_of_them.gap < 1e8
     friction = lambda t, q, v, multipliers, p: {"x": -p["mu"] * multipliers["table"], "y": 0.0}
     table = lj.Holonomic(lambda t, q, p: q["y"])
     box = lj.System(falling, {"table": table}, force=friction)
@@ -83,3 +83,12 @@ def test_float32_and_a_force_that_reacts():
     )
     assert not slid and slid.broken_by() == ["the forces"]
     np.testing.assert_allclose(slid.rate, -0.25 * OF_STONE["m"] * OF_STONE["g"], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_no_states_on_the_constraints():
+    """An error says that no state satisfies the constraints."""
+    nowhere = lj.System(falling, {"never": lj.Holonomic(lambda t, q, p: q["x"] ** 2 + 1.0)})
+    state = {"x": 0.5, "y": 1.0}, {"x": 2.0, "y": 0.5}
+    with pytest.raises(ValueError, match="only 0 states were found"):
+        lj.is_symmetry(nowhere, lj.Generator.shift("y"), *state, OF_STONE)

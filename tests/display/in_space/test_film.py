@@ -80,14 +80,6 @@ def test_several_lanes():
     assert "film.js" in film_scripts(plane) and "space.js" not in film_scripts(plane)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e12])
-def test_any_size(size):
-    """A point at rest, a tiny and a huge motion, and a single frame."""
-    data = told(Animation(T, {"": size * POINTS["tip"]}, 25.0, 10)._repr_html_())
-    assert np.isfinite(data["view"]["scale"]) and len({label for _, label in data["grid"]["x"]}) >= 3
-    assert told(Animation(T[:1], {"": size * POINTS["tip"][:1]}, 25.0, 10)._repr_html_())["frames"] == 1
-
-
 def test_a_figure_of_some_instants():
     """One instant has the colours of the film's marks, the nearest last; the first of several is paler."""
     view, _ = view_of(*MOTION.extent(), -60.0, 22.0)

@@ -44,12 +44,8 @@ def test_grids(size):
     for lines, low, high in ((grid.x, LOW[0], HIGH[0]), (grid.y, LOW[1], HIGH[1])):
         assert lines[0] <= size * low + 1e-6 * grid.step and lines[-1] >= size * high - 1e-6 * grid.step
         assert 3 <= len(lines) <= 9 and len(set(labelled(lines, grid.step))) == len(lines)
-
-
-def test_labels():
-    """A height that cannot be told from a line has its label; others have three digits."""
-    assert labelled(np.array([2e-6, 0.1]), 0.1) == ["0.0", "0.1"]
-    assert labelled(np.array([0.0123]), 0.1) == ["0.0123"]
+    # A height that cannot be told from a line has its label; others have three digits.
+    assert labelled(np.array([2e-6, 0.1, 0.0123]), 0.1) == ["0.0", "0.1", "0.0123"]
 
 
 def box(name, half):
@@ -78,13 +74,3 @@ def test_what_looks_away_is_hidden():
     painted = marks(ball, view)
     assert 0.3 * len(SPHERE.faces) < len(painted) < 0.5 * len(SPHERE.faces)
     assert min(mark.nearness for mark in painted) > 0
-
-
-def test_lines_behind_and_before():
-    """A line through a box is painted in pieces, some before it and some behind it."""
-    line = Shape("line", (Anchor(None, np.array([0.0, -3.0, 0.0])), Anchor(None, np.array([0.0, 3.0, 0.0]))))
-    poses = {"a": np.array([0.0, 0, 0, 1, 0, 0, 0])}
-    view, _ = view_of(np.array([-1.0, -3, -1]), np.array([1.0, 3, 1]), -90.0, 10.0)
-    nearness = [mark.nearness for mark in marks(InSpace((line,), poses, {}), view)]
-    faces = [mark.nearness for mark in marks(InSpace((box("a", 0.5),), poses, {}), view)]
-    assert min(nearness) < min(faces) and max(nearness) > max(faces) and len(nearness) > 8

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from lagjax.display.web_page import Page, encoded, fragment, whole
-from lagjax.display.web_page.page import in_bytes
 
 NASTY = '</script><script>alert("1")</script><!-- & \u2028'
 
@@ -53,8 +52,3 @@ def test_a_page_of_its_own(tmp_path):
     assert '<html lang="en">' in text and "<title>A &lt; B</title>" in text and "<h1>A &lt; B</h1>" in text
     assert not re.findall(r"https?://|(?:src|href)=", text)
     assert repr(page).startswith("Page of 3 points, 1 kB: works in a notebook") and page._repr_html_() == page.html
-
-
-def test_sizes_in_words():
-    """Sizes in thousands and millions of bytes."""
-    assert [in_bytes(x) for x in (1, 2000, 999_999, 25e6)] == ["1 kB", "2 kB", "1000 kB", "25.0 MB"]

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from scipy.integrate import quad, solve_ivp
 
 import lagjax as lj
 from tests.counting import compiles
@@ -88,54 +87,29 @@ def rough():
     return data, lj.fit(swing, lj.Record(FAR, q=data, q0=2.0, v0=0.0, sigma=0.6), {"w2": 4.2})
 
 
+def compared(found):
+    """Laplace's approximation, whose covariance is that of JAX's Hessian of the likelihood; and that Hessian."""
+    told, (flat, back) = found.laplace(), ravel_pytree(found.sampling)
+    # Starts come first there.
+    order = np.roll(np.arange(len(flat)), len(found.names))
+    order = np.ix_(order, order)
+    hessian = np.asarray(jax.jit(jax.hessian(lambda x: -found.log_likelihood(back(x))))(flat))[order]
+    inverse = np.linalg.inv(hessian)
+    sizes = np.sqrt(np.outer(np.diag(inverse), np.diag(inverse)))
+    np.testing.assert_allclose(told.covariance / sizes, inverse / sizes, atol=1e-5)
+    return told, hessian
+
+
 @pytest.mark.exhaustive
-def test_large_residuals_against_scipy(rough):
-    """The inverse covariance agrees with second differences of SciPy's motion, and with JAX's Hessian."""
-    data, found = rough
-    told = found.laplace()
-
-    def half(x):
-        field = lambda t, y: [y[1], -x[0] * np.sin(y[0])]
-        motion = solve_ivp(field, (0.0, 6.0), x[1:], "DOP853", FAR, rtol=1e-12, atol=1e-12).y[0]
-        return 0.5 * np.sum(((motion - data) / 0.6) ** 2)
-
-    def second(h):
-        step, n = h * np.eye(3), range(3)
-        mixed = lambda a, b: half(told.mean + a + b) - half(told.mean + a - b)
-        return np.array([[(mixed(step[i], step[j]) + mixed(-step[i], -step[j])) / (4 * h**2) for j in n] for i in n])
-
-    by_differences = (4 * second(1e-3) - second(2e-3)) / 3
-    np.testing.assert_allclose(np.linalg.inv(told.covariance), by_differences, rtol=1e-4, atol=1e-3)
-    # Twin: the Gauss-Newton one differs; so does one with the term S of the other sign.
+def test_large_residuals(rough):
+    """The Hessian has the term S of the residuals' curvature. Twin: the Gauss-Newton one has not."""
+    _, found = rough
+    told, hessian = compared(found)
     gauss_newton = np.linalg.inv(told.gauss_newton)
-    assert not np.allclose(gauss_newton, by_differences, rtol=0.02)
-    assert not np.allclose(2 * gauss_newton - by_differences, by_differences, rtol=0.02)
-    flat, back = ravel_pytree(found.sampling)
-    of_jax = jax.jit(jax.hessian(lambda x: -found.log_likelihood(back(x))))(flat)
-    order = np.ix_([2, 0, 1], [2, 0, 1])
-    np.testing.assert_allclose(np.linalg.inv(told.covariance), np.asarray(of_jax)[order], rtol=1e-6)
+    assert not np.allclose(gauss_newton, hessian, rtol=0.02)
     np.testing.assert_allclose(np.sqrt(np.diag(told.gauss_newton))[:1], found.sd, rtol=1e-6)
     standard = jax.hessian(told.standardised(found.log_likelihood))(jnp.zeros(3))
     np.testing.assert_allclose(standard, -np.eye(3), atol=1e-6)
-
-
-@pytest.mark.exhaustive
-def test_evidence_against_quadrature():
-    """The evidence is nearly the integral of the density over one unknown, the more so the smaller the errors."""
-    off = []
-    for sigma in (0.4, 0.1):
-        clean = np.asarray(lj.integrate(swing, 2.0, 0.0, {"w2": 4.0}, ts=FAR).q)
-        data = clean + sigma * np.random.default_rng(3).normal(size=15)
-        record = lj.Record(FAR, q=data, q0=2.0, v0=0.0, hold_q=True, hold_v=True, sigma=sigma)
-        found = lj.fit(swing, record, {"w2": 4.05})
-        told, density = found.laplace(), jax.jit(lambda x: found.log_likelihood({"w2": x}))
-        best, (x, sd) = float(density(told.mean[0])), (told.mean[0], told.sd[0])
-        mass = quad(lambda y: np.exp(float(density(y)) - best), x - 8 * sd, x + 8 * sd, epsabs=1e-8)[0]
-        known = np.log(mass) + best - 15 * np.log(sigma) - 7.5 * np.log(2 * np.pi)
-        off.append(abs(told.log_evidence - known))
-    assert off[0] < 0.05 and off[1] < off[0] / 3
-    # Twin: without the width of the density.
-    assert abs(told.log_evidence - (best - 15 * np.log(sigma) - 7.5 * np.log(2 * np.pi))) > 1.0
 
 
 @pytest.mark.exhaustive
@@ -167,23 +141,10 @@ def test_no_peak(rough):
 @pytest.mark.exhaustive
 def test_windows_records_and_a_loss_that_forgives():
     """With independent windows or a robust loss it agrees with JAX's Hessian; joined windows are refused."""
-    of_all = lambda f: jax.jit(jax.hessian(lambda x: -f.log_likelihood(ravel_pytree(f.sampling)[1](x))))
-
-    def compared(found, rtol=1e-5):
-        told, flat = found.laplace(), ravel_pytree(found.sampling)[0]
-        hessian, p = np.asarray(of_all(found)(flat)), len(found.names)
-        order = np.r_[len(flat) - p : len(flat), 0 : len(flat) - p]
-        inverse = np.linalg.inv(hessian[np.ix_(order, order)])
-        scale = np.sqrt(np.diag(inverse))
-        np.testing.assert_allclose(
-            told.covariance / scale / scale[:, None], inverse / scale / scale[:, None], atol=rtol
-        )
-        return told
-
-    rng = np.random.default_rng(0)
-    data = np.asarray(lj.integrate(swing, 2.0, 0.0, {"w2": 4.0}, ts=FAR).q) + 0.1 * rng.normal(size=15)
+    data = np.asarray(lj.integrate(swing, 2.0, 0.0, {"w2": 4.0}, ts=FAR).q)
+    data = data + 0.1 * np.random.default_rng(0).normal(size=15)
     apart = lj.fit(swing, lj.Record(FAR, q=data, sigma=0.1), {"w2": 4.0}, window=2.0, joined=False, restarts=0)
-    told = compared(apart)
+    told, _ = compared(apart)
     assert len(told.names) == 7 and told.names[1] == "q(0) of window 0"
     joined = lj.fit(swing, lj.Record(FAR, q=data, sigma=0.1), {"w2": 4.0}, window=2.0, restarts=0)
     with pytest.raises(ValueError, match="windows of this fit are joined"):
@@ -197,10 +158,6 @@ def test_windows_records_and_a_loss_that_forgives():
     data[4] += 2.0
     wild = lj.Record(FAR, q=data, q0=2.0, v0=0.0, sigma=0.1)
     forgiving = lj.fit(swing, wild, {"w2": 4.0}, loss="cauchy", restarts=0)
-    told = compared(forgiving)
+    told, _ = compared(forgiving)
     assert np.isnan(told.log_evidence) and abs(forgiving.values[0] - 4.0) < 0.3
-    # Twin: least squares give another one.
-    with pytest.warns(lj.FitWarning):
-        squares = lj.fit(swing, wild, {"w2": 4.0}, restarts=0).laplace()
-    assert not np.allclose(squares.sd, told.sd, rtol=0.02)
     assert np.isnan(lj.fit(swing, lj.Record(FAR, q=data, q0=2.0, v0=0.0), {"w2": 4.0}).laplace().log_evidence)
