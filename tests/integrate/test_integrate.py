@@ -10,9 +10,7 @@ from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.integrate.solve.phases import traced_phases
-from lagjax.jaxtools.jaxpr import length
 from lagjax.system import coordinates
-from tests.plain import not_plain
 from tests.systems import DRIVEN_PARAMS, HORIZONTAL, PARAMS, TS, driven, pendulum, rod_pendulum
 
 # A wide swing, from 2 rad at 3 rad/s: nonlinear, and without a symmetry that would raise an order.
@@ -84,20 +82,6 @@ def test_lanes_agree_with_single_runs_and_keep_their_own_failure():
     assert bool((batch.result == lj.RESULTS.start_not_finite)[2])
     assert np.all(np.isnan(batch.q[2]))
     assert "3 successful" in repr(batch) and "not finite" in repr(batch)
-
-
-@pytest.mark.exhaustive
-def test_gradient_of_a_batch():
-    """The gradient of a sum over lanes is the sum of the lanes' gradients, with shared and with batched inputs."""
-    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
-    final = lambda k, start: lj.integrate(
-        system, start, 0.0, {"k": k}, ts=np.array([0.0, 1.0]), rtol=1e-10, atol=1e-10, throw=False
-    ).q[-1]
-    starts = jnp.array([0.5, 1.0, 2.0])
-    total = lambda k: jnp.sum(jax.vmap(lambda start: jax.jit(final)(k * start, start))(starts))
-    # q(1) = start cos(sqrt(k start)).
-    exact = jnp.sum(-(starts**2) * jnp.sin(jnp.sqrt(4 * starts)) / (2 * jnp.sqrt(4 * starts)))
-    np.testing.assert_allclose(jax.grad(total)(4.0), exact, rtol=1e-8)
 
 
 def oscillator(k):
@@ -211,35 +195,3 @@ def test_calls_of_the_host_are_the_users():
     np.testing.assert_allclose(lj.integrate(checked, 0.0, 1.0, ts=ts).q, ts, rtol=1e-12)
     with pytest.raises(Exception, match="through the wall"):
         lj.integrate(checked, 0.0, -1.0, ts=ts)
-
-
-class OwnDopri8(diffrax.Dopri8):
-    """A user's subclass, which is used unchanged."""
-
-
-class OwnTsit5(diffrax.Tsit5):
-    """Another user's subclass."""
-
-
-SHIPPED = [(diffrax.Dopri8(), lj.Dopri8(), OwnDopri8()), (diffrax.Tsit5(), lj.Tsit5(), OwnTsit5())]
-
-
-def by_method(method, **options):
-    """The pendulum on a rod by a method, as a function of gravity."""
-    settings = dict(ts=np.linspace(0.0, 1.0, 3), rtol=1e-9, atol=1e-9, method=method, throw=False) | options
-    return lambda g: lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS | {"g": g}, **settings)
-
-
-@pytest.mark.exhaustive
-@not_plain
-@pytest.mark.parametrize(("shipped", "ours", "own"), SHIPPED, ids=["Dopri8", "Tsit5"])
-def test_methods_of_diffrax_run_in_our_form(shipped, ours, own):
-    """A method of diffrax's gives our program, and says so; a subclass runs unchanged, with the same answer."""
-    g, name = jnp.asarray(PARAMS["g"]), type(ours).__name__
-    operations = lambda method: length(jax.make_jaxpr(lambda g: by_method(method)(g).q)(g).jaxpr)
-    assert operations(shipped) == operations(ours) != operations(own)
-    found, expected = by_method(shipped)(g), by_method(own)(g)
-    for mine, theirs in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((expected.q, expected.v))):
-        np.testing.assert_allclose(mine, theirs, rtol=1e-8, atol=1e-8)
-    assert f"{name} (diffrax's, in lagjax's form), rtol" in repr(found)
-    assert "form)" not in repr(expected) + jax.eval_shape(by_method(ours), g).static.method

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.events.event import crossings_of
-from tests.systems import PARAMS, pendulum, rod_pendulum
+from tests.systems import PARAMS, rod_pendulum
 from tests.tiers import exhaustive_but
 
 G = 10.0
@@ -171,22 +171,6 @@ def test_lanes():
     assert "5 lanes, 0 to 2 each" in repr(found)
 
 
-@pytest.mark.exhaustive
-def test_pendulum_by_its_elliptic_integral():
-    """A Poincaré section by restarting at each end, and a recorded one; bottoms are half a period apart."""
-    special = pytest.importorskip("scipy.special")
-    half = 2 * special.ellipk(np.sin(0.75) ** 2) * np.sqrt(PARAMS["l"] / PARAMS["g"])
-    bottom = {"bottom": lj.Crossing(lambda t, q, v, p: q)}
-    recorded = {"bottom": lj.Crossing(lambda t, q, v, p: q, terminal=False, direction=-1)}
-    t, q, v = 0.0, 1.5, 0.0
-    for k in range(8):
-        end = lj.integrate(pendulum, q, v, PARAMS, ts=[t, t + 10.0], events=bottom).end
-        t, q, v = float(end.t), float(end.q), float(end.v)
-        assert t == pytest.approx((k + 0.5) * half, rel=1e-8)
-    many = lj.integrate(pendulum, 1.5, 0.0, PARAMS, ts=[0.0, 8.2 * half], events=recorded)
-    np.testing.assert_allclose(times(many, "bottom"), half * (2 * np.arange(4) + 0.5), rtol=1e-8)
-
-
 @pytest.mark.optimised
 @pytest.mark.exhaustive
 def test_what_jumps():
@@ -231,16 +215,6 @@ def test_float32():
     np.testing.assert_allclose(traj.end.t, np.arccos(-0.9), atol=1e-3)
 
 
-@pytest.mark.exhaustive
-def test_count_of_what_is_not_kept():
-    """Only crossings up to the end of the motion count, even if there is no room to keep them."""
-    events = EVENTS | {"level": lj.Crossing(lambda t, q, v, p: q - p["level"], terminal=False, most=1)}
-    params = SPRING | {"level": 0.9, "stop": np.cos(1.5)}
-    found = lj.integrate(plant, 0.0, 1.0, params, ts=[0.0, 6.0], events=events).events["level"]
-    assert len(found.found().t) == 1
-    assert int(found.count) == 1
-
-
 # A guard whose slope is infinite or unknown at one instant.
 
 FREE = lj.System(lambda t, q, v, p: 0.5 * v**2)
@@ -271,20 +245,6 @@ def test_an_infinite_slope_does_not_stop_the_motion():
         np.testing.assert_allclose(times(motion, name), roots, rtol=0, atol=2e-14, err_msg=name)
         assert not bool(motion.events[name].uncertain)
     assert int(motion.stats["num_rejected_steps"]) < 1000
-
-
-@pytest.mark.exhaustive
-def test_a_guard_that_is_nowhere_known():
-    """Twin: a guard that is NaN or infinite throughout, or oscillates without end, is called unreliable, and soon."""
-    unknown = {
-        "nan": lambda t, q, v, p: t * jnp.nan,
-        "infinite": lambda t, q, v, p: t * jnp.inf,
-        "without end": lambda t, q, v, p: jnp.sin(1 / t),
-    }
-    with doubt:
-        motion = steep(unknown)
-    assert all(bool(found.uncertain) for found in motion.events.values()) and float(motion.q[-1]) == 10.0
-    assert int(motion.stats["num_rejected_steps"]) < 5000
 
 
 def test_directions_of_diffrax():

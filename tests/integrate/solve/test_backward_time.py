@@ -120,14 +120,6 @@ def test_there_and_back(options):
 
 
 @pytest.mark.exhaustive
-def test_fixed_steps_backward():
-    """A user's controller is reversed together with the times: 200 steps of 0.01."""
-    traj = lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN, dt0=0.01, stepsize_controller=diffrax.ConstantStepSize())
-    assert int(traj.stats["num_steps"]) == 200
-    np.testing.assert_allclose(traj.q, lj.integrate(pendulum, 0.5, 1.0, PARAMS, ts=DOWN).q, atol=1e-8)
-
-
-@pytest.mark.exhaustive
 def test_events_backward():
     """Thrown up to 0 at t = 2 with v = -10: backward it rises to 3.75 at t = 1.5; the direction is that of the run."""
     stone = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)

@@ -1,6 +1,5 @@
 """Motions over the jumps of their forces: closed forms, their derivatives of first and second order, and sliding."""
 
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -100,19 +99,6 @@ def test_derivatives_over_jumps(name, mode):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("name", SLOPES)
-def test_derivatives_where_jumps_are_ignored(name):
-    """Failing twin: by the start it is one, by an edge or a time zero, and behind a wall far off."""
-    function, at, right, wrong = SLOPES[name]
-    found = jax.jacfwd(partial(function, jumps="ignored"), argnums=tuple(range(len(at))))(*at)
-    for of, expected, known in zip(found, right(*at), wrong):
-        if known is not None:
-            np.testing.assert_allclose(of, known, atol=1e-6)
-        elif name == "wall":
-            assert abs(of - expected) > 0.1
-
-
-@pytest.mark.exhaustive
 def test_more_derivatives_of_a_brake():
     """In lanes, and the second ones; twin: the first one in another lane."""
     lanes = jnp.array([1.8, 2.0, 2.3])
@@ -156,21 +142,6 @@ def test_stick_and_slip():
 
 
 @pytest.mark.exhaustive
-def test_a_table():
-    """A force from a table: as from the straight lines between its knots; derivative against a difference quotient."""
-    knots, heights = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
-    tabled = lj.System(kinetic, force=lambda t, q, v, p: p * jnp.interp(q, knots, heights))
-    end = lambda p, **options: lj.integrate(tabled, 1.5, 0.0, p, ts=jnp.array([0.0, 5.0]), **options)
-    exact = end(1.0, jumps="ignored", rtol=1e-12)
-    found = end(1.0)
-    np.testing.assert_allclose(found.q[-1], exact.q[-1], rtol=1e-8)
-    assert found.stats["num_steps"] < end(1.0, jumps="ignored").stats["num_steps"]
-    h = 1e-4
-    quotient = (end(1.0 + h, rtol=1e-12).q[-1] - end(1.0 - h, rtol=1e-12).q[-1]) / (2 * h)
-    np.testing.assert_allclose(jax.grad(lambda p: end(p).q[-1])(1.0), quotient, rtol=1e-6)
-
-
-@pytest.mark.exhaustive
 def test_many_numbers():
     """A gradient by thirty numbers, which replays the steps of each leg; twin: one more number than counted."""
     rubbed = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, force=lambda t, q, v, p: -jnp.sum(p) * jnp.sign(v))
@@ -178,15 +149,6 @@ def test_many_numbers():
     # Rest at the far turning point of a half swing would be at -1 + 2 p; here q = p - (1 - p) cos t until pi.
     found = jax.grad(end)(jnp.full(30, 0.1 / 30))
     np.testing.assert_allclose(found, 1 - np.cos(2.0), rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_a_fit():
-    """The edge and the strength of a brake from its motion without noise; twin: where they started."""
-    ts, true = np.linspace(0.0, 2.0, 21), {"edge": 0.73, "by": 1.7}
-    traj = lj.integrate(brake, 0.0, 2.0, true, ts=ts)
-    fit = lj.fit(brake, lj.Record(ts, traj.q, q0=0.0, v0=2.0), {"edge": 0.5, "by": 1.0})
-    np.testing.assert_allclose([fit.params["edge"], fit.params["by"]], [0.73, 1.7], rtol=1e-9)
 
 
 @pytest.mark.exhaustive

@@ -116,16 +116,6 @@ def test_a_whole_number_that_counts_stays_whole():
     assert of(1.0) == of(2.5) != of(1)
 
 
-@pytest.mark.exhaustive
-def test_a_whole_number_is_an_index():
-    """The motion with a whole number is that of the float, also after a float."""
-    table = jnp.array([1.0, 4.0, 9.0])
-    spring = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * table[p["which"]] * q**2)
-    swing = lambda k, which: float(lj.integrate(spring, 1.0, 0.0, {"k": k, "which": which}, ts=TS).q[-1])
-    for k, which, rate in ((1.0, 1, 2.0), (1, 2, 3.0), (4, 1, 4.0)):
-        assert swing(k, which) == pytest.approx(np.cos(rate * TS[-1]), abs=1e-7)
-
-
 LOOPED = diffrax.Dopri8(scan_kind="lax")
 CONDITION = {"event": diffrax.Event(lambda t, y, args, **kwargs: y[0]["x"] < 0)}
 METHODS = [
@@ -209,16 +199,6 @@ def test_programs_of_many_systems_are_dropped():
     """The number of memory maps stays constant; the twin, which keeps all programs, needs more for each."""
     grown = lambda kept: float(subprocess.check_output([sys.executable, "-c", MANY, kept], text=True))
     assert grown("2") < 40 and grown("100") > 60
-
-
-@pytest.mark.exhaustive
-def test_regular_and_robust_agree():
-    """On regular equations both solves agree to round-off; a program that JAX traces uses the robust one."""
-    at_once = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, rtol=1e-12)
-    traced = jax.jit(lambda p: lj.integrate(rod_pendulum, *HORIZONTAL, p, ts=TS, rtol=1e-12))(PARAMS)
-    for one, other in zip(jax.tree.leaves((at_once.q, at_once.v, at_once.multipliers)),
-                          jax.tree.leaves((traced.q, traced.v, traced.multipliers))):  # fmt: skip
-        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.exhaustive

@@ -115,13 +115,6 @@ def test_constraints_hold():
     np.testing.assert_allclose(-2 * found.multipliers["rod"], v**2 + np.cos(q), atol=1e-7)
 
 
-@pytest.mark.exhaustive
-def test_backward():
-    """Backward from its end the motion is the same."""
-    back = lj.integrate(pendulum, *map(float, exact(4.0)), {"g": 1.0, "l": 1.0}, ts=TS[::-1])
-    np.testing.assert_allclose(back.at(BETWEEN).q, exact(BETWEEN)[0], atol=1e-8)
-
-
 def errors_at_step(h):
     """The largest errors halfway between outputs that are one step apart: by `at`, and by a cubic with slopes v."""
     ts = np.arange(0.0, 4.0 + h / 2, h)

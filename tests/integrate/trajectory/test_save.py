@@ -113,19 +113,6 @@ def test_how_it_ended(tmp_path):
         assert bool(again.result == result) and np.isnan(again.q["x"][-1]) and again.end.t == 0.875
 
 
-@pytest.mark.exhaustive
-def test_methods_and_controllers(tmp_path):
-    """The method and the steps asked for come back, so that `at` continues the motion as before."""
-    pid = dict(method=diffrax.Dopri5(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))
-    implicit = dict(method=lj.Radau5(), max_step=0.1, jump_ts=[0.5])
-    low = dict(events={"low": lj.Crossing(lambda t, q, v, params: q["y"] + 0.9, terminal=False)})
-    for settings in (pid, implicit, low):
-        traj = swing(**settings)
-        again = check(traj, rod, tmp_path / "x.npz")
-        np.testing.assert_array_equal(again.at(0.3).q["x"], traj.at(0.3).q["x"])
-        assert repr(again) == repr(traj)
-
-
 def test_the_method_asked_for(tmp_path):
     """A method, a controller and limits on steps come back, each of its kind."""
     pid = diffrax.PIDController(rtol=1e-6, atol=1e-6)
