@@ -101,16 +101,6 @@ def test_what_is_singular_is_said():
         lj.accelerations(odd, 0.0, *start, None)
 
 
-@pytest.mark.exhaustive
-def test_two_vortices():
-    """Ten thousand steps by Gauss: on the circle, with H and the impulses to round-off. Twin: in the first test."""
-    ts = np.linspace(0.0, 1000.0, 5)
-    motion = lj.integrate(vortices, PAIR, still(PAIR), G, ts=ts, method=lj.Gauss(4), dt0=0.1, estimate_error=False)
-    np.testing.assert_allclose(plane(motion), rotated(ts), atol=1e-12)
-    assert np.ptp(motion.jacobi_integral()) < 1e-15
-    assert np.max(np.ptp(impulses(motion, G), axis=1)) < 1e-14
-
-
 def biot_savart(t, y, strengths):
     """The velocities of point vortices, x before y."""
     z = y[: strengths.size] + 1j * y[strengths.size :]
@@ -232,33 +222,3 @@ def test_a_guiding_centre():
     np.testing.assert_allclose(gauss.q["r"].T, exact[:3], atol=1e-8)
     other = lj.integrate(guiding, TRAPPED, still(TRAPPED), SLOW | {"mu": 1.1}, ts=ts)
     assert np.max(np.abs(other.q["r"].T - exact[:3])) > 1e-2
-
-
-@jax.jit
-def by_runge_kutta(h):
-    """H at a hundred outputs, two thousand steps of order 4 between two."""
-
-    def step(_, y):
-        k1 = drift_rate(y)
-        k2 = drift_rate(y + 0.5 * h * k1)
-        k3 = drift_rate(y + 0.5 * h * k2)
-        return y + h / 6 * (k1 + 2 * k2 + 2 * k3 + drift_rate(y + h * k3))
-
-    def interval(y, _):
-        B = dipole(y[:3])[1]
-        return jax.lax.fori_loop(0, 2000, step, y), 0.5 * y[3] ** 2 + SLOW["mu"] * jnp.sqrt(B @ B)
-
-    return jax.lax.scan(interval, jnp.append(TRAPPED["r"], TRAPPED["u"]), None, length=100)[1]
-
-
-@pytest.mark.exhaustive
-def test_energy_of_a_guiding_centre():
-    """Two hundred thousand steps, four thousand bounces: H does not drift, though K depends on q. Twin: Runge-Kutta."""
-    ts = np.linspace(0.0, 1e4, 101)
-    motion = lj.integrate(
-        guiding, TRAPPED, still(TRAPPED), SLOW, ts=ts, method=lj.Gauss(2), dt0=0.05, estimate_error=False
-    )
-    h = np.asarray(motion.jacobi_integral())
-    assert int(motion.stats["num_steps"]) == 200_000
-    assert np.ptp(h) < 1e-6 and abs(np.polyfit(ts, h, 1)[0]) * ts[-1] < 1e-8
-    assert np.ptp(by_runge_kutta(0.05)) > 1e-2

@@ -244,17 +244,6 @@ def test_rates_of_maxwells_element():
 
 
 @pytest.mark.slow
-def test_maxwells_element():
-    """Two damped points of one vector, which move each other, and a mass: the matrix exponential."""
-    start = np.array([1.0, 0.5, -0.3])
-    motion = lj.integrate(chain, start, np.zeros(3), CHAIN, ts=ONE)
-    right = expm(chain_matrix(**CHAIN)) @ [1.0, 0.0, 0.5, -0.3]
-    np.testing.assert_allclose([*motion.q[-1], motion.v[-1, 0]], right[[0, 2, 3, 1]], rtol=1e-9)
-    twin = expm(chain_matrix(k=4.0, c=3.0)) @ [1.0, 0.0, 0.5, -0.3]
-    assert np.max(np.abs(twin - right)) > 0.1
-
-
-@pytest.mark.slow
 def test_energy_of_a_damped_chain():
     """What the dampers take away is what the chain loses; a state in L gives and takes energy too."""
     ledger = lj.energy_ledger(lj.integrate(chain, np.array([1.0, 0.5, -0.3]), np.zeros(3), CHAIN, ts=ONE))
@@ -312,17 +301,6 @@ def test_no_motion_without_damping():
         lj.accelerations(cubic, 0.0, 1.0, 1.0, 1.0)
 
 
-@pytest.mark.exhaustive
-def test_a_fit_of_a_damper():
-    """The damping of a massless point from the motion of the mass beside it."""
-    ts = np.linspace(0.0, 3.0, 20)
-    start = np.array([1.0, 0.5, -0.3])
-    seen = lj.integrate(chain, start, np.zeros(3), CHAIN, ts=ts).q
-    record = lj.Record(ts, q=seen, q0=start, v0=np.zeros(3), hold_q=True, hold_v=True, sigma=1e-3)
-    found = lj.fit(chain, [record], CHAIN | {"c": 1.0}, free=["c"])
-    np.testing.assert_allclose(found.params["c"], 1.5, rtol=1e-6)
-
-
 @pytest.mark.slow
 def test_a_bounce_keeps_the_cost():
     """A ball that bounces with half its speed, and the integral of its v²: in phases, through the impact."""
@@ -335,19 +313,6 @@ def test_a_bounce_keeps_the_cost():
     # It falls for a second, and then rises for half of one.
     np.testing.assert_allclose(motion.q["cost"][-1], 1 / 3 + 0.5**3 / 3, rtol=1e-9)
     np.testing.assert_allclose(motion.v["cost"][-1], 0.0, atol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_heat_of_dry_friction():
-    """The heat of a block that slides and comes to rest for good, μ m g |v|, is what the spring has lost."""
-    rubbed = lj.System(
-        lambda t, q, v, p: 0.5 * v["x"] ** 2 - 50.0 * q["x"] ** 2,
-        force=lambda t, q, v, p: {"x": -p * jnp.sign(v["x"]), "heat": 0.0},
-        states={"heat": lambda t, q, v, p: p * jnp.abs(v["x"])},
-    )
-    motion = lj.integrate(rubbed, {"x": 0.5, "heat": 0.0}, {"x": 0.0}, 0.3 * 9.81, ts=np.array([0.0, 2.6, 4.0]))
-    np.testing.assert_allclose(motion.q["x"][1:], 0.5 - 16 * 0.02943, atol=1e-9)
-    np.testing.assert_allclose(motion.q["heat"][1:], 50 * (0.25 - motion.q["x"][1:] ** 2), rtol=1e-8)
 
 
 @pytest.mark.slow

@@ -1,10 +1,8 @@
 """Equations of motion against textbook formulas at random states."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.equations import equations_of
@@ -128,18 +126,6 @@ def test_coordinates_of_any_structure_agree():
     expected = a_of(System(vector), 0.0, q, v, params)
     got = a_of(System(by_name), 0.0, name(q), name(v), params)
     np.testing.assert_allclose([got["upper"], got["lower"][0]], expected, rtol=1e-13)
-
-
-@pytest.mark.exhaustive
-def test_a_network_inside_the_lagrangian():
-    """params may be an equinox network; its weights have a gradient through the accelerations."""
-    network = eqx.nn.MLP(2, "scalar", 8, 1, activation=jax.nn.softplus, key=jax.random.key(0), dtype=jnp.float64)
-    system = System(lambda t, q, v, params: 0.5 * jnp.dot(v, v) - params(q))
-    q, v = rng.normal(size=(2, 2))
-    a, _ = accelerations(system, 0.0, q, v, network)
-    np.testing.assert_allclose(a, -jax.grad(network)(jnp.asarray(q)), rtol=1e-12)
-    slope = eqx.filter_grad(lambda net: jnp.sum(accelerations(system, 0.0, q, v, net)[0]))(network)
-    assert float(jnp.max(jnp.abs(slope.layers[0].weight))) > 1e-3
 
 
 def test_time_dependent_mass():

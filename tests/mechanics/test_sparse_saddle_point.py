@@ -145,14 +145,6 @@ def test_undetermined_is_refused():
         lj.accelerations(system, 0.0, q, v, params)
 
 
-@pytest.mark.exhaustive
-def test_undetermined_is_refused_at_the_start_of_a_motion():
-    """The same for a motion, by the verdict inside the compiled program."""
-    system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
-    with pytest.raises(ValueError, match="singular"):
-        lj.integrate(system, q, v, params, ts=np.array([0.0, 0.1]))
-
-
 def acceleration(system, q, v):
     """The sparse solution as a function of gravity and of the length, and the dense one."""
 
@@ -251,34 +243,6 @@ def test_explain_says_so():
     explained = lambda system, *state: lj.explain(system, 0.0, *state)
     assert "banded, half bandwidth 1, 9 equations" in repr(explained(*chain(9)))
     assert "banded" not in repr(explained(*chain(4)))
-
-
-@pytest.mark.exhaustive
-def test_a_motion_stays_on_its_links():
-    """A short motion of 16 links agrees with the dense solution, and keeps constraints and energy."""
-    system, q, v, params = chain(16)
-    hidden = lj.Holonomic(lambda t, q, p: jax.lax.scan(lambda c, x: (c, x + c), 0.0, links(t, q, p))[1])
-    ts = np.linspace(0.0, 0.05, 3)
-    sparse = lj.integrate(system, q, v, params, ts=ts)
-    dense = lj.integrate(lj.System(particles, {"links": hidden}), q, v, params, ts=ts)
-    np.testing.assert_allclose(sparse.q, dense.q, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(sparse.multipliers["links"], dense.multipliers["links"], rtol=1e-7)
-    assert sparse.residual() < 1e-14 and sparse.drift() < 1e-9
-
-
-@pytest.mark.exhaustive
-def test_gradient_of_a_motion():
-    """The derivative of a chain's end by gravity: forward, reverse, and by the difference of two motions."""
-    system, q, v, params = chain(8)
-
-    def end(g):
-        return lj.integrate(system, q, v, params | {"g": g}, ts=np.array([0.0, 0.1]), rtol=1e-11, atol=1e-11).q[
-            -1, -1, 0
-        ]
-
-    forward, reverse = jax.jit(jax.jacfwd(end))(9.81), jax.jit(jax.grad(end))(9.81)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    np.testing.assert_allclose(forward, (end(9.82) - end(9.80)) / 0.02, rtol=1e-5)
 
 
 @pytest.mark.slow

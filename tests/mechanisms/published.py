@@ -65,21 +65,6 @@ def andrews(q, v, p):
     return M, f, g, G
 
 
-def andrews_end(q0, v0, end, p, rtol=1e-13):
-    """(q, v) at `end` by DOP853 on the printed equations, with the constraint at acceleration level."""
-
-    def field(t, y):
-        q, v = y[:7], y[7:]
-        M, f, _, G = andrews(q, v, p)
-        # (d/dt G) v by a complex step: exact to round-off.
-        gamma = -(andrews(q + 1e-30j * v, v + 0j, p)[3].imag / 1e-30) @ v
-        matrix = np.block([[M, G.T], [G, np.zeros((6, 6))]])
-        return np.concatenate([v, np.linalg.solve(matrix, np.concatenate([f, gamma]))[:7]])
-
-    y = solve_ivp(field, (0, end), np.concatenate([q0, v0]), "DOP853", rtol=rtol, atol=rtol).y[:, -1]
-    return y[:7], y[7:]
-
-
 def car_axis(t, q, p):
     """(mass, f, g, G) of the Bari test set: k a = f + Gᵀ λ. G's rows are the factors of its λ1 and λ2."""
     xl, yl, xr, yr = q
@@ -184,16 +169,6 @@ def governor_state(p, field, y):
     sinking = -l * np.cos(angle) * rate * up
     q = np.concatenate([[psi, z], reach * e + height, -reach * e + height])
     return q, np.concatenate([[turn, slide], outwards + sinking, -outwards + sinking])
-
-
-def governor_end(end, p, method="Radau", rtol=1e-12):
-    """(q, v) at `end` in the order (ψ, z, C, D), from the equations of α and z."""
-    field = governor_field(p)
-    start = [0.0, np.pi / 6, 0.5, 0.0, 0.0]
-    # Nothing depends on ψ, so Radau's difference step for its column of zeros grows until it overflows.
-    with np.errstate(over="ignore"):
-        y = solve_ivp(field, (0, end), start, method, rtol=rtol, atol=rtol / 10).y[:, -1]
-    return governor_state(p, field, y)
 
 
 def double_pendulum_end(end, p, rtol=3e-14):

@@ -176,28 +176,6 @@ def test_a_double_pendulum_by_hand():
     np.testing.assert_allclose([turning["shoulder"], turning["elbow"]], expected, atol=1e-12)
 
 
-@pytest.mark.exhaustive
-def test_accelerations_of_an_arm():
-    """Against Pinocchio's articulated-body algorithm, where it is installed."""
-    pinocchio = pytest.importorskip("pinocchio")
-    text = arm()
-    model, theirs = lj.read_urdf(text), pinocchio.buildModelFromXML(text)
-    positions, rates = drawn_at_random(model)
-    q, v = np.zeros(theirs.nq), np.zeros(theirs.nv)
-    for name in theirs.names[1:]:
-        joint = theirs.joints[theirs.getJointId(name)]
-        v[joint.idx_v] = rates[name]
-        # A joint without limits has cosine and sine.
-        turned = [positions[name]] if joint.nq == 1 else [np.cos(positions[name]), np.sin(positions[name])]
-        q[joint.idx_q : joint.idx_q + joint.nq] = turned
-    expected = pinocchio.aba(theirs, theirs.createData(), q, v, -0.3 * v)
-    a, _ = lj.accelerations(model.joint_system(), 0.0, *model.joint_state(positions, rates), None)
-    ours = [a[name] for name in theirs.names[1:]]
-    np.testing.assert_allclose(
-        ours, [expected[theirs.joints[theirs.getJointId(x)].idx_v] for x in theirs.names[1:]], atol=1e-11
-    )
-
-
 BODY = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
 LARGEST = BODY.replace('"1"', '"1.7e308"')
 

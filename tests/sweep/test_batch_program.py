@@ -10,7 +10,6 @@ import pytest
 import lagjax as lj
 from lagjax.display import progress as meter
 from lagjax.jaxtools import jaxpr_identity
-from lagjax.jaxtools.cache import PROGRAMS
 from tests.counting import compiles
 
 K, TABLE = 2.0, np.array([2.0, 7.0])
@@ -153,21 +152,6 @@ def test_a_run_that_draws_numbers():
     random = np.random.default_rng(0)
     run = lambda point: random.normal() * point["x"]
     assert quiet(run, xs(3)).values[0] != quiet(run, xs(3)).values[0]
-
-
-def test_a_limited_number_of_programs_is_kept(monkeypatch):
-    """The most recently used programs stay, and serve a function that is written again."""
-    PROGRAMS.clear()
-    monkeypatch.setattr(PROGRAMS, "most", 3)
-    for k in range(5):
-        quiet(closing_over(float(k)), xs(3))
-    assert len(PROGRAMS) == 3
-    with compiles() as found:
-        quiet(closing_over(4.0), xs(3))
-    assert found == []
-    with compiles() as found:
-        quiet(closing_over(0.0), xs(3))
-    assert found
 
 
 def test_a_long_compile_is_announced(monkeypatch, capsys):

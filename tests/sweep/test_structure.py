@@ -167,22 +167,6 @@ def test_times_of_their_own(tmp_path):
 
 
 @pytest.mark.slow
-def test_part_of_it(store, tmp_path):
-    """Points not run are NaN but have times; the others have values."""
-    import xarray
-
-    half = quiet(run, store=tmp_path / "store", chunk=1, part=(0, 2))
-    data = xarray.open_zarr(tmp_path / "store").load()
-    not_run = data["result"].values == -1
-    assert 0 < not_run.sum() == not_run.size - half.ran and np.array_equal(data["motion.t"], TS)
-    np.testing.assert_array_equal(np.isnan(data["motion.q.x"]).all("motion.t"), not_run)
-    xarray.testing.assert_equal(data, lj.open_sweep(tmp_path / "store", classes=[Pair]).to_xarray())
-    np.testing.assert_allclose(
-        lj.open_sweep(tmp_path / "store", classes=[Pair]).values["motion"].q["x"][~not_run], EXACT[~not_run], atol=1e-8
-    )
-
-
-@pytest.mark.slow
 def test_copied_and_pickled():
     """A copy keeps its functions; pickle refuses what has a lambda, in words, unless the values are in a store."""
     swept = quiet(run)

@@ -66,19 +66,6 @@ def assert_same(found, expected, rtol, atol):
 
 
 @pytest.mark.exhaustive
-def test_same_as_a_loop(looped):
-    """One lane after the other takes the same steps; together, sines round differently, which changes first steps."""
-    in_turn, together = quiet(final_angle_and_slope, layout="map", workers=1), quiet(final_angle_and_slope)
-    assert in_turn.dims == {"g": 3, "angle": 7} and in_turn.ok.all() and together.ok.all()
-    np.testing.assert_array_equal(in_turn.values["steps"], looped["steps"])
-    assert_same(in_turn.values, looped, 1e-10, 1e-12)
-    np.testing.assert_allclose(together.values["steps"], looped["steps"], rtol=0.2)
-    assert_same(together.values, looped, 1e-7, 1e-7)
-    # The gradient integrates as well.
-    assert np.all(in_turn.status.steps > looped["steps"])
-
-
-@pytest.mark.exhaustive
 def test_same_as_vmap_and_whoever_is_beside():
     """Steps are the same as under `jax.vmap`, in other chunks, sorted, and in another order of lanes."""
     swept = quiet(final_angle_and_slope)

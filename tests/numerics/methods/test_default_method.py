@@ -149,25 +149,3 @@ def test_explained(name):
     system, q, params, tight, loose = CASES[name]
     said = repr(lj.explain(system, 0.0, q, rates(q)[::-1], params))
     assert ("by Tsit5 at rtol of 1e-6 and above" in said) == (loose != tight) and f"stepped by {tight}" in said
-
-
-@pytest.mark.exhaustive
-def test_many_coordinates_and_derivatives():
-    """A lattice of forty masses, with arrays and stages in a loop, agrees with Dopri8; derivatives in both modes."""
-    springs = lambda q, params: jnp.sum(0.5 * jnp.diff(q) ** 2 + params["β"] / 4 * jnp.diff(q) ** 4)
-    lattice = lj.System(lambda t, q, v, params: 0.5 * jnp.sum(v**2) - springs(q, params))
-    q0 = jnp.sin(jnp.linspace(0.0, jnp.pi, 40))
-
-    def at_end(params, **settings):
-        return jnp.sum(lj.integrate(lattice, q0, 0 * q0, params, ts=jnp.array([0.0, 20.0]), **settings).q[-1] ** 3)
-
-    params = {"β": jnp.asarray(0.5)}
-    by_dopri = jax.jit(jax.value_and_grad(lambda params: at_end(params, method=lj.Dopri8(), rtol=1e-11, atol=1e-11)))
-    value, slope = by_dopri(params)
-    for derivative in (jax.jacfwd, jax.grad):
-        np.testing.assert_allclose(jax.jit(derivative(at_end))(params)["β"], slope["β"], rtol=1e-6)
-    checkpointed = diffrax.RecursiveCheckpointAdjoint()
-    np.testing.assert_allclose(
-        jax.jit(jax.grad(lambda p: at_end(p, adjoint=checkpointed)))(params)["β"], slope["β"], rtol=1e-6
-    )
-    np.testing.assert_allclose(at_end(params), value, rtol=1e-7)

@@ -100,14 +100,6 @@ def solve(method, ts, dt0):
     )  # fmt: skip
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", [Nystrom8, Nystrom12])
-def test_nystrom_in_a_loop(kind):
-    """Each step of a motion agrees with that of unrolled stages."""
-    one_by_one, looped = (solve(kind(in_a_loop=loop), np.linspace(0.0, END, 3), 0.25).ys for loop in (False, True))
-    np.testing.assert_allclose(looped[0]["angle"], one_by_one[0]["angle"], rtol=1e-14)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [Dopri8, pytest.param(Tsit5, marks=pytest.mark.exhaustive)])
 def test_the_steps_of_diffrax(kind):
