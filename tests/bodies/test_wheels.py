@@ -61,7 +61,7 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
     q, v = in_the_cylinder(turning, 0.5, about_radius)
     for residual in lj.constraint_residual(system, 0.0, q, v, IN_CYLINDER).values():
         np.testing.assert_allclose(residual, 0.0, atol=1e-14)
-    a, _ = lj.accelerations(system, 0.0, q, v, IN_CYLINDER)
+    a, _ = accelerations(system, 0.0, q, v, IN_CYLINDER)
     expected = -(G + SHARE * SMALL * turning * about_radius) / (1 + SHARE)
     np.testing.assert_allclose(a["ball"].position[2], expected, rtol=1e-12)
     radial = q["ball"].position * np.array([1.0, 1.0, 0.0])
@@ -80,7 +80,7 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
         q, v = {"ball": pose}, {"ball": pose.moving(velocity, spin)}
         for residual in lj.constraint_residual(system, 0.0, q, v, params).values():
             np.testing.assert_allclose(residual, 0.0, atol=1e-14)
-        a, _ = lj.accelerations(system, 0.0, q, v, params)
+        a, _ = accelerations(system, 0.0, q, v, params)
         expected = G * np.sin(angle) / (1 + SHARE) * along - speed**2 / path * place / path
         np.testing.assert_allclose(a["ball"].position, expected, atol=1e-12)
 
@@ -108,7 +108,7 @@ def test_a_ball_on_a_turntable():
     for t in (0.0, 0.8):
         for residual in lj.constraint_residual(system, t, q, v, {"rate": 1.5}).values():
             np.testing.assert_allclose(residual, 0.0, atol=1e-15)
-        a, multipliers = lj.accelerations(system, t, q, v, {"rate": 1.5})
+        a, multipliers = accelerations(system, t, q, v, {"rate": 1.5})
         expected = SHARE / (1 + SHARE) * 1.5 * np.cross([0.0, 0.0, 1.0], velocity)
         np.testing.assert_allclose(a["ball"].position, expected, atol=1e-13)
         # Nothing but the table pushes it, along the table.

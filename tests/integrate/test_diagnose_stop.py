@@ -167,10 +167,6 @@ def test_a_short_fixed_step():
     assert re.search(r"it needs 9.8e\+03 more.\nFix: max_steps=15000, or longer steps", said), said
 
 
-# x over the depth y of a cycloid: x' is infinite at y = y0 (1 + 1/u0²).
-cycloid = lj.System(lambda y, x, u, p: jnp.sqrt((1 + u**2) / (2 * 9.81 * y)))
-
-
 @pytest.mark.slow
 def test_steps_that_collapse_at_a_singularity():
     """If steps collapse before max_steps, the singularity is named too, with where it happened."""

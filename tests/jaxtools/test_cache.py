@@ -2,7 +2,6 @@
 
 import copy
 import gc
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -13,7 +12,6 @@ from lagjax.jaxtools import cache
 from lagjax.jaxtools.compiled import compiled
 from tests.counting import compiles
 from tests.plain import not_plain
-MAPS = Path("/proc/self/maps")
 
 
 @eqx.filter_jit
@@ -26,12 +24,6 @@ def inside(function, x):
 def called(function, x):
     """A compiled program that holds a function of the user's."""
     return inside(function, x)
-
-
-def maps():
-    """The number of memory maps of this process."""
-    gc.collect()
-    return MAPS.read_bytes().count(b"\n") if MAPS.exists() else 0
 
 
 def programs():

@@ -1,6 +1,5 @@
 """Systems that solve their own equations: checked against L, with constraints, in the user's words where wrong."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,4 +92,3 @@ def test_forward_dynamics_of_the_wrong_kind():
         with pytest.raises((TypeError, ValueError), match=said):
             lj.accelerations(system, 0.0, Q, V, PARAMS)
     assert "forward dynamics" in lj.System(lagrangian, forward_dynamics=polar).functions().__repr__()
-    assert jax.tree.structure(Q) == jax.tree.structure(V)

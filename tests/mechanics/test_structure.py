@@ -144,13 +144,11 @@ def test_a_long_program_is_not_taken_apart(nodes, known):
 
 @not_plain
 @pytest.mark.slow
-@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
-def test_a_long_program_is_explained(nodes, known):
-    """`explain` works without a structure; twin: few nodes."""
-    system, s = mass_by_quadrature(nodes)
+def test_a_long_program_is_explained():
+    """`explain` works without a structure."""
+    system, s = mass_by_quadrature(500)
     report = dict(lj.explain(system, *s[:3]).rows)
-    assert report["mass matrix"] == "positive definite" + ", diagonal, depends on q[0], q[1], q[2]" * known
-    assert report["solved"] == ("3 divisions" if known else "3 equations by elimination")
+    assert (report["mass matrix"], report["solved"]) == ("positive definite", "3 equations by elimination")
 
 
 def test_a_long_mass_matrix_is_not_known_to_be_diagonal():

@@ -108,11 +108,6 @@ def test_another_sweep_is_refused(tmp_path):
         lj.sweep(run(2.0), axes, store=tmp_path / "other", progress=False)
 
 
-def blocks_there(path):
-    """The number of marked blocks, 0 before the store exists."""
-    return 0 if not path.exists() else len(Store(path).blocks) - len(Store(path).missing())
-
-
 def points_there(path):
     """The number of points in the marked blocks."""
     store = Store(path)
@@ -120,17 +115,12 @@ def points_there(path):
     return sum(len(np.r_[store.blocks.points(number)]) for number in there)
 
 
-def wait_for(process, path, count):
-    """Wait until `count` blocks are marked."""
-    deadline = time.monotonic() + 120
-    while blocks_there(path) < count:
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def kill_when(process, path, count):
     """`kill -9` once `count` blocks are marked."""
-    wait_for(process, path, count)
+    deadline = time.monotonic() + 120
+    while not path.exists() or len(Store(path).blocks) - len(Store(path).missing()) < count:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()

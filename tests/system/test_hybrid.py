@@ -76,9 +76,6 @@ def test_a_ball_that_bounces():
     )
 
 
-RESTITUTION, LEVEL = 0.5, 0.0
-
-
 @pytest.mark.exhaustive
 def test_lanes_are_single_runs():
     """Lanes that switch at different times, and different numbers of times, agree with single runs."""

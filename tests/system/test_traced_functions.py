@@ -1,9 +1,7 @@
 """What a function computes is its jaxpr: whatever its values come from, an answer is that of a fresh process."""
 
-import collections
 import contextvars
 import copy
-import dataclasses
 import functools
 import gc
 import importlib

@@ -1,4 +1,4 @@
-"""Mechanisms on constraints from one position to another: a slider-crank and a four-bar linkage against one angle."""
+"""Motions on constraints from one position to another: a slider-crank and a rod, against the equation of one angle."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ from scipy.optimize import brentq
 
 import lagjax as lj
 from lagjax.mechanisms import slider_crank
-from lagjax.mechanisms.mechanism import rod_kinetic_energy, squared_distance
 from tests.mechanisms import published
 
 
@@ -40,28 +39,6 @@ def test_slider_crank():
         crank.params, outputs=9,
     )  # fmt: skip
     assert other.start_velocity.crank.angle > 151.0
-
-
-BASE, CRANK, COUPLER, ROCKER = 3.0, 1.0, 2.5, 2.0
-
-
-def linkage_lagrangian(t, q, v, params):
-    """Three uniform rods of mass one per length; b and c are the ends of the coupler."""
-    still = jnp.zeros(2)
-    kinetic = rod_kinetic_energy(CRANK, still, v["b"]) + rod_kinetic_energy(ROCKER, v["c"], still)
-    kinetic = kinetic + rod_kinetic_energy(COUPLER, v["b"], v["c"])
-    heights = 0.5 * CRANK * q["b"][1] + 0.5 * COUPLER * (q["b"][1] + q["c"][1]) + 0.5 * ROCKER * q["c"][1]
-    return kinetic - params["g"] * heights
-
-
-linkage = lj.System(
-    linkage_lagrangian,
-    {
-        "crank": lj.Holonomic(lambda t, q, params: q["b"] @ q["b"] - CRANK**2),
-        "coupler": lj.Holonomic(lambda t, q, params: squared_distance(q["b"], q["c"]) - COUPLER**2),
-        "rocker": lj.Holonomic(lambda t, q, params: squared_distance(q["c"], jnp.array([BASE, 0.0])) - ROCKER**2),
-    },
-)
 
 
 @pytest.mark.exhaustive

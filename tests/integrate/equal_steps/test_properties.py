@@ -239,6 +239,8 @@ def on_relativistic_spring():
     """An oscillator whose L has a largest velocity."""
     rel = lj.System(lambda t, q, v, params: -jnp.sqrt(1 - v**2) - 0.5 * q**2)
     return rel, (0.5, 0.0), None, TEN, adaptive(rel, (0.5, 0.0), None, TEN).q
+
+
 # Each order of Gauss's method is measured on the double pendulum, each of the splitting on the ellipse.
 ORDERS = [
     *((on_long_ellipse, lj.Splitting(n), steps) for n, steps in

@@ -1,6 +1,5 @@
 """Motions over the jumps of their forces: closed forms, their derivatives of first and second order, and sliding."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
