@@ -99,15 +99,6 @@ def test_a_closed_over_value_is_a_number_of_the_system():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("transform", [lambda f: jax.jit(jax.grad(f)), jax.jacfwd, jax.grad])
-def test_gradient_by_a_closed_over_value(transform):
-    """A value that L closes over has its derivative; before such values were lifted, jit(grad) silently gave zero."""
-    ts, tight = np.array([0.0, 1.0]), {"rtol": 1e-10, "atol": 1e-10}
-    final = lambda k: lj.integrate(oscillator(k), 1.0, 0.0, ts=ts, **tight).q[-1]
-    np.testing.assert_allclose(transform(final)(4.0), -np.sin(2.0) / 4.0, rtol=1e-8)
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("method", [None, lj.Dopri8(), lj.Tsit5()], ids=["default", "8", "5"])
 def test_float32_with_explicit_time(method):
     """Stages at intermediate times stay in float32 even if JAX has float64 enabled."""
@@ -138,23 +129,6 @@ def test_dissipation_and_force_in_motion():
     response, ts = pull / (k - m * rate**2 + 1j * c * rate), np.array([0.0, 1.0, 5.0])
     traj = lj.integrate(driven, response.real, (1j * rate * response).real, DRIVEN_PARAMS, ts=ts, rtol=1e-11)
     np.testing.assert_allclose(traj.q, (response * np.exp(1j * rate * ts)).real, atol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_feedback_and_values_closed_over_where_equations_are_not_written_out():
-    """Baumgarte's rate, and a length that a constraint closes over inside `jit`, are arguments of the program."""
-    there = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS)
-    for drift in ("baumgarte", "none"):
-        traj = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=TS, drift=drift)
-        np.testing.assert_allclose(traj.q["x"], there.q["x"], atol=1e-7)
-
-    @jax.jit
-    def closed_over(length):
-        rod = lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - length**2)
-        system = lj.System(rod_pendulum.lagrangian, {"rod": rod})
-        return lj.integrate(system, {"x": length, "y": 0.0}, HORIZONTAL[1], PARAMS, ts=TS).q["x"]
-
-    np.testing.assert_allclose(closed_over(1.25), there.q["x"], atol=1e-12)
 
 
 @pytest.mark.exhaustive

@@ -126,18 +126,6 @@ def test_redundant_constraints_have_the_shortest_multipliers():
     assert largest(found[0] - alone) <= 1e-11 * largest(alone)
 
 
-@pytest.mark.exhaustive
-def test_contradictory_constraints_are_named():
-    """The same links demanded at another rate contradict each other: an error, and NaN while tracing."""
-    system, q, v, params = chain(10)
-    faster = lambda t, q, params: links(t, q, params)[:2] + t**2
-    broken = lj.System(particles, system.constraints | {"faster": lj.Holonomic(faster)})
-    with pytest.raises(ValueError, match="contradict.*faster|faster.*contradict"):
-        lj.accelerations(broken, 0.0, q, v, params)
-    a, _ = jax.jit(lambda q: lj.accelerations(broken, 0.0, q, v, params))(q)
-    assert np.all(np.isnan(a))
-
-
 def test_undetermined_is_refused():
     """A massless end hangs on one link: its acceleration across it is not determined, and an error says so."""
     system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
@@ -174,18 +162,6 @@ def test_derivatives_in_both_modes():
         np.testing.assert_allclose(
             jax.jit(mode(of(sparse)))(params["m"]), expected, rtol=0, atol=1e-11 * largest(expected)
         )
-
-
-@pytest.mark.exhaustive
-def test_second_derivatives_and_lanes():
-    """Forward-over-forward derivatives and a batch agree with the dense equations."""
-    system, q, v, params = chain(8)
-    sparse, dense = acceleration(system, q, v)
-    heavier = lambda s: params | {"m": params["m"] * jnp.where(np.arange(8) == 2, s, 1.0)}
-    twice = lambda f: jax.jit(jax.jacfwd(jax.jacfwd(lambda s: f(heavier(s)))))(1.0)
-    np.testing.assert_allclose(twice(sparse), twice(dense), rtol=0, atol=1e-10 * largest(twice(dense)))
-    lanes = lambda f: jax.jit(jax.vmap(lambda g: f(params | {"g": g})))(jnp.array([1.0, 9.81]))
-    np.testing.assert_allclose(lanes(sparse), lanes(dense), rtol=0, atol=1e-12 * largest(lanes(dense)))
 
 
 def largest_array(function, *args):
@@ -235,14 +211,6 @@ def test_without_constraints():
     np.testing.assert_allclose(a, np.broadcast_to([0.0, -9.81], (20, 2)), rtol=1e-14)
     with pytest.raises(ValueError, match="singular"):
         lj.accelerations(free, 0.0, q, v, params | {"m": np.where(np.arange(20) == 3, 0.0, params["m"])})
-
-
-@pytest.mark.exhaustive
-def test_explain_says_so():
-    """`explain` names the band and its size; for a small system it names none."""
-    explained = lambda system, *state: lj.explain(system, 0.0, *state)
-    assert "banded, half bandwidth 1, 9 equations" in repr(explained(*chain(9)))
-    assert "banded" not in repr(explained(*chain(4)))
 
 
 @pytest.mark.slow

@@ -111,35 +111,6 @@ def test_more_derivatives_of_a_brake():
 MASS, SPRING, GRAVITY = 1.0, 100.0, 9.81
 
 
-@pytest.mark.slow
-def test_stick_and_slip():
-    """A block pulled by a spring on a floor with friction: it sticks, and slips u (s - sin(ω s)/ω) at a time.
-
-    Twin: pulled twice as fast.
-    """
-    pulled = lj.System(
-        lambda t, q, v, p: 0.5 * v**2 - 0.5 * 4.0 * (q - p["u"] * t) ** 2,
-        force=lambda t, q, v, p: -p["mu"] * jnp.sign(v),
-    )
-
-    def right(t, u, mu):
-        q = 0.0
-        while True:
-            # The spring is as strong as friction.
-            begin = (mu / 4.0 + q) / u
-            if t <= begin:
-                return q
-            if t <= begin + np.pi:
-                return q + u * ((t - begin) - np.sin(2 * (t - begin)) / 2)
-            q += u * np.pi
-
-    ts = np.linspace(0.0, 12.0, 13)
-    traj = lj.integrate(pulled, 0.0, 0.0, {"u": 0.5, "mu": 1.0}, ts=ts)
-    np.testing.assert_allclose(traj.q, [right(t, 0.5, 1.0) for t in ts], rtol=1e-8, atol=1e-9)
-    assert traj.stats["num_jumps"] >= 6
-    assert abs(traj.q[-1] - right(12.0, 1.0, 1.0)) > 1
-
-
 @pytest.mark.exhaustive
 def test_many_numbers():
     """A gradient by thirty numbers, which replays the steps of each leg; twin: one more number than counted."""

@@ -18,7 +18,6 @@ from lagjax.integrate.stepping.tolerances import (
     shared,
     tolerances_at,
 )
-from lagjax.numerics.methods.radau import SimplifiedNewton
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, TS, driven, motion, pendulum, rod_pendulum
 
@@ -151,27 +150,21 @@ def test_at_round_off_without_mass():
 
 @pytest.mark.exhaustive
 def test_rest_at_zero_in_any_units():
-    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps.
-
-    Twin: with a root finder whose tolerance is of the order of a metre, nanometres take other steps.
-    """
+    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps."""
     late = lj.System(
         lambda t, q, v, p: 0.5 * v**2,
         force=lambda t, q, v, p: p["unit"] * t**3 - 100 * q - 50 * v - 1e3 * q**3 / p["unit"] ** 2,
     )
 
-    def of(unit, method):
-        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=method, rtol=1e-6)
+    def of(unit):
+        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=lj.Radau5(), rtol=1e-6)
         return float(traj.q[-1]) / unit, int(traj.stats["num_steps"])
 
-    in_metres = lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-6, atol=1e-9))
-    (q, steps), (absolute, of_absolute) = of(1.0, lj.Radau5()), of(1.0, in_metres)
+    q, steps = of(1.0)
     for unit in (2.0**-30, 2.0**54):
-        found, count = of(unit, lj.Radau5())
+        found, count = of(unit)
         assert count == steps
         np.testing.assert_allclose(found, q, rtol=1e-13)
-    found, count = of(2.0**-30, in_metres)
-    assert abs(found / absolute - 1) > 1e-10 or count != of_absolute
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import ellipk
 
 import lagjax as lj
 from lagjax.integrate.trajectory.films import hermite
@@ -105,16 +104,6 @@ def test_continued_as_it_was_asked_for():
     assert (asked.drift, asked.by_size, asked.jumps, asked.method) == ("project", True, "ignored", None)
 
 
-@pytest.mark.exhaustive
-def test_constraints_hold():
-    """States are projected and have multipliers: Newton's law along the rod, 2 λ = -(v² - g y) for g = x² + y² - 1."""
-    found, (q, v) = rotate().at(BETWEEN), exact(BETWEEN)
-    np.testing.assert_allclose(found.q["x"], np.sin(q), atol=1e-8)
-    np.testing.assert_allclose(found.q["x"] ** 2 + found.q["y"] ** 2, 1.0, atol=1e-14)
-    np.testing.assert_allclose(found.q["x"] * found.v["x"] + found.q["y"] * found.v["y"], 0.0, atol=1e-14)
-    np.testing.assert_allclose(-2 * found.multipliers["rod"], v**2 + np.cos(q), atol=1e-7)
-
-
 def errors_at_step(h):
     """The largest errors halfway between outputs that are one step apart: by `at`, and by a cubic with slopes v."""
     ts = np.arange(0.0, 4.0 + h / 2, h)
@@ -142,16 +131,6 @@ def test_where_there_is_no_motion():
             ended.at(t)
     with pytest.raises(TypeError, match="a time or an array of times, not 'noon'"):
         ended.at("noon")
-
-
-@pytest.mark.exhaustive
-def test_at_an_event():
-    """The state there is that of the event; in a program a motion goes as far as it."""
-    traj, end = swing(events={"lowest": lj.Crossing(lambda t, q, v, p: q)}), float(ellipk(np.sin(AMPLITUDE / 2) ** 2))
-    assert abs(float(traj.at(traj.end.t).q)) < 1e-9 and abs(float(traj.end.t) - end) < 1e-8
-    np.testing.assert_allclose(traj.at(end - 0.01).q, exact(end - 0.01)[0], atol=1e-9)
-    inside = jax.jit(lambda traj, t: traj.at(t).q)(traj, np.array([-0.1, 1.0, 3.0]))
-    assert list(np.isnan(inside)) == [True, False, True] and abs(inside[1] - exact(1.0)[0]) < 1e-9
 
 
 @pytest.mark.exhaustive
