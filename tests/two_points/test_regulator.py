@@ -8,8 +8,7 @@ from scipy.linalg import solve_continuous_are
 import lagjax as lj
 
 mass = lj.System(
-    lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2,
-    force=lambda t, q, v, p: p["push"] + 0.0 * v,
+    lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2, force=lambda t, q, v, p: p["push"] + 0.0 * v
 )
 
 
@@ -53,10 +52,7 @@ def test_questions_that_are_wrong():
 
 @pytest.mark.slow
 def test_an_upright_pole():
-    """A pole on a cart, by its angle and by its tip on a rod: one cost to go, one push; under it the motion comes back.
-
-    From nearby, the integrated cost of the motion under the feedback is the cost to go; without it the pole falls.
-    """
+    """A pole on a cart, by its angle and by its tip on a rod: one set of roots, and one push."""
     cart, g, length = {"M": 1.0, "m": 0.3}, 9.81, 0.5
 
     def by_angle(t, q, v, p):
@@ -88,16 +84,6 @@ def test_an_upright_pole():
     lean = {"x": 0.0, "angle": 1e-3}
     same = {"x": 0.0, "tip": jnp.array([length * 1e-3, length])}
     assert abs(one.control(lean, zero)["push"] - other.control(same, rest)["push"]) < 1e-9
-
-    held = lj.System(by_angle, force=lambda t, q, v, p: {"x": one.control(q, v)["push"], "angle": 0.0})
-    ts = np.linspace(0.0, 20.0, 4001)
-    motion = lj.integrate(held, lean, zero, cart, ts=ts)
-    x = np.stack([motion.q["angle"], motion.q["x"], motion.v["angle"], motion.v["x"]])
-    push = -np.asarray(one.gain)[0] @ x
-    spent = np.trapezoid(x[1] ** 2 + 10 * np.sin(x[0]) ** 2 + push**2, ts)
-    assert abs(spent / (one.cost_to_go[0, 0] * 1e-6) - 1) < 1e-3 and abs(motion.q["angle"][-1]) < 1e-6
-    fallen = lj.integrate(angle, lean, zero, {**cart, "push": 0.0}, ts=[0.0, 3.0])
-    assert abs(fallen.q["angle"][-1]) > 1.0
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """What steps of equal length keep: symplecticity, reversibility, orders on motions of every kind, derivatives."""
 
-import dataclasses
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,13 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.integrate.equal_steps import loop, rattle_step
-from lagjax.numerics import tableau
 from lagjax.scenes import cross_rails
 from tests import by_hand
 from tests.behaviour.test_orders import computed, double_pendulum_equation, orders, states, within
 from tests.integrate.equal_steps.test_equal_steps import TURN, G, adaptive, ellipse, fall, kepler, length, rod, run
-from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, reference, rods_from_angles
+from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, reference, rods_from_angles
 
 # Steps that are too long for the tolerance are meant.
 pytestmark = pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
@@ -56,29 +52,9 @@ def measured(exact, form, method, steps):
     ],
 )
 def test_order_of_a_double_pendulum(exact, form, method):
-    """Its order in places, velocities and multipliers, by angles and by rods. Twin: `test_a_wrong_order_is_seen`."""
+    """Its order in places, velocities and multipliers, by angles and by rods; each order is the others' twin."""
     found = measured(exact, form, method, STEPS[method])
     assert all(within(method.error_order(), found)), found
-
-
-@pytest.mark.exhaustive
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["nodes of constraints", "lengths of steps"])
-def test_a_wrong_order_is_seen(exact, kind, monkeypatch):
-    """Failing twins: the constraints' forces at equidistant nodes; the lengths of Suzuki's steps with another root."""
-    right, part = tableau(3), 1 / (4 - 4 ** (1 / 2.9))
-    wrong = right.to_nodes + np.array([0.0, 0.06, -0.06, 0.0])[:, None] / right.weights * np.array([0.2, 0.6, 0.2])
-    monkeypatch.setattr(loop, "tableau", lambda s: right._replace(to_nodes=wrong))
-    monkeypatch.setattr(rattle_step, "lengths", lambda order: np.array([part, part, 1 - 4 * part, part, part]))
-    method = dataclasses.replace(lj.Gauss(3), newton=True)
-    if kind == "lengths of steps":
-        # With a pace of one it is a program of its own: programs are kept.
-        method = lj.Splitting(4, pace=lambda t, q, params: 1.0)
-    found = measured(exact, "constrained", method, STEPS[dataclasses.replace(method, **USUAL[type(method)])])
-    assert not any(within(method.error_order(), found)), found
-
-
-USUAL = {lj.Gauss: {"newton": False}, lj.Splitting: {"pace": None}}
 
 
 def momenta(v, q):
@@ -96,18 +72,6 @@ def by_angles(x, method, span, **options):
     q, p = jnp.split(x, 2)
     end = run(double_pendulum, (q, rates(p, q)), DOUBLE_PARAMS, [0.0, span], method, 0.1, **options).end
     return jnp.concatenate([end.q, momenta(end.v, end.q)])
-
-
-def by_rods(x, span):
-    """The same after a span of the rods' motion."""
-    q, p = jnp.split(x, 2)
-    start = rods_from_angles(q, rates(p, q), DOUBLE_PARAMS)
-    end = run(double_rods, start, DOUBLE_PARAMS, [0.0, span], lj.Gauss(3), 0.05).end
-    rods = jnp.stack([end.q["first"], end.q["second"] - end.q["first"]])
-    moves = jnp.stack([end.v["first"], end.v["second"] - end.v["first"]])
-    angles = jnp.arctan2(rods[:, 0], -rods[:, 1])
-    turned = jnp.sum(moves * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=1)
-    return jnp.concatenate([angles, momenta(turned / jnp.stack([DOUBLE_PARAMS["l1"], DOUBLE_PARAMS["l2"]]), angles)])
 
 
 def on_orbit(x, method, span):
@@ -133,18 +97,17 @@ CHANGES = {
        for s in (2, 3, 4) for span in (0.1, 3.0)},
     **{f"orbit {n} {span}": (lambda x, n=n, span=span: on_orbit(x, lj.Splitting(n), span), at_pericentre, True)
        for n in (2, 4, 6, 8) for span in (0.1, 6.0)},
-    **{f"rods {span}": (lambda x, span=span: by_rods(x, span), at_swing, True) for span in (0.05, 1.0)},
-    **{f"rod {n}": (lambda x, n=n: on_rod(x, lj.Splitting(n)), at_side, True) for n in (2, 6)},
+    **{f"rod {method}": (lambda x, method=method: on_rod(x, method), at_side, True)
+       for method in (lj.Splitting(2), lj.Splitting(6), lj.Gauss(2), lj.Gauss(3))},
     "angles, Heun": (lambda x: by_angles(x, diffrax.Heun(), 2.0, **FIXED), at_swing, False),
     "rod, Tsit5": (lambda x: on_rod(x, lj.Tsit5(), dt0=None, rtol=1e-4), at_side, False),
-    "rods, wrong rates": (lambda x: by_rods(x, 1.0).at[2:].divide(jnp.array([1.0, 1.1])), at_swing, False),
 }  # fmt: skip
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", CHANGES)
 def test_steps_are_symplectic(name):
-    """Dᵀ J D = J for one step and many of equal length. Twins: other methods, and rates that are no momenta."""
+    """Dᵀ J D = J for one step and many of equal length. Twins: other methods."""
     change, start, symplectic = CHANGES[name]
     D = np.asarray(jax.jit(jax.jacfwd(change))(start()))
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(len(D) // 2))
