@@ -283,36 +283,6 @@ def arm(count):
     return links, hinges, [lj.weight(links)], q, v
 
 
-def on_bodies(tree, q, v):
-    """The poses of the bodies of a tree and their rates, q and v of `lj.multibody`."""
-    return [{name: lj.Pose(*x[:2]) for name, x in both.items()} for both in (tree.poses(q), tree.rates(q, v))]
-
-
-@pytest.mark.exhaustive
-def test_an_arm_in_space():
-    """Seven jointed bodies in maximal coordinates, 49 numbers and 42 equations: accelerations and motion of their tree.
-
-    Twin: without the velocities' terms.
-    """
-    links, hinges, weight, q, v = arm(7)
-    tree, system = lj.Tree(links, hinges), lj.multibody(links, hinges, weight)
-    in_angles, _ = lj.accelerations(tree.system(weight), 0.0, q, v, None)
-    expected = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (v, in_angles))[1]
-    without = jax.jvp(lambda q, v: on_bodies(tree, q, v)[1], (q, v), (jax.tree.map(jnp.zeros_like, v), in_angles))[1]
-    a, multipliers = lj.accelerations(system, 0.0, *on_bodies(tree, q, v), None)
-    assert all(multipliers[name].shape == (5,) for name in hinges)
-    for link in links:
-        np.testing.assert_allclose(a[link.name].position, expected[link.name].position, atol=1e-11)
-        np.testing.assert_allclose(a[link.name].quaternion, expected[link.name].quaternion, atol=1e-11)
-    assert np.abs(a[links[6].name].position - without[links[6].name].position).max() > 0.01
-    ts, tolerances = np.linspace(0.0, 0.5, 3), {"rtol": 1e-12, "atol": 1e-12}
-    of_angles = lj.integrate(tree.system(weight), q, v, None, ts=ts, **tolerances)
-    traj = lj.integrate(system, *on_bodies(tree, q, v), None, ts=ts, **tolerances)
-    places = jax.vmap(tree.poses)(of_angles.q)
-    for link in links:
-        np.testing.assert_allclose(traj.q[link.name].position, places[link.name].position, atol=1e-10)
-
-
 def test_poses_of_a_tree_are_refused():
     """Those of a tree have a matrix beside them, and are none of `lj.multibody`."""
     links, hinges, weight, q, v = arm(2)

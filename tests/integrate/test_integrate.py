@@ -29,29 +29,6 @@ def test_against_scipy():
 
 
 @pytest.mark.exhaustive
-def test_gradients_in_both_modes():
-    """d(final state, multiplier)/d(start, params), forward and reverse, jitted or not, match a central difference."""
-
-    def outcome(x):
-        traj = lj.integrate(
-            rod_pendulum, {"x": x["l"], "y": 0.0}, {"x": 0.0, "y": x["vy"]}, {"g": x["g"], "l": x["l"]},
-            ts=np.array([0.0, 0.75]), rtol=1e-10, atol=1e-10,
-        )  # fmt: skip
-        return jnp.stack([traj.q["x"][-1], traj.multipliers["rod"][-1]])
-
-    x = {"g": 9.8125, "l": 1.25, "vy": -0.5}
-    outcome = jax.jit(outcome)
-    forward, reverse = jax.jacfwd(outcome)(x), jax.jacrev(outcome)(x)
-    step = 2.0**-13
-    for name in x:
-        # Fourth-order difference: its error (1e-13) and the integration's (1e-10 / step) are both below 1e-6.
-        at = lambda k: outcome(x | {name: x[name] + k * step})
-        difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
-        np.testing.assert_allclose(forward[name], difference, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(reverse[name], forward[name], rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.BacksolveAdjoint()]
 )

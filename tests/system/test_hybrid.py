@@ -76,19 +76,6 @@ def test_a_ball_that_bounces():
     )
 
 
-@pytest.mark.exhaustive
-def test_lanes_are_single_runs():
-    """Lanes that switch at different times, and different numbers of times, agree with single runs."""
-    hs = np.array([0.4, 1.0, 3.0, 6.0])
-    together = jax.vmap(lambda h: bounced(h, estimate_error=False, throw=False))(hs)
-    alone = [bounced(h, estimate_error=False, throw=False) for h in hs]
-    assert [len(traj.switches) for traj in alone] == [4, 2, 1, 0]
-    assert np.isnan(together.q[0, -1]) and int(together.result._value[0]) == int(lj.RESULTS.too_many_switches._value)
-    for i, traj in enumerate(alone):
-        np.testing.assert_allclose(together.q[i], traj.q, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(together.switches.t[i], traj.switches.t, rtol=1e-13)
-
-
 def switched(t, v, v_after):
     """A ball whose flights begin with these switches, as far as an error looks at them."""
     few, none = len(t), np.zeros(len(t), int)
@@ -176,60 +163,6 @@ def test_between_walls():
     z, v = np.linspace(0.1, 0.9, 1000), np.linspace(1.0, 9.0, 1000)
     found = jax.jit(jax.vmap(end))(z, v)
     np.testing.assert_allclose(found, np.abs((z + v + 1) % 2 - 1), rtol=0, atol=1e-12)
-
-
-SPHERE = {"m": 2.0, "R": 0.25, "g": G, "mu": 0.25}
-
-
-def sphere(t, q, v, p):
-    """A solid sphere in the plane."""
-    spin = 0.2 * p["m"] * p["R"] ** 2 * v["phi"] ** 2
-    return 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2) + spin - p["m"] * p["g"] * q["y"]
-
-
-def sliding(t, q, v, p):
-    """The velocity of the contact."""
-    return v["x"] - p["R"] * v["phi"]
-
-
-def coulomb(t, q, v, multipliers, p):
-    """Friction against a contact that slides forward."""
-    friction = -p["mu"] * multipliers["ground"]
-    return {"x": friction, "y": 0.0, "phi": -p["R"] * friction}
-
-
-ground = lj.Holonomic(lambda t, q, p: q["y"] - p["R"])
-slides = lj.System(sphere, {"ground": ground}, force=coulomb)
-rolls = lj.System(sphere, {"ground": ground, "grip": lj.Nonholonomic(sliding)})
-grip = lj.slips("grip", on="ground", coefficient=lambda p: p["mu"])
-thrown = lj.Hybrid(
-    {"slides": slides, "rolls": rolls},
-    [lj.Switch("slides", to="rolls", when=lj.sticks(sliding)), lj.Switch("rolls", to="slides", when=grip)],
-)
-
-
-def throw(mu, hybrid=thrown, **options):
-    """A sphere thrown without spin."""
-    q0, v0 = {"x": 0.0, "y": 0.25, "phi": 0.0}, {"x": 3.0, "y": 0.0, "phi": 0.0}
-    return in_phases(hybrid, q0, v0, SPHERE | {"mu": mu}, ts=np.linspace(0.0, 1.0, 5), **options)
-
-
-@pytest.mark.exhaustive
-def test_a_sphere_thrown_sliding():
-    """From t = 2 v₀/(7 μ g) on it rolls with 5 v₀/7; the other phase's multiplier is NaN."""
-    when = 6.0 / (7 * G)
-    for rtol in (1e-6, 1e-9, 1e-11):
-        traj = throw(0.25, rtol=rtol)
-        np.testing.assert_allclose(traj.switches.t[0], when / 0.25, rtol=10 * rtol)
-        np.testing.assert_allclose(traj.v["x"][-1], 15 / 7, rtol=10 * rtol)
-    np.testing.assert_allclose(traj.multipliers["ground"], 2.0 * G, rtol=1e-10)
-    assert np.isnan(traj.multipliers["grip"][0]) and abs(traj.multipliers["grip"][-1]) < 1e-9
-    # Twin: with friction that drives the sliding, it never ends.
-    pushing = lambda t, q, v, multipliers, p: jax.tree.map(jnp.negative, coulomb(t, q, v, multipliers, p))
-    driven = lj.System(sphere, {"ground": ground}, force=pushing)
-    hybrid = lj.Hybrid({"slides": driven, "rolls": rolls}, thrown.switches)
-    traj = throw(0.25, hybrid=hybrid)
-    assert len(traj.switches) == 0
 
 
 @pytest.mark.slow
