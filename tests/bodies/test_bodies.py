@@ -68,8 +68,11 @@ def test_a_hinge():
     A ball joint and a sleeve leave more freedoms, which a motion in the plane does not use.
     """
     expected = -3.0 * G * np.sin(0.6) / (0.6 + 3.0)
-    for joint in (lj.spherical, lj.cylindrical):
+    for joint, count in ((lj.spherical, 3), (lj.cylindrical, 4), (lj.revolute, 5)):
         bar, system, q, v = hinged(joint)
+        held = system.constraints["hinge"]
+        assert isinstance(held, lj.Holonomic)
+        np.testing.assert_allclose(held.g(0.0, q, None), np.zeros(count), atol=1e-14)
         a, _ = accelerations(system, 0.0, q, v, None)
         np.testing.assert_allclose(angular_acceleration(bar, q, a)[1], expected, atol=1e-12)
     bar, system, q, v = hinged(lj.revolute)

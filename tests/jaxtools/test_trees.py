@@ -1,29 +1,10 @@
 """Operations on all arrays of a tree: they choose, stop derivatives, and leave the rest as it is."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from lagjax.jaxtools.trees import decided, without_init
-
-
-class Checked(eqx.Module):
-    """A module whose `__init__` refuses everything."""
-
-    x: float
-
-    def __init__(self, x):
-        raise ValueError("refused")
-
-
-def test_no_init_is_called():
-    """The fields are set without a check; twin: the usual way refuses."""
-    made = without_init(Checked, {"x": 2.0})
-    assert isinstance(made, Checked) and jax.tree.leaves(made) == [2.0]
-    with pytest.raises(ValueError, match="refused"):
-        Checked(2.0)
+from lagjax.jaxtools.trees import decided
 
 
 def _kept(through):

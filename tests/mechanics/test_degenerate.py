@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import lagjax as lj
@@ -101,37 +100,15 @@ def test_what_is_singular_is_said():
         lj.accelerations(odd, 0.0, *start, None)
 
 
-def biot_savart(t, y, strengths):
-    """The velocities of point vortices, x before y."""
-    z = y[: strengths.size] + 1j * y[strengths.size :]
-    apart = z[:, None] - z[None] + np.eye(z.size)
-    w = np.sum(strengths / apart * (1 - np.eye(z.size)), axis=1) / (2j * np.pi)
-    return np.concatenate([w.real, -w.imag])
-
-
 @pytest.mark.exhaustive
-@pytest.mark.filterwarnings("ignore")
 def test_leapfrogging_pairs():
-    """Orders 2 s by Gauss, against SciPy, of which each is the others' twin; energy and impulses over 1e5 steps."""
-    start, strengths = (
-        {"x": np.array([0.0, 0.0, 0.0, 0.0]), "y": np.array([1.0, 0.4, -0.4, -1.0])},
-        np.array([1.0, 1.0, -1.0, -1.0]),
-    )
-    y0 = np.concatenate([start["x"], start["y"]])
-    exact = solve_ivp(biot_savart, (0, 20), y0, "DOP853", args=(strengths,), rtol=1e-13, atol=1e-14).y[:, -1]
-    exact = exact[:4] + 1j * exact[4:]
-
-    def run(method, dt, end=20.0):
-        return lj.integrate(
-            vortices, start, still(start), strengths, ts=np.linspace(0.0, end, 11), method=method,
-            dt0=jnp.asarray(dt), estimate_error=False,
-        )  # fmt: skip
-
-    for s, steps in {2: (0.25, 0.125), 3: (0.25, 0.125), 4: (0.25, 0.2)}.items():
-        errors = [np.max(np.abs(plane(run(lj.Gauss(s), dt))[-1] - exact)) for dt in steps]
-        order = np.log(errors[0] / errors[1]) / np.log(steps[0] / steps[1])
-        assert abs(order - 2 * s) < 0.35, (s, errors, order)
-    long = run(lj.Gauss(3), 0.2, 20_000.0)
+    """Energy and impulses over 1e5 steps of Gauss."""
+    start = {"x": np.zeros(4), "y": np.array([1.0, 0.4, -0.4, -1.0])}
+    strengths = np.array([1.0, 1.0, -1.0, -1.0])
+    long = lj.integrate(
+        vortices, start, still(start), strengths, ts=np.linspace(0.0, 20_000.0, 11), method=lj.Gauss(3), dt0=0.2,
+        estimate_error=False,
+    )  # fmt: skip
     h = np.asarray(long.jacobi_integral())
     assert int(long.stats["num_steps"]) == 100_000
     assert np.ptp(h) < 2e-9 and abs(np.polyfit(np.asarray(long.t), h, 1)[0]) * 20_000 < 0.5 * np.ptp(h)

@@ -4,7 +4,6 @@ import contextvars
 import copy
 import functools
 import gc
-import importlib
 import os
 import sys
 import threading
@@ -392,29 +391,6 @@ def test_a_function_called_at_run_time():
         with compiles() as found:
             assert weight_at(system) == g
         assert number == 0 or found == []
-
-
-def test_a_module_that_is_loaded_again(tmp_path, monkeypatch):
-    """A reloaded module's L counts, whatever was compiled before."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    path = tmp_path / "lagjax_test_model.py"
-    path.write_text("def lagrangian(t, q, v, p):\n    return 0.5 * v**2 - 2.0 * q\n")
-    model = importlib.import_module("lagjax_test_model")
-    assert weight_at(lj.System(model.lagrangian)) == 2.0
-    path.write_text("def lagrangian(t, q, v, p):\n    return 0.5 * v**2 - 33.0 * q\n")
-    importlib.reload(model)
-    assert weight_at(lj.System(model.lagrangian)) == 33.0
-
-
-def test_a_system_with_the_data_of_its_own():
-    """A new object of the same class, whose predecessor has changed since, computes with its own data."""
-    first, second = Planet(), Planet()
-    first.table["g"] = second.table["g"] = 9.81
-    assert weight_at(lj.System(first.by_table)) == 9.81
-    first.table["g"] = 4.0
-    assert weight_at(lj.System(second.by_table)) == 9.81
-    assert weight_at(lj.System(first.by_table)) == 4.0
 
 
 def test_a_trajectory_keeps_what_was_read():

@@ -45,17 +45,6 @@ def test_dry_friction():
     assert abs(crept - right) > 0.05 * abs(right)
 
 
-@pytest.mark.exhaustive
-def test_friction_in_other_words():
-    """Nested `where`, and |v| in Rayleigh's function, bring it to rest as `sign(v)` does."""
-    size = 0.3 * MASS * GRAVITY
-    nested = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
-    rayleigh = block(dissipation=lambda t, q, v, p: size * jnp.abs(v))
-    for system in (nested, rayleigh):
-        traj = lj.integrate(system, 0.5, 0.0, ts=[0.0, 4.0])
-        np.testing.assert_allclose(traj.q[-1], rest_of_block(0.3)[0], rtol=1e-7)
-
-
 @pytest.mark.slow
 def test_a_relay_that_slides():
     """u = -4 sign(q + v/2): after the first jump the motion stays on q + v/2 = 0, where q decays by e in 1/2.

@@ -42,23 +42,7 @@ def ratios(*pairs):
     return np.concatenate([off / error for off, error in largest])
 
 
-def off_orbit(traj):
-    """The true errors of an orbit's coordinates, and velocities, each with the estimated ones."""
-    for got, true, error in zip((traj.q, traj.v), exact(np.asarray(traj.t)), (traj.error.q, traj.error.v)):
-        yield [abs(got[name] - true[name]) for name in got], error.values()
-
-
 FEW, MANY = np.linspace(0.0, 40.0, 9), np.linspace(0.0, 20.0, 101)
-CASES = {
-    "default": (FEW, dict()),
-    "outputs choose the steps": (MANY, dict(method=lj.Dopri8())),
-    "backward": (FEW[::-1], dict(rtol=1e-7, atol=1e-7)),
-    "implicit": (FEW, dict(method=lj.Radau5(), rtol=1e-7, atol=1e-7)),
-    "default, loose": (FEW, dict(rtol=1e-5, atol=1e-5)),
-    "a longest step": (FEW, dict(max_step=0.1, method=lj.Dopri8())),
-    "Tsit5": (FEW, dict(method=lj.Tsit5(), rtol=1e-6, atol=1e-6)),
-    "fixed steps": (FEW, dict(method=diffrax.Heun(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)),
-}
 RATE = np.sqrt(PARAMS["g"] / PARAMS["l"])
 
 
@@ -80,14 +64,6 @@ def test_estimated_as_they_are(rtol):
         off = abs(traj.q - q), abs(traj.v - v) / RATE
         found.append(ratios((off, (traj.error.q, traj.error.v / RATE))))
     check_estimates(np.concatenate(found))
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", CASES)
-def test_estimated_as_they_are_on_an_orbit(name):
-    """Estimates are about the true errors, by each method and wherever the steps come from."""
-    ts, settings = CASES[name]
-    check_estimates(ratios(*off_orbit(orbit(ts, **settings))))
 
 
 def test_what_is_not_estimated():

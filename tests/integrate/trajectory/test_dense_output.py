@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.trajectory.films import hermite
 from tests.by_hand import ASKED, HOW, by_hand, with_problem
 from tests.by_hand import swing as exact_swing
 from tests.counting import compiles
@@ -102,23 +101,6 @@ def test_continued_as_it_was_asked_for():
     np.testing.assert_array_equal(found.multipliers["rod"], [0.75, 0.0])
     asked = ASKED_FOR[-1]
     assert (asked.drift, asked.by_size, asked.jumps, asked.method) == ("project", True, "ignored", None)
-
-
-def errors_at_step(h):
-    """The largest errors halfway between outputs that are one step apart: by `at`, and by a cubic with slopes v."""
-    ts = np.arange(0.0, 4.0 + h / 2, h)
-    traj = swing(ts=ts, method=diffrax.Dopri5(), stepsize_controller=diffrax.ConstantStepSize(), dt0=h)
-    t = (ts[:-1] + h / 2)[:: len(ts) // 40]
-    cubic = hermite(*map(np.asarray, (traj.t, traj.q, traj.v)), t)
-    return [np.max(np.abs(found - exact(t)[0])) for found in (traj.at(t).q, cubic)]
-
-
-@pytest.mark.exhaustive
-def test_order_of_the_method():
-    """With Dopri5 it has order 5 on a nonlinear motion; twin: the cubic through the outputs has order 4."""
-    steps = 0.1 / 2.0 ** np.arange(3)
-    of_at, of_cubic = np.polyfit(np.log(steps), np.log([errors_at_step(h) for h in steps]), 1)[0]
-    assert abs(of_at - 5.0) < 0.35 and abs(of_cubic - 4.0) < 0.35
 
 
 def test_where_there_is_no_motion():
