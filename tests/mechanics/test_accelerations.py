@@ -72,16 +72,6 @@ def test_velocity_constraint_with_time_and_position():
     np.testing.assert_allclose(a, [0.0, 0.5 + 3.0 * 2.0], rtol=1e-13)
 
 
-def test_vector_constraints_keep_their_shape():
-    """A constraint of two equations has a multiplier of shape (2,), named once."""
-    pin = Holonomic(lambda t, q, params: q)
-    system = System(plane_particle, {"pin": pin})
-    a, multipliers = accelerations(system, 0.0, np.zeros(2), np.zeros(2), {"m": 2.0, "g": 5.0})
-    np.testing.assert_allclose(a, [0.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(multipliers["pin"], [0.0, 10.0], rtol=1e-14)
-    assert constraint_residual(system, 0.0, np.ones(2), np.zeros(2), {"m": 2.0, "g": 5.0})["pin"].shape == (2,)
-
-
 def test_indefinite_mass_matrix():
     """L = ½ (v_x² - v_y²) with x = y + z tied: definite on what is free, so it is solved."""
     system = System(

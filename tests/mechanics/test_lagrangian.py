@@ -106,20 +106,6 @@ def test_force_and_dissipation_signs():
     assert float(a) == (5.0 - 0.5 * 3.0) / 2.0
 
 
-def test_coordinates_of_any_structure_agree():
-    """Vector and dict forms of one system give the same accelerations."""
-
-    def by_name(t, q, v, params):
-        as_vector = lambda x: jnp.stack([x["upper"], x["lower"][0]])
-        return double_pendulum_lagrangian(t, as_vector(q), as_vector(v), params)
-
-    q, v = rng.normal(size=(2, 2))
-    name = lambda x: {"upper": x[0], "lower": x[1:]}
-    expected = a_of(System(double_pendulum_lagrangian), 0.0, q, v, OF_ARMS)
-    got = a_of(System(by_name), 0.0, name(q), name(v), OF_ARMS)
-    np.testing.assert_allclose([got["upper"], got["lower"][0]], expected, rtol=1e-13)
-
-
 def test_time_dependent_mass():
     """∂p/∂t counts: L = ½ e^(ct) v² gives a = -c v."""
     system = System(lambda t, q, v, params: 0.5 * jnp.exp(params * t) * v**2)

@@ -46,19 +46,6 @@ def final_angle_and_slope(point):
     return {"angle": traj.q[-1], "slope": slope(point), "steps": traj.stats["num_steps"]}
 
 
-def by_loop(run, axes):
-    """Run point by point."""
-    program = jax.jit(run)
-    points = [program({"g": g, "angle": angle}) for g in axes["g"] for angle in axes["angle"]]
-    return jax.tree.map(lambda *x: np.stack(x).reshape(len(axes["g"]), len(axes["angle"])), *points)
-
-
-@pytest.fixture(scope="module")
-def looped():
-    """The loop over the grid."""
-    return by_loop(final_angle_and_slope, AXES)
-
-
 def assert_same(found, expected, rtol, atol):
     """Compare values and gradients."""
     for name in ("angle", "slope"):

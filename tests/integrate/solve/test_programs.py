@@ -3,19 +3,16 @@
 import operator
 import subprocess
 import sys
-from types import SimpleNamespace
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.solve.programs import method_of
 from lagjax.jaxtools import hashable_partition
 from lagjax.jaxtools.cache import PROGRAMS
-from lagjax.system import coordinates, model_of
+from lagjax.system import coordinates
 from tests.counting import compiles
 from tests.systems import (
     HORIZONTAL,
@@ -24,7 +21,6 @@ from tests.systems import (
     cartesian_lagrangian,
     pendulum,
     pendulum_lagrangian,
-    reference,
     rod,
     rod_pendulum,
 )
@@ -106,40 +102,6 @@ def test_a_whole_number_that_counts_stays_whole():
             *"fff", kind, "i"]  # fmt: skip
     of = lambda k: hashable_partition(given(k))[1]
     assert of(1.0) == of(2.5) != of(1)
-
-
-LOOPED = diffrax.Dopri8(scan_kind="lax")
-CONDITION = {"event": diffrax.Event(lambda t, y, args, **kwargs: y[0]["x"] < 0)}
-METHODS = [
-    ("pendulum", {}, lj.Nystrom12),
-    ("rod pendulum", {}, lj.Dopri8),
-    ("pendulum", {"adjoint": diffrax.BacksolveAdjoint()}, lj.Dopri8),
-    ("pendulum", {"outputs": "interpolated"}, lj.Tsit5),
-    ("pendulum", {"method": LOOPED}, diffrax.Dopri8),
-    ("pendulum", {"method": diffrax.Heun()}, diffrax.Heun),
-    ("pendulum", {"method": diffrax.Dopri8()}, lj.Dopri8),
-    ("pendulum", {"method": diffrax.Dopri8(), **CONDITION}, diffrax.Dopri8),
-    *(("pendulum", {"method": diffrax.Tsit5(), "adjoint": adjoint}, lj.Tsit5)
-      for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint(), diffrax.DirectAdjoint())),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "asked", "kind"), METHODS)
-def test_the_method_that_is_used(name, asked, kind):
-    """The fastest that can; ours in place of diffrax's, but not of others, with an option, or a condition's own."""
-    system, *state, params = reference(name)
-    usual = {"method": None, "outputs": None, "loose": False, "event": None, "adjoint": None}
-    found = method_of(SimpleNamespace(**usual | asked), model_of(system, 0.0, *state, params))
-    assert type(found) is kind
-
-
-def test_methods_that_cannot():
-    """A method for accelerations without velocities where there are constraints; long steps with outputs inside."""
-    system, *state, params = reference("rod pendulum")
-    model = model_of(system, 0.0, *state, params)
-    for outputs, words in ((None, "and there are constraints"), ("interpolated", "its steps are too long")):
-        with pytest.raises(ValueError, match=words):
-            method_of(SimpleNamespace(method=lj.Nystrom12(), outputs=outputs, loose=False), model)
 
 
 def test_another_function_is_looked_at():
