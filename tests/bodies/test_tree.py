@@ -1,4 +1,4 @@
-"""Trees in joint coordinates: the recursion against the equations of L, Pinocchio and closed forms; refused trees."""
+"""Trees in joint coordinates: the recursion against the equations of L and closed forms; refused trees."""
 
 import jax
 import jax.numpy as jnp
@@ -131,35 +131,6 @@ def test_the_recursion_solves_lagranges_equations():
         q, v = like(rng, tree.reference()), like(rng, tree.reference())
         assert off(t, q, v, params, v, params) < 1e-11
         assert off(t, q, v, params, jax.tree.map(jnp.zeros_like, v), params) > 0.1
-
-
-@pytest.mark.parametrize("parents", [[-1, 0, 1, 1, 3, 0, 5], [-1, 0, 0]], ids=["in a loop", "written out"])
-def test_a_tree_beside_pinocchio(parents):
-    """Accelerations of a forked tree of hinges and slides, within 1e-10 of Pinocchio's."""
-    pin = pytest.importorskip("pinocchio")
-    rng = np.random.default_rng(4)
-    bodies = [a_body(rng, f"b{i}") for i in range(len(parents))]
-    model, joints, centres = pin.Model(), {}, rng.normal(size=(len(parents), 3))
-    for i, parent in enumerate(parents):
-        place, axis = rng.normal(size=3), rng.normal(size=3)
-        axis, slides, centre = axis / np.linalg.norm(axis), i in (2, 5), centres[i]
-        kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
-        at = model.addJoint(parent + 1, kind(axis), pin.SE3(np.eye(3), place), f"j{i}")
-        inertia = pin.Inertia(bodies[i].mass, centre, np.array(bodies[i].inertia))
-        model.appendBodyToJoint(at, inertia, pin.SE3.Identity())
-        # Pinocchio's places are given from the joint of the parent, ours from its centre of mass.
-        on = lj.ground.at(place, axis) if parent < 0 else bodies[parent].at(place - centres[parent], axis)
-        joints[f"j{i}"] = (lj.prismatic if slides else lj.revolute)(on, bodies[i].at(-centre, axis))
-    tree = lj.Tree(bodies, joints)
-    q, v, tau = rng.normal(size=(3, len(parents)))
-    expected = pin.aba(model, model.createData(), q, v, tau)
-    recursion = tree.system([lj.weight(bodies)]).forward_dynamics
-    assert recursion is not None
-    named = (dict(zip(joints, map(jnp.asarray, x))) for x in (q, v, tau))
-    found = jax.jit(lambda *x: recursion(0.0, *x, None))(*named)
-    np.testing.assert_allclose([found[name] for name in joints], expected, rtol=1e-10, atol=1e-10)
-    other = pin.aba(model, model.createData(), q, 0 * v, tau)
-    assert np.abs(other - expected).max() > 0.1
 
 
 @pytest.mark.parametrize("count", [3, 6], ids=["written out", "in a loop"])

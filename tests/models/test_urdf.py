@@ -1,4 +1,4 @@
-"""Models from URDF texts, against a double pendulum by hand, MuJoCo and Pinocchio; what is refused, by its line."""
+"""Models from URDF texts, against a double pendulum by hand and MuJoCo; what is refused, by its line."""
 
 import jax
 import jax.numpy as jnp

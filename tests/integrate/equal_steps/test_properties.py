@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.scenes import cross_rails
 from tests import by_hand
 from tests.behaviour.test_orders import computed, double_pendulum_equation, orders, states, within
 from tests.integrate.equal_steps.test_equal_steps import TURN, G, adaptive, ellipse, fall, kepler, length, rod, run
@@ -144,14 +143,6 @@ def on_long_ellipse():
     return kepler, ellipse(0.6), 1.0, ts, by_hand.kepler(ts, 0.6)[0]
 
 
-def on_cross_rails():
-    """The carriage in the laboratory, where L depends on time, against its closed form."""
-    params, ts = cross_rails.PARAMS, np.linspace(0.0, 4.0, 5)
-    rotating = jax.vmap(lambda t: cross_rails.exact_motion(params, cross_rails.Q0, cross_rails.V0, t))(ts)
-    exact = jax.vmap(lambda t, q, v: cross_rails.to_lab(params, t, q, v)[0])(ts, *rotating)
-    return cross_rails.lab_system, cross_rails.to_lab(params, 0.0, cross_rails.Q0, cross_rails.V0), params, ts, exact
-
-
 def on_knife_edge():
     """A knife edge on a slope: with v = (a/ω) sin ωt along it, its path is a cycloid (Neimark & Fufaev)."""
     across = lj.Nonholonomic(lambda t, q, v, a: jnp.sin(q[2]) * v[0] - jnp.cos(q[2]) * v[1])
@@ -209,7 +200,6 @@ ORDERS = [
     *((on_long_ellipse, lj.Splitting(n), steps) for n, steps in
       {2: (137, 274), 4: (55, 110), 6: (34, 48), 8: (20.5, 27.4)}.items()),
     (on_pendulum, lj.Gauss(2), (6, 8, 12)),
-    (on_cross_rails, lj.Gauss(3), (8, 12, 16)),
     (on_knife_edge, lj.Gauss(1), (20, 30, 40)),
     (on_knife_edge, lj.Gauss(3), (4, 5, 6)),
     (on_heavy_top, lj.Gauss(3), (10, 20)),
