@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import lagjax as lj
 from lagjax.mechanisms import slider_crank
@@ -37,7 +35,7 @@ def test_slider_crank():
 
 @pytest.mark.exhaustive
 def test_derivatives_on_a_constraint():
-    """By a parameter and an end on the constraint, in both modes: those of the angle by SciPy, by differences."""
+    """By a parameter and an end on the constraint, in both modes: of θ'' = -g cos θ, beside the turn φ t/T at g = 0."""
     rod = lj.System(
         lambda t, q, v, params: 0.5 * v @ v - params["g"] * q[1],
         {"rod": lj.Holonomic(lambda t, q, params: q @ q - 1.0)},
@@ -47,14 +45,7 @@ def test_derivatives_on_a_constraint():
         end = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         return lj.connect(rod, jnp.array([1.0, 0.0]), end, 0.0, 0.5, {"g": g}, outputs=2).start_velocity[1]
 
-    def by_angle(g, angle):
-        def off(speed):
-            options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
-            return solve_ivp(lambda t, y: [y[1], -g * np.cos(y[0])], (0, 0.5), [0.0, speed], **options).y[0, -1] - angle
-
-        return float(np.asarray(brentq(off, 0.0, 10.0, xtol=1e-13)))
-
-    at, step = (3.0, 0.7), 1e-3
-    exact = [(by_angle(*(np.array(at) + d)) - by_angle(*(np.array(at) - d))) / (2 * step) for d in step * np.eye(2)]
+    angle, time = 0.7, 0.5
+    exact = (1 - np.cos(angle)) * time / angle**2, 1 / time
     for mode in (jax.jacfwd, jax.jacrev):
-        assert np.allclose(jax.jit(mode(start_speed, (0, 1)))(*at), exact, rtol=1e-6)
+        assert np.allclose(jax.jit(mode(start_speed, (0, 1)))(0.0, angle), exact, rtol=1e-9)
