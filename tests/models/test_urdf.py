@@ -7,6 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.models.mjcf import mujoco_itself
+from tests.jaxtools.in_numpy import accelerations
 
 mujoco = mujoco_itself()
 
@@ -164,7 +165,7 @@ def test_a_double_pendulum_by_hand():
     a, _ = lj.accelerations(model.joint_system(), 0.0, *model.joint_state(angles, rates), None)
     np.testing.assert_allclose([a["shoulder"], a["elbow"]], expected, atol=1e-12)
     q, v = model.state(angles, rates)
-    a, _ = lj.accelerations(model.system(), 0.0, q, v, None)
+    a, _ = accelerations(model.system(), 0.0, q, v, None)
     turning = jax.jvp(model.joint_rates, (q, v), (v, a))[1]
     np.testing.assert_allclose([turning["shoulder"], turning["elbow"]], expected, atol=1e-12)
 
