@@ -8,7 +8,6 @@ import lagjax as lj
 from lagjax.mechanics.structure import are_angles, is_diagonal, structure
 from lagjax.system import coordinates
 from lagjax.system.model import model_of
-from tests.plain import not_plain
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
 
@@ -125,15 +124,6 @@ def test_a_long_program_is_not_taken_apart(nodes, known):
     """A long mass matrix has no structure; twin: few nodes."""
     system, s = mass_by_quadrature(nodes)
     assert (structure(model_of(system, *s)) is not None) == known
-
-
-@not_plain
-@pytest.mark.slow
-def test_a_long_program_is_explained():
-    """`explain` works without a structure."""
-    system, s = mass_by_quadrature(500)
-    report = dict(lj.explain(system, *s[:3]).rows)
-    assert (report["mass matrix"], report["solved"]) == ("positive definite", "3 equations by elimination")
 
 
 def test_a_long_mass_matrix_is_not_known_to_be_diagonal():

@@ -99,15 +99,6 @@ def test_fixed_steps():
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("copies", (1, 2))
-def test_constraints_and_their_multipliers(copies):
-    """A rod, and two equivalent ones, whose steps use the robust solve; in a batch, and from a turning point."""
-    system, q0 = rod(copies), {"x": 2.0, "y": 0.0}
-    one = lambda vy, p: end(system, q0, {"x": 0.0, "y": vy}, p)
-    modes_agree(lambda x: jnp.sum(jax.vmap(one, (0, None))(*x)), (jnp.array([0.0, 0.5]), PARAMS))
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize("method", (None, diffrax.Kvaerno5()))
 def test_implicit_methods(method):
     """A stiff spring: derivatives by the implicit function theorem at each step."""

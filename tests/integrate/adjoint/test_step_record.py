@@ -7,24 +7,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.adjoint import step_record
-from tests.integrate.adjoint.test_replay import PARAMS, TS, end, pendulum
+from tests.integrate.adjoint.test_replay import PARAMS, TS, pendulum
 
 pytestmark = pytest.mark.usefixtures("in_reverse")
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("room", ((16, 64), (16, 4), (4, 2)))
-def test_more_steps_than_there_is_room_for(monkeypatch, room):
-    """Steps run again from checkpoints, from all of them or from every other one, are the same steps."""
-    of = lambda system: jax.grad(lambda p: end(system, 0.75, 0.25, p, method=lj.Tsit5()))(PARAMS)
-    expected, (rows, places) = of(pendulum()), room
-    monkeypatch.setattr(step_record, "ROWS", rows)
-    monkeypatch.setattr(step_record, "PLACES", places)
-    system = pendulum()
-    steps = lj.integrate(system, 0.75, 0.25, PARAMS, ts=TS, rtol=1e-10, method=lj.Tsit5()).stats["num_accepted_steps"]
-    assert steps > rows * places or room != (4, 2)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), of(system), expected)
 
 
 def long_swing():
