@@ -24,13 +24,6 @@ def pendulum(drag=0.05):
     return lj.System(lagrangian, dissipation=lambda t, q, v, p: 0.5 * drag * v**2)
 
 
-def rod(copies=1):
-    """The same pendulum in the plane on a rod, or on several equivalent constraints."""
-    lagrangian = lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - p["g"] * q["y"]
-    hold = lambda c: lj.Holonomic(lambda t, q, p: c * (q["x"] ** 2 + q["y"] ** 2 - p["l"] ** 2))
-    return lj.System(lagrangian, {f"rod {i}": hold(i + 1.0) for i in range(copies)})
-
-
 def end(system, q0, v0, params, ts=TS, **options):
     """A number that depends on all outputs, with different weights; NaN does not count."""
     traj = lj.integrate(system, q0, v0, params, ts=ts, rtol=1e-10, throw=False, **options)
@@ -98,16 +91,6 @@ def test_fixed_steps():
     np.testing.assert_allclose(found, slopes_expected(x, (0, 1, 1, 3)), rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("method", (None, diffrax.Kvaerno5()))
-def test_implicit_methods(method):
-    """A stiff spring: derivatives by the implicit function theorem at each step."""
-    system = lj.System(
-        lambda t, q, v, p: 0.5 * v**2 - 0.5 * p["k"] * q**2, dissipation=lambda t, q, v, p: 0.5 * p["c"] * v**2
-    )
-    modes_agree(lambda p: end(system, 1.0, 0.0, p, method=method or lj.Radau5()), {"k": 1e3, "c": 2e2})
-
-
 @pytest.mark.slow
 def test_a_force_that_jumps():
     """By the time of the jump, which is the end of a step, and the force: q = cos t + f (1 - cos(t - s)) after it."""
@@ -126,21 +109,6 @@ def test_a_force_that_jumps():
 def falling():
     """A falling stone, described by its height."""
     return lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
-
-
-@pytest.mark.exhaustive
-def test_an_event():
-    """Derivatives of the end time, the end velocity and the outputs of a fall to the floor."""
-    stone, floor = falling(), lj.Crossing(lambda t, q, v, p: q, direction=-1)
-
-    def function(x):
-        traj = lj.integrate(stone, x["h"], x["u"], x, ts=TS, rtol=1e-10, events={"floor": floor})
-        return traj.end.t**2 + traj.end.v + jnp.sum(jnp.where(jnp.isfinite(traj.q), traj.q, 0.0))
-
-    found = modes_agree(function, {"g": 9.81, "h": 1.0, "u": 0.0})
-    # T = √(2 h / g), v = -√(2 g h), q = h - g t²/2 at the outputs before it.
-    by_g = -2 / 9.81**2 - 1 / np.sqrt(2 * 9.81) - np.sum(TS[TS < 0.451] ** 2) / 2
-    np.testing.assert_allclose(found["g"], by_g, rtol=1e-9)
 
 
 @pytest.mark.exhaustive

@@ -1,4 +1,4 @@
-"""Second derivatives in every order of the modes; by many parameters: `tests/behaviour/test_compositions.py`."""
+"""Second derivatives at crossings; in every order of the modes: `tests/behaviour/test_compositions.py`."""
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +9,6 @@ import lagjax as lj
 from lagjax.integrate.events import event_times
 
 TS = np.array([0.0, 0.9])
-spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params * q) ** 2)
-
-
-def end(x):
-    """The square of q = q0 cos(k T), integrated."""
-    return lj.integrate(spring, x[0], 0.0, x[1], ts=TS, rtol=1e-11, atol=1e-11).q[-1] ** 2
-
-
-def exact(x):
-    """The same by its formula."""
-    return (x[0] * jnp.cos(0.9 * x[1])) ** 2
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("inner", (jax.jacfwd, jax.jacrev))
-@pytest.mark.parametrize("outer", (jax.jacfwd, jax.jacrev))
-def test_modes_in_any_order(inner, outer):
-    """The Hessian of a motion whose formula is known, with the modes nested in all four ways."""
-    x = jnp.array([0.75, 1.25])
-    np.testing.assert_allclose(outer(inner(end))(x), jax.hessian(exact)(x), atol=1e-8)
 
 
 falling = lj.System(lambda t, q, v, p: 0.5 * v**2 - p[0] * q)
