@@ -260,20 +260,6 @@ def test_no_damping_at_all(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_bounce_keeps_the_cost():
-    """A ball that bounces with half its speed, and the integral of its v²: in phases, through the impact."""
-    ball = lj.System(lambda t, q, v, p: 0.5 * v["y"] ** 2 - q["y"], states={"cost": lambda t, q, v, p: v["y"] ** 2})
-    bounce = lj.Switch(
-        "flies", to="flies", when=lambda t, q, v, p: q["y"], reset=lambda t, q, v, p: v | {"y": -0.5 * v["y"]}
-    )
-    start = {"y": 0.5, "cost": 0.0}, {"y": 0.0}
-    motion = lj.integrate(lj.Hybrid({"flies": ball}, [bounce]), *start, ts=np.array([0.0, 1.5]))
-    # It falls for a second, and then rises for half of one.
-    np.testing.assert_allclose(motion.q["cost"][-1], 1 / 3 + 0.5**3 / 3, rtol=1e-9)
-    np.testing.assert_allclose(motion.v["cost"][-1], 0.0, atol=1e-9)
-
-
-@pytest.mark.slow
 def test_a_vector_of_states_beside_a_constraint():
     """A pendulum by a rod, with a filtered velocity fed back, against the angle's equation by SciPy. Twin: a lag."""
     rod = lj.Holonomic(lambda t, q, p: q["r"] @ q["r"] - 1.0)
