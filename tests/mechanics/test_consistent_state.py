@@ -126,21 +126,6 @@ def test_random_starts_reach_the_manifold_in_lanes():
 
 
 @pytest.mark.slow
-def test_unreachable_is_an_error_with_the_residual_by_name():
-    """A held coordinate that violates a constraint, contradictory constraints, and a wrong name are each reported."""
-    state = {"x": 3.0, "y": 0.5}, {"x": 0.0, "y": 0.0}
-    with pytest.raises(ValueError, match=r"(?s)'x' held.*'ellipse' = [\d.]+.*Fix:"):
-        lj.consistent_state(on_ellipse, 0.0, *state, PARAMS, hold="x")
-    with pytest.raises(ValueError, match="(?s)hold names 'z'.*'x' and 'y'"):
-        lj.consistent_state(on_ellipse, 0.0, *state, PARAMS, hold=["x", "z"])
-    walls = {
-        name: lj.Holonomic(lambda t, q, params, at=at: q["x"] - at) for name, at in (("left", 0.0), ("right", 1.0))
-    }
-    with pytest.raises(ValueError, match="(?s)'left' = .*'right' = |'right' = |'left' = "):
-        lj.consistent_state(lj.System(lagrangian, walls), 0.0, *state, PARAMS)
-
-
-@pytest.mark.slow
 def test_the_best_state_is_where_the_least_is_missing():
     """Two circles of radius one, their centres 2.5 apart, miss each other by 0.5: the point between by 0.25 each."""
     away = lambda x: lj.Holonomic(lambda t, q, params: jnp.hypot(q["x"] - x, q["y"]) - 1.0)
