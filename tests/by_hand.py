@@ -46,3 +46,19 @@ def swing(t, amplitude: float, rate=1.0):
     k = np.sin(amplitude / 2)
     sn, cn, dn, _ = ellipj(ellipk(k**2) - rate * np.asarray(t), k**2)
     return 2 * np.arcsin(k * sn), -2 * k * rate * cn * dn / np.sqrt(1 - (k * sn) ** 2)
+
+
+def kepler(t, e):
+    """Places and velocities (..., 2) on an orbit with k = a = 1 from its pericentre, where M = E - e sin E.
+
+    Kepler's equation is solved by halving, as E lies within e of M.
+    """
+    M = np.mod(np.asarray(t) + np.pi, 2 * np.pi) - np.pi
+    E, low, high = M, M - e, M + e
+    for _ in range(60):
+        E = (low + high) / 2
+        late = E - e * np.sin(E) > M
+        low, high = np.where(late, low, E), np.where(late, E, high)
+    b, rate = np.sqrt(1 - e**2), 1 / (1 - e * np.cos(E))
+    places, ways = ([np.cos(E) - e, b * np.sin(E)], [-rate * np.sin(E), b * rate * np.cos(E)])
+    return np.stack(places, axis=-1), np.stack(ways, axis=-1)

@@ -13,15 +13,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate import failure
 from lagjax.system import coordinates
-from tests.behaviour.test_bad_input import refusal
 from tests.systems import PARAMS, TS, motion, pendulum
-
-
-@pytest.mark.slow
-def test_max_steps():
-    """The message says where the motion stopped, after how many steps, how many are missing, and what to do."""
-    with refusal(RuntimeError, "stopped at t = 0", "max_steps = 4", r"needs \d more", r"max_steps=\d+, or"):
-        lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=TS, max_steps=4)
 
 
 def test_failure_under_jit_is_not_silent(monkeypatch):

@@ -4,7 +4,6 @@ import importlib
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import lagjax as lj
@@ -60,21 +59,3 @@ def test_integrate_tells_and_goes_on(monkeypatch):
     with pytest.warns(UserWarning, match="Fix: force=drag"):
         assert run(0.5) is done
     jax.eval_shape(lambda q0: run(q0).q, 0.5)
-
-
-@pytest.mark.exhaustive
-def test_a_force_taken_for_a_dissipation():
-    """Its motion is that of a constant force of 0.5, and a warning; twin: traced values, of all kinds, are ignored."""
-    free = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
-    start = {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 1.0}
-    dragged, ts = lj.System(free, dissipation=lambda t, q, v, params: -0.5 * v["x"]), np.array([0.0, 2.0])
-    with pytest.warns(UserWarning, match="Fix: force=f"):
-        motion = lj.integrate(dragged, *start, None, ts=ts)
-    np.testing.assert_allclose(motion.q["x"][-1], 0.5 * 0.5 * 2.0**2, rtol=1e-12)
-
-    def traced(y, c):
-        closed = lj.System(free, dissipation=lambda t, q, v, params: c * v["x"])
-        of_start = lj.integrate(dragged, start[0] | {"y": y}, start[1], None, ts=ts)
-        return of_start.q["x"] + lj.integrate(closed, *start, None, ts=ts).q["x"]
-
-    assert jax.eval_shape(traced, 0.5, 0.5).shape == (2,)

@@ -2,11 +2,9 @@
 
 import copy
 import gc
-from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -14,9 +12,6 @@ from lagjax.jaxtools import cache
 from lagjax.jaxtools.compiled import compiled
 from tests.counting import compiles
 from tests.plain import not_plain
-
-MANY = 24
-MAPS = Path("/proc/self/maps")
 
 
 @eqx.filter_jit
@@ -29,27 +24,6 @@ def inside(function, x):
 def called(function, x):
     """A compiled program that holds a function of the user's."""
     return inside(function, x)
-
-
-def waves(number):
-    """A function unlike any other, with more than one kernel."""
-    return lambda x: jnp.cumsum(jnp.sin(x + number)) @ jnp.sort(jnp.cos(number * x))
-
-
-def maps():
-    """The number of memory maps of this process."""
-    gc.collect()
-    return MAPS.read_bytes().count(b"\n") if MAPS.exists() else 0
-
-
-def after_many(x):
-    """How many memory maps the later half of many functions adds, each called once."""
-    for number in range(MANY // 2):
-        called(waves(number), x)
-    before = maps()
-    for number in range(MANY // 2, MANY):
-        called(waves(number), x)
-    return maps() - before
 
 
 def programs():
@@ -69,18 +43,6 @@ def test_dropped_programs_are_freed(monkeypatch):
             called(lambda x, number=number: number * x, x)
         held.append((programs() - before, len(cache.PROGRAMS)))
     assert held == [(7, 7), (2, 2)]
-
-
-@not_plain
-@pytest.mark.exhaustive
-@pytest.mark.skipif(not MAPS.exists(), reason="only Linux tells")
-def test_programs_are_bounded(monkeypatch):
-    """The memory of dropped programs is freed; the twin, which keeps all, needs more for each."""
-    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(64))
-    grown_at_all = after_many(np.ones(8))
-    monkeypatch.setattr(cache, "PROGRAMS", cache.Recent(5))
-    grown = after_many(np.ones(9))
-    assert len(cache.PROGRAMS) == 5 and grown_at_all > MANY / 2 and grown < grown_at_all / 3
 
 
 def test_traces_are_dropped_too(monkeypatch):

@@ -16,7 +16,6 @@ from lagjax.jaxtools.fuse_cpu import (  # fmt: skip
     calls_host,
     fits,
     kept_as_call,
-    marked,
     one_function,
     without_checks,
     without_library,
@@ -240,12 +239,6 @@ def test_products_of_many_multiplications():
     check_products([64, 65])
 
 
-@pytest.mark.exhaustive
-def test_products_of_every_size():
-    """Sizes 2 to 300 as matrix times vector, and their square roots as matrix times matrix."""
-    check_products(range(2, 301))
-
-
 def test_a_checkpoint_is_looked_into():
     """A checkpoint holds its program in another way; products in it are replaced too."""
     w = np.random.default_rng(0).normal(size=(9, 9))
@@ -304,12 +297,6 @@ def test_a_call_stays_one():
 
     calls = lambda mark: jax.jit(twice(mark)).lower(2.0).compile().as_text().count(" call(")
     assert calls(kept_as_call) == 2 and calls(lambda results: results) == 0
-
-
-def test_marks_reach_the_program():
-    """The attributes stand on the call in the program that XLA is given."""
-    text = jax.jit(lambda x: marked(jax.jit(jnp.sin)(x), ONE_KERNEL)).lower(1.0).as_text()
-    assert all(f'{name} = "{value}"' in text for name, value in ONE_KERNEL.items())
 
 
 def test_the_derivative_of_a_branch_fits():

@@ -97,65 +97,6 @@ def test_another_function_would_be_seen(monkeypatch):
     assert not the_same_in_numpy("le")
 
 
-FACTOR = np.array([[1.0, 2.0], [3.0, 4.0]])
-LINEAR = {
-    "add": lambda x: lax.add(x, x),
-    "add_any": lambda x: jax.linear_transpose(lambda y: (y, y), x)((x, x))[0],
-    "broadcast_in_dim": lambda x: lax.broadcast_in_dim(x, (2, 2, 2), (1, 2)),
-    "concatenate": lambda x: lax.concatenate([x, x], 0),
-    "convert_element_type": lambda x: lax.convert_element_type(x, np.float32),
-    "copy": lambda x: lax.copy_p.bind(x),
-    "cumsum": lambda x: lax.cumsum(x, 0),
-    "neg": lax.neg,
-    "pad": lambda x: lax.pad(x, 0.0, [(1, 0, 0), (0, 1, 0)]),
-    "reduce_sum": lambda x: lax.reduce_sum_p.bind(x, axes=(0,), out_sharding=None),
-    "reshape": lambda x: lax.reshape(x, (4,)),
-    "rev": lambda x: lax.rev(x, (0,)),
-    "slice": lambda x: lax.slice(x, (0, 1), (2, 2)),
-    "split": lambda x: lax.split(x, (1, 1))[1],
-    "squeeze": lambda x: lax.squeeze(lax.slice(x, (0, 0), (1, 2)), (0,)),
-    "sub": lambda x: lax.sub(x, lax.mul(x, FACTOR)),
-    "transpose": lambda x: lax.transpose(x, (1, 0)),
-    "div": lambda x: lax.div(x, FACTOR),
-    "dynamic_slice": lambda x: lax.dynamic_slice(x, (1, 0), (1, 2)),
-    "gather": lambda x: x[np.array([1, 0]), np.array([1, 1])],
-    "dot_general": lambda x: x @ FACTOR,
-    "mul": lambda x: lax.mul(x, FACTOR),
-}
-
-
-NOT_LINEAR = {"a square": lambda x: lax.mul(x, x), "a sine": jnp.sin}
-
-
-@cache
-def of_sums():
-    """By name, what each function gives for two matrices, their sum, and twice the first, by one program."""
-    x, y = np.array([[0.3, -1.2], [2.5, 0.7]]), np.array([[1.1, 0.4], [-0.6, 3.0]])
-    each = jax.jit(lambda x: {name: f(x) for name, f in (LINEAR | NOT_LINEAR).items()})
-    found = [each(jnp.asarray(z)) for z in (x, y, x + y, 2 * x)]
-    return {name: [np.asarray(one[name], float) for one in found] for name in found[0]}
-
-
-def is_linear(name):
-    """Whether a function of a matrix doubles with it, and leaves sums alone."""
-    x, y, together, doubled = of_sums()[name]
-    return np.allclose(together, x + y, atol=1e-6) and np.allclose(doubled, 2 * x, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", LINEAR)
-def test_linear_primitives(name):
-    """They are linear in their first operand, as the analysis of dependence assumes."""
-    found = [equation.primitive.name for equation in jaxpr.equations(jax.make_jaxpr(LINEAR[name])(FACTOR).jaxpr)]
-    assert name in found and is_linear(name)
-
-
-def test_all_linear_primitives_are_tried():
-    """Twin: a function that is not linear is noticed; and only the named primitives of the tables are not tried."""
-    assert not any(map(is_linear, NOT_LINEAR))
-    untried = jaxpr.ADDITIVE | jaxpr.LINEAR_IN_FIRST | jaxpr.BILINEAR - set(LINEAR)
-    assert untried - set(LINEAR) == {"stack", "stop_gradient"}
-
-
 def below(x, count=100):
     """The floating-point number that is `count` places below x."""
     for _ in range(count):

@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import lagjax as lj
 from lagjax.jaxtools.linearity import is_linear
 from tests.jaxtools.in_numpy import evaluated
-from tests.tiers import exhaustive_but
 
 E, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
@@ -84,26 +82,3 @@ def test_what_jax_traces():
         return mu
 
     jax.eval_shape(both, 0.3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", exhaustive_but(["while_loop"], ["a jitted helper", "cross", "where between two", "vjp", "while_loop"])
-)
-def test_a_block_on_a_floor(name):
-    """Friction however it is written: a = -3 and x(0.5) = 0.625, a slope of -g by the coefficient; abs is refused."""
-    kinetic = lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * q[2]
-    floor, q, v, p = {"floor": lj.Holonomic(lambda t, q, p: q[2])}, np.zeros(3), 2 * E, {"g": 10.0, "mu": 0.3}
-
-    def block(force):
-        return lj.System(kinetic, floor, force=lambda t, q, v, lam, p: force(lam["floor"] * p["mu"] / 0.3, v))
-
-    system = block(LINEAR[name])
-    of_mu = lambda mu: lj.accelerations(system, 0.0, q, v, p | {"mu": mu})[0][0]
-    a, multipliers = lj.accelerations(system, 0.0, q, v, p)
-    np.testing.assert_allclose(a, [-3.0, 0.0, 0.0], atol=1e-13)
-    np.testing.assert_allclose(multipliers["floor"], 10.0, rtol=1e-14)
-    np.testing.assert_allclose(jax.jacfwd(of_mu)(0.3), -10.0, rtol=1e-12)
-    np.testing.assert_allclose(lj.integrate(system, q, v, p, ts=[0.0, 0.5]).q[-1, 0], 0.625, rtol=1e-12)
-    with pytest.raises(ValueError, match="must be linear in the multipliers"):
-        lj.accelerations(block(NOT_LINEAR["a jitted abs"]), 0.0, q, v, p)

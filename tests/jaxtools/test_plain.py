@@ -18,21 +18,16 @@ def undecided(monkeypatch):
     monkeypatch.setattr(plain, "KNOWN", {"0.0"})
 
 
-@pytest.mark.parametrize(("wanted", "expected"), [("1", True), ("0", False)])
-def test_the_variable_decides(monkeypatch, wanted, expected):
-    """With the variable set there is no warning."""
+@pytest.mark.parametrize(
+    ("wanted", "known", "expected"), [("1", "0.0", True), ("0", "0.0", False), ("", jaxlib.version.__version__, False)]
+)
+def test_in_silence(monkeypatch, wanted, known, expected):
+    """With the variable set, or a known version, which is compiled for speed, there is no warning."""
     monkeypatch.setattr(plain, "_WANTED", wanted)
+    monkeypatch.setattr(plain, "KNOWN", {known})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert plain.is_plain() is expected
-
-
-def test_a_known_version_is_compiled_for_speed(monkeypatch):
-    """In silence."""
-    monkeypatch.setattr(plain, "KNOWN", {jaxlib.version.__version__})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert plain.is_plain() is False
 
 
 def test_an_unknown_version_is_plain():

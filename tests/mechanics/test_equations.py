@@ -208,16 +208,6 @@ def test_what_is_written_does_not_outlive_a_value(change):
 
 
 @not_plain
-@pytest.mark.slow
-def test_explain_prints_the_choice(monkeypatch):
-    """`explain` prints the form that the equations really have."""
-    explained = lambda: repr(lj.explain(rod_pendulum, 0.0, *HORIZONTAL, PARAMS))
-    assert "elimination without the zeros" in explained()
-    monkeypatch.setattr(equations, "is_small", lambda *problem: False)
-    assert "3 equations by elimination" in explained()
-
-
-@not_plain
 def test_the_choice_in_words(monkeypatch):
     """What is written out is said to be, and the form of the others."""
     s = coordinates.state(0.0, *HORIZONTAL, PARAMS)

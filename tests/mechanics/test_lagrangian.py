@@ -1,17 +1,18 @@
 """Equations of motion against textbook formulas at random states."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from lagjax import System, accelerations, jacobi_integral, mass_matrix, momentum
 from lagjax.mechanics.equations import equations_of
 from lagjax.system.model import model_of
 from tests.jaxtools.in_numpy import in_numpy
+from tests.systems import double_pendulum_lagrangian
 
 rng = np.random.default_rng(20)
+# Of unit length.
+OF_ARMS = {"m1": 1.5, "m2": 0.5, "l1": 1.0, "l2": 1.0, "g": 9.8125}
 
 
 def a_of(system, t, q, v, params):
@@ -20,19 +21,12 @@ def a_of(system, t, q, v, params):
     return in_numpy(solved)(t, q, v, params)
 
 
-def double_pendulum(t, q, v, params):
-    """Two unit-length arms, masses m1 and m2, absolute angles."""
-    m1, m2, g = params
-    kinetic = 0.5 * (m1 + m2) * v[0] ** 2 + 0.5 * m2 * v[1] ** 2 + m2 * v[0] * v[1] * jnp.cos(q[0] - q[1])
-    return kinetic + (m1 + m2) * g * jnp.cos(q[0]) + m2 * g * jnp.cos(q[1])
-
-
 def test_double_pendulum_accelerations():
     """The double pendulum at 50 random states, and its twin without the centrifugal term fails."""
     q, v = rng.normal(size=(2, 50, 2))
     m1, m2, g = 1.5, 0.5, 9.8125
-    system = System(double_pendulum)
-    solved = in_numpy(lambda q, v: equations_of(model_of(system, 0.0, q, v, (m1, m2, g))).accelerations(0.0, q, v)[0])
+    system = System(double_pendulum_lagrangian)
+    solved = in_numpy(lambda q, v: equations_of(model_of(system, 0.0, q, v, OF_ARMS)).accelerations(0.0, q, v)[0])
     a = [solved(*state) for state in zip(q, v)]
     s, c = np.sin(q[:, 0] - q[:, 1]), np.cos(q[:, 0] - q[:, 1])
 
@@ -110,36 +104,6 @@ def test_force_and_dissipation_signs():
     )
     a, _ = accelerations(system, 0.0, 0.0, 3.0, {"m": 2.0, "F": 5.0, "c": 0.5})
     assert float(a) == (5.0 - 0.5 * 3.0) / 2.0
-
-
-def test_coordinates_of_any_structure_agree():
-    """Scalar, vector and dict forms of one system give the same accelerations."""
-
-    def vector(t, q, v, params):
-        return double_pendulum(t, q, v, params)
-
-    def by_name(t, q, v, params):
-        as_vector = lambda x: jnp.stack([x["upper"], x["lower"][0]])
-        return double_pendulum(t, as_vector(q), as_vector(v), params)
-
-    q, v = rng.normal(size=(2, 2))
-    params = (1.5, 0.5, 9.8125)
-    name = lambda x: {"upper": x[0], "lower": x[1:]}
-    expected = a_of(System(vector), 0.0, q, v, params)
-    got = a_of(System(by_name), 0.0, name(q), name(v), params)
-    np.testing.assert_allclose([got["upper"], got["lower"][0]], expected, rtol=1e-13)
-
-
-@pytest.mark.exhaustive
-def test_a_network_inside_the_lagrangian():
-    """params may be an equinox network; its weights have a gradient through the accelerations."""
-    network = eqx.nn.MLP(2, "scalar", 8, 1, activation=jax.nn.softplus, key=jax.random.key(0), dtype=jnp.float64)
-    system = System(lambda t, q, v, params: 0.5 * jnp.dot(v, v) - params(q))
-    q, v = rng.normal(size=(2, 2))
-    a, _ = accelerations(system, 0.0, q, v, network)
-    np.testing.assert_allclose(a, -jax.grad(network)(jnp.asarray(q)), rtol=1e-12)
-    slope = eqx.filter_grad(lambda net: jnp.sum(accelerations(system, 0.0, q, v, net)[0]))(network)
-    assert float(jnp.max(jnp.abs(slope.layers[0].weight))) > 1e-3
 
 
 def test_time_dependent_mass():

@@ -1,11 +1,7 @@
 """The way back to the constraints: velocity constraints leave positions, and a rolling body rolls."""
 
-from collections import Counter
-
-import jax
 import numpy as np
 
-from lagjax.jaxtools.jaxpr import equations as operations
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.projection import to_manifold
 from lagjax.system.model import model_of
@@ -35,20 +31,6 @@ def test_returning_to_a_velocity_constraint_leaves_positions():
     nearest = u - np.linalg.solve(mass, rows.T @ np.linalg.solve(rows @ np.linalg.solve(mass, rows.T), rows @ u))
     np.testing.assert_allclose(np.stack(list(projected.v.values())), nearest, atol=1e-14)
     assert np.max(np.abs(nearest - u)) > 0.1
-
-
-def test_what_the_program_contains_once():
-    """Residuals are in it twice, before and in the loop of the last iterations; M and A are differentiated once.
-
-    M with A, and A for the sizes of its rows, are one function of the same operands, which XLA merges.
-    """
-    q, v = coin_state(COIN, 0.25, 1.25, 0.375, 1.5, -6.0)
-    model = model_of(tilting_disk, 0.0, q, v, COIN)
-    program = jax.make_jaxpr(lambda q, v: to_manifold(equations_of(model), 0.0, q, v, 1e-12, 1e-12)[:2])(q, v)
-    calls = [x for x in operations(program.jaxpr) if x.primitive.name in ("jit", "pjit")]
-    names = Counter(x.params["name"] for x in calls)
-    assert names["_residuals"] == 2
-    assert len({id(x.params["jaxpr"]) for x in calls if x.params["name"] == "linear_equations"}) == 1
 
 
 def test_returning_to_the_plane_rolls():

@@ -126,31 +126,11 @@ def test_redundant_constraints_have_the_shortest_multipliers():
     assert largest(found[0] - alone) <= 1e-11 * largest(alone)
 
 
-@pytest.mark.exhaustive
-def test_contradictory_constraints_are_named():
-    """The same links demanded at another rate contradict each other: an error, and NaN while tracing."""
-    system, q, v, params = chain(10)
-    faster = lambda t, q, params: links(t, q, params)[:2] + t**2
-    broken = lj.System(particles, system.constraints | {"faster": lj.Holonomic(faster)})
-    with pytest.raises(ValueError, match="contradict.*faster|faster.*contradict"):
-        lj.accelerations(broken, 0.0, q, v, params)
-    a, _ = jax.jit(lambda q: lj.accelerations(broken, 0.0, q, v, params))(q)
-    assert np.all(np.isnan(a))
-
-
 def test_undetermined_is_refused():
     """A massless end hangs on one link: its acceleration across it is not determined, and an error says so."""
     system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
     with pytest.raises(ValueError, match="singular"):
         lj.accelerations(system, 0.0, q, v, params)
-
-
-@pytest.mark.exhaustive
-def test_undetermined_is_refused_at_the_start_of_a_motion():
-    """The same for a motion, by the verdict inside the compiled program."""
-    system, q, v, params = with_masses(np.append(np.ones(11), 0.0))
-    with pytest.raises(ValueError, match="singular"):
-        lj.integrate(system, q, v, params, ts=np.array([0.0, 0.1]))
 
 
 def acceleration(system, q, v):
@@ -182,18 +162,6 @@ def test_derivatives_in_both_modes():
         np.testing.assert_allclose(
             jax.jit(mode(of(sparse)))(params["m"]), expected, rtol=0, atol=1e-11 * largest(expected)
         )
-
-
-@pytest.mark.exhaustive
-def test_second_derivatives_and_lanes():
-    """Forward-over-forward derivatives and a batch agree with the dense equations."""
-    system, q, v, params = chain(8)
-    sparse, dense = acceleration(system, q, v)
-    heavier = lambda s: params | {"m": params["m"] * jnp.where(np.arange(8) == 2, s, 1.0)}
-    twice = lambda f: jax.jit(jax.jacfwd(jax.jacfwd(lambda s: f(heavier(s)))))(1.0)
-    np.testing.assert_allclose(twice(sparse), twice(dense), rtol=0, atol=1e-10 * largest(twice(dense)))
-    lanes = lambda f: jax.jit(jax.vmap(lambda g: f(params | {"g": g})))(jnp.array([1.0, 9.81]))
-    np.testing.assert_allclose(lanes(sparse), lanes(dense), rtol=0, atol=1e-12 * largest(lanes(dense)))
 
 
 def largest_array(function, *args):
@@ -243,42 +211,6 @@ def test_without_constraints():
     np.testing.assert_allclose(a, np.broadcast_to([0.0, -9.81], (20, 2)), rtol=1e-14)
     with pytest.raises(ValueError, match="singular"):
         lj.accelerations(free, 0.0, q, v, params | {"m": np.where(np.arange(20) == 3, 0.0, params["m"])})
-
-
-@pytest.mark.exhaustive
-def test_explain_says_so():
-    """`explain` names the band and its size; for a small system it names none."""
-    explained = lambda system, *state: lj.explain(system, 0.0, *state)
-    assert "banded, half bandwidth 1, 9 equations" in repr(explained(*chain(9)))
-    assert "banded" not in repr(explained(*chain(4)))
-
-
-@pytest.mark.exhaustive
-def test_a_motion_stays_on_its_links():
-    """A short motion of 16 links agrees with the dense solution, and keeps constraints and energy."""
-    system, q, v, params = chain(16)
-    hidden = lj.Holonomic(lambda t, q, p: jax.lax.scan(lambda c, x: (c, x + c), 0.0, links(t, q, p))[1])
-    ts = np.linspace(0.0, 0.05, 3)
-    sparse = lj.integrate(system, q, v, params, ts=ts)
-    dense = lj.integrate(lj.System(particles, {"links": hidden}), q, v, params, ts=ts)
-    np.testing.assert_allclose(sparse.q, dense.q, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(sparse.multipliers["links"], dense.multipliers["links"], rtol=1e-7)
-    assert sparse.residual() < 1e-14 and sparse.drift() < 1e-9
-
-
-@pytest.mark.exhaustive
-def test_gradient_of_a_motion():
-    """The derivative of a chain's end by gravity: forward, reverse, and by the difference of two motions."""
-    system, q, v, params = chain(8)
-
-    def end(g):
-        return lj.integrate(system, q, v, params | {"g": g}, ts=np.array([0.0, 0.1]), rtol=1e-11, atol=1e-11).q[
-            -1, -1, 0
-        ]
-
-    forward, reverse = jax.jit(jax.jacfwd(end))(9.81), jax.jit(jax.grad(end))(9.81)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-10)
-    np.testing.assert_allclose(forward, (end(9.82) - end(9.80)) / 0.02, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.structure import are_angles, conserves_jacobi_integral, is_diagonal, structure
+from lagjax.mechanics.structure import are_angles, is_diagonal, structure
 from lagjax.system import coordinates
 from lagjax.system.model import model_of
-from tests.plain import not_plain
 
 free = lambda t, q, v, params: 0.5 * (v["a"] ** 2 + v["b"] ** 2)
 
@@ -53,21 +52,6 @@ def test_vectors_of_angles():
     assert tuple(are_angles(model_of(lj.System(chain), *s))) == (True,) * 4
     mixed = lambda t, q, v, params: 0.5 * v @ v + jnp.cos(q[0]) - q[1] ** 2
     assert tuple(are_angles(model_of(lj.System(mixed), *s))) == (False,) * 4
-
-
-def test_conserved_jacobi_integral():
-    """Explicit time in L or a constraint, a force, dissipation or a velocity constraint each take it away."""
-    s = coordinates.state(0.0, {"a": 0.1, "b": 0.2}, {"a": 0.0, "b": 0.0}, {"k": 1.0})
-    known = lambda **parts: conserves_jacobi_integral(model_of(lj.System(**({"lagrangian": free} | parts)), *s))
-    fixed, moving = (lj.Holonomic(lambda t, q, params, rate=rate: q["a"] - q["b"] * (1 + rate * t)) for rate in (0, 1))
-    assert known() and known(constraints={"fixed": lj.Holonomic(lambda t, q, params: q["a"] - q["b"])})
-    assert not known(lagrangian=lambda t, q, v, params: free(t, q, v, params) * jnp.cos(t))
-    assert not known(constraints={"moving": moving})
-    assert not known(constraints={"rolling": lj.Nonholonomic(lambda t, q, v, params: v["a"] - v["b"])})
-    assert not known(force=lambda t, q, v, params: v)
-    assert not known(dissipation=lambda t, q, v, params: v["a"] ** 2)
-    # Time enters the expression but multiplies zero: not recognised as constant, which errs on the safe side.
-    assert not known(constraints={"fixed": fixed})
 
 
 def of(lagrangian, q, constraints=None, **functions):
@@ -140,17 +124,6 @@ def test_a_long_program_is_not_taken_apart(nodes, known):
     """A long mass matrix has no structure; twin: few nodes."""
     system, s = mass_by_quadrature(nodes)
     assert (structure(model_of(system, *s)) is not None) == known
-
-
-@not_plain
-@pytest.mark.slow
-@pytest.mark.parametrize(("nodes", "known"), [(4, True), (500, False)])
-def test_a_long_program_is_explained(nodes, known):
-    """`explain` works without a structure; twin: few nodes."""
-    system, s = mass_by_quadrature(nodes)
-    report = dict(lj.explain(system, *s[:3]).rows)
-    assert report["mass matrix"] == "positive definite" + ", diagonal, depends on q[0], q[1], q[2]" * known
-    assert report["solved"] == ("3 divisions" if known else "3 equations by elimination")
 
 
 def test_a_long_mass_matrix_is_not_known_to_be_diagonal():

@@ -100,34 +100,6 @@ def car_axis(t, q, p):
     return k, f, g, G
 
 
-def slider_crank_end(end, p, speed=150.0, rtol=3e-14):
-    """(q, v) at `end`, in the order (x1, y1, θ1, x2, y2, θ2, x3), by DOP853 on the equation of θ1."""
-    m1, m2, m3, J1, J2, l1, l2, g = (p[k] for k in ("m1", "m2", "m3", "J1", "J2", "l1", "l2", "g"))
-
-    def rod(angle):
-        """sin θ2, cos θ2, w = dθ2/dθ1 and dw/dθ1."""
-        sin, cos = -l1 / l2 * np.sin(angle), np.sqrt(1 - (l1 / l2 * np.sin(angle)) ** 2)
-        w = -l1 / l2 * np.cos(angle) / cos
-        return sin, cos, w, l1 / l2 * np.sin(angle) / cos + w**2 * sin / cos
-
-    def field(t, y):
-        angle, rate = y
-        s, c = np.sin(angle), np.cos(angle)
-        s2, c2, w, dw = rod(angle)
-        centre, block = l1 * s + 0.5 * l2 * w * s2, l1 * s + l2 * w * s2
-        d_centre, d_block = l1 * c + 0.5 * l2 * (dw * s2 + w**2 * c2), l1 * c + l2 * (dw * s2 + w**2 * c2)
-        J = J1 + m1 * l1**2 / 4 + J2 * w**2 + m2 * (centre**2 + 0.25 * (l1 * c) ** 2) + m3 * block**2
-        dJ = 2 * J2 * w * dw + m2 * (2 * centre * d_centre - 0.5 * l1**2 * c * s) + 2 * m3 * block * d_block
-        return [rate, -(0.5 * dJ * rate**2 + 0.5 * (m1 + m2) * g * l1 * c) / J]
-
-    angle, rate = solve_ivp(field, (0, end), [0.0, speed], "DOP853", rtol=rtol, atol=rtol).y[:, -1]
-    s, c = np.sin(angle), np.cos(angle)
-    s2, c2, w, _ = rod(angle)
-    q = [l1 * c / 2, l1 * s / 2, angle, l1 * c + l2 * c2 / 2, l1 * s / 2, np.arcsin(s2), l1 * c + l2 * c2]
-    slopes = [-l1 * s / 2, l1 * c / 2, 1.0, -l1 * s - l2 * s2 * w / 2, l1 * c / 2, w, -l1 * s - l2 * s2 * w]
-    return np.array(q), rate * np.array(slopes)
-
-
 def ladder_end(windows, end, p, speed=1.0):
     """(q, v) of the heads at `end` in Jacobi's elliptic functions, for a ladder that goes over the top.
 
@@ -184,37 +156,3 @@ def governor_state(p, field, y):
     sinking = -l * np.cos(angle) * rate * up
     q = np.concatenate([[psi, z], reach * e + height, -reach * e + height])
     return q, np.concatenate([[turn, slide], outwards + sinking, -outwards + sinking])
-
-
-def governor_end(end, p, method="Radau", rtol=1e-12):
-    """(q, v) at `end` in the order (ψ, z, C, D), from the equations of α and z."""
-    field = governor_field(p)
-    start = [0.0, np.pi / 6, 0.5, 0.0, 0.0]
-    # Nothing depends on ψ, so Radau's difference step for its column of zeros grows until it overflows.
-    with np.errstate(over="ignore"):
-        y = solve_ivp(field, (0, end), start, method, rtol=rtol, atol=rtol / 10).y[:, -1]
-    return governor_state(p, field, y)
-
-
-def double_pendulum_end(end, p, rtol=3e-14):
-    """(q, v) at `end` in the order (x1, y1, x2, y2), by DOP853 on the equations of the angles, from the horizontal."""
-    m1, m2, l1, l2, g = (p[k] for k in ("m1", "m2", "l1", "l2", "g"))
-
-    def field(t, y):
-        first, second, rate1, rate2 = y
-        sin, cos = np.sin(first - second), np.cos(first - second)
-        matrix = [[(m1 + m2) * l1, m2 * l2 * cos], [l1 * cos, l2]]
-        force = [
-            -m2 * l2 * rate2**2 * sin - (m1 + m2) * g * np.sin(first),
-            l1 * rate1**2 * sin - g * np.sin(second),
-        ]
-        return np.concatenate([[rate1, rate2], np.linalg.solve(matrix, force)])
-
-    start = [np.pi / 2, np.pi / 2, 0.0, 0.0]
-    first, second, rate1, rate2 = solve_ivp(field, (0, end), start, "DOP853", rtol=rtol, atol=rtol).y[:, -1]
-    inner, outer = l1 * np.array([np.sin(first), -np.cos(first)]), l2 * np.array([np.sin(second), -np.cos(second)])
-    turn1, turn2 = (
-        rate1 * l1 * np.array([np.cos(first), np.sin(first)]),
-        rate2 * l2 * np.array([np.cos(second), np.sin(second)]),
-    )
-    return np.concatenate([inner, inner + outer]), np.concatenate([turn1, turn1 + turn2])

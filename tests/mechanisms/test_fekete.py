@@ -1,10 +1,8 @@
 """Fekete points: the published state is at rest, with equal multipliers."""
 
 import numpy as np
-import pytest
 
 from lagjax.mechanisms import fekete
-from tests.behaviour.test_end_states import run
 
 
 def test_fekete():
@@ -18,9 +16,3 @@ def test_fekete():
 
     assert np.max(np.abs(forces(fekete.REST) - 2 * 19 / 4 * fekete.REST)) < 1e-10
     assert np.max(np.abs(forces(mechanism.q0) - 2 * 19 / 4 * mechanism.q0)) > 0.1
-
-
-@pytest.mark.exhaustive
-def test_fekete_multipliers():
-    """At rest every multiplier is -(N - 1)/4, for any arrangement."""
-    np.testing.assert_allclose(run(fekete.MECHANISM, 1e-10).multipliers["sphere"][-1], -19 / 4, rtol=1e-12)

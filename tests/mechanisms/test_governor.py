@@ -1,19 +1,10 @@
 """The governor: its stored end against the two equations of its angle and its height."""
 
 import numpy as np
-import pytest
 
 from lagjax.mechanisms import governor
 from tests.by_numpy import equations
 from tests.mechanisms import published
-from tests.mechanisms.test_mechanism import assert_reference
-
-
-@pytest.mark.exhaustive
-def test_governor():
-    """Radau on the two equations of α and z gives the stored end."""
-    mechanism = governor.MECHANISM
-    assert_reference(mechanism, *published.governor_end(mechanism.end, mechanism.params))
 
 
 def test_its_accelerations():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies import product, spin_in_body
+from lagjax.bodies import product
 from lagjax.models.mjcf import mujoco_itself
 
 mujoco = mujoco_itself()
@@ -219,17 +219,3 @@ def test_numbers_that_are_none(attributes, axis, message, tmp_path, monkeypatch)
             f'<mujoco><worldbody><body name="rod" {attributes}><joint name="hinge" axis="{axis}"/>'
             '<geom size=".1" mass="1"/></body></worldbody></mujoco>'
         )
-
-
-@pytest.mark.exhaustive
-def test_accelerations():
-    """In joint coordinates against MuJoCo: numbers at 1e-12, the ball by its angular acceleration, free fall."""
-    model, theirs = lj.read_mjcf(TEXT), Theirs(TEXT)
-    q, v = model.joint_state(theirs.positions, theirs.rates)
-    a, _ = lj.accelerations(model.joint_system(), 0.0, q, v, None)
-    for name in ("yaw", "first", "second", "slide", "x", "y", "turn"):
-        expected = theirs.data.qacc[theirs.m.joint(name).dofadr[0]]
-        np.testing.assert_allclose(a[name], expected, atol=1e-12)
-    first = theirs.m.joint("ball").dofadr[0]
-    np.testing.assert_allclose(spin_in_body(q["ball"], a["ball"]), theirs.data.qacc[first : first + 3], atol=1e-12)
-    np.testing.assert_allclose(a["crate"].position, [0.0, 0.0, -9.81], atol=1e-12)

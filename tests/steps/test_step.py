@@ -106,8 +106,7 @@ def skate_lagrangian(t, q, v, params):
 
 
 skate = lj.System(
-    skate_lagrangian,
-    {"blade": lj.Nonholonomic(lambda t, q, v, params: v[0] * jnp.sin(q[2]) - v[1] * jnp.cos(q[2]))},
+    skate_lagrangian, {"blade": lj.Nonholonomic(lambda t, q, v, params: v[0] * jnp.sin(q[2]) - v[1] * jnp.cos(q[2]))}
 )
 
 

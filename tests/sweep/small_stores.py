@@ -12,10 +12,7 @@ from lagjax.integrate.solve.harvest import report
 from tests.mutated import describe
 
 AXES = {"k": np.arange(1, 6), "x": np.linspace(0.1, 1.0, 8)}
-EXACT = {
-    "n": 10 + AXES["k"][:, None] * np.ones(8, int),
-    "y": np.stack([AXES["k"][:, None] * AXES["x"]] * 2, -1),
-}
+EXACT = {"n": 10 + AXES["k"][:, None] * np.ones(8, int), "y": np.stack([AXES["k"][:, None] * AXES["x"]] * 2, -1)}
 
 
 def run(point):

@@ -7,28 +7,6 @@ import pytest
 
 from lagjax.sweep.axes import axes_of
 
-GRID = {"a": np.array([1.0, 2.0]), "b": np.array([10.0, 20.0, 30.0]), "c": np.arange(8.0).reshape(4, 2)}
-
-
-def test_the_last_axis_is_the_fastest():
-    """Indices follow nested loops, for one point and several; an axis of vectors gives slices."""
-    axes = axes_of(GRID, paired=False)
-    assert axes.shape == (2, 3, 4) and axes.size == 24
-    points = [(a, b, c) for a in GRID["a"] for b in GRID["b"] for c in GRID["c"]]
-    several = axes.at(np.array([0, 7, 23]))
-    for n, index in enumerate((0, 7, 23)):
-        for point in (axes.at(index), {name: x[n] for name, x in several.items()}):
-            assert (point["a"], point["b"]) == points[index][:2]
-            assert np.array_equal(point["c"], points[index][2])
-
-
-def test_paired_axes_move_together():
-    """Paired axes have a single dimension, the point."""
-    axes = axes_of({"a": jnp.arange(3.0), "b": 2 * jnp.arange(3.0)}, paired=True)
-    assert axes.dims == {"point": 3}
-    assert axes.at(2) == {"a": 2.0, "b": 4.0}
-    assert axes.words(1) == "a = 1, b = 2"
-
 
 def test_numbers_become_those_of_jax():
     """Integers stay integers; floats get JAX's dtype."""

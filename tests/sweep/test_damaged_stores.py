@@ -69,7 +69,9 @@ def test_a_block_without_mark_was_not_run(store):
     remove(store / "lagjax/marks/c/1/0/0")
     opened = lj.open_sweep(store)
     assert opened.counts() == {"successful": 32, "not run": 8} and np.isnan(opened.values["y"]).sum() == 16
-    assert swept(store).ran == 8
+    again = swept(store)
+    assert again.ran == 8
+    same(again.values)
 
 
 def wrong_copies(whole, to, seed):

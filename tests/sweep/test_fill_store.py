@@ -1,15 +1,10 @@
 """How stores are filled: what is missing is computed again, also by other versions."""
 
-import numpy as np
 import pytest
 
 import lagjax as lj
 from lagjax.sweep import metadata
-from lagjax.sweep.store import Store
-from tests.sweep import worker
 from tests.sweep.small_stores import AXES, remove, rewrite, run, same, swept
-from tests.sweep.test_store import same as same_sweep
-from tests.sweep.test_store import swept as swept_points
 
 
 def by_another_version(description):
@@ -35,17 +30,3 @@ def test_other_versions(store):
     rewrite(store, lambda description: description["fingerprint"].update(format=99))
     with pytest.raises(ValueError, match="which is newer"):
         lj.open_sweep(store)
-
-
-def test_only_what_is_missing(tmp_path):
-    """Unmarked blocks are computed again, whatever values they contain."""
-    import zarr
-
-    path, whole = tmp_path / "sweep", swept_points(worker.quick)
-    swept_points(worker.quick, path)
-    store = Store(path)
-    store.unmark([1])
-    zarr.open_group(str(path))["value"][store.blocks.region(1)] = -1.0
-    again = swept_points(worker.quick, path)
-    assert again.ran == len(np.r_[store.blocks.points(1)])
-    same_sweep(again, whole)

@@ -6,7 +6,6 @@ import pytest
 
 import lagjax as lj
 from tests.sweep.small_stores import AXES, run, swept
-from tests.sweep.test_sweep import quiet
 from tests.sweep.test_tables import swept as swept_in_blocks
 
 
@@ -20,18 +19,6 @@ def test_names_that_look_like_folders(tmp_path):
         lj.sweep(lambda point: {"a": {"b": point["x"]}, "a.b": 1.0}, AXES, progress=False).to_xarray()
     with pytest.raises(ValueError, match="two axes are named '1'"):
         lj.sweep(run, {1: AXES["x"], "1": AXES["x"]}, progress=False)
-
-
-def test_paired_and_labelled():
-    """The dimension is the point, and the axes are its coordinates; twin: each with each, as a loop."""
-    pairs = {"g": np.array([1.0, 4.0, 9.0]), "angle": np.array([0.1, 0.2, 0.3])}
-    run = lambda point: jnp.sqrt(point["g"]) * jnp.cos(point["angle"])
-    swept = quiet(run, pairs, paired=True)
-    data = swept.to_xarray()
-    assert data["value"].dims == ("point",) and data["g"].dims == ("point",)
-    each = np.sqrt(pairs["g"])[:, None] * np.cos(pairs["angle"])
-    np.testing.assert_allclose(swept.values, each.diagonal(), rtol=1e-15)
-    np.testing.assert_allclose(quiet(run, pairs).values, each, rtol=1e-15)
 
 
 def test_axes_with_names_that_are_taken(tmp_path):

@@ -1,6 +1,5 @@
 """Trajectories that a sweep stored or pickled come back as trajectories, with their system if it is passed again."""
 
-import copy
 import pickle
 from typing import NamedTuple
 
@@ -164,31 +163,6 @@ def test_times_of_their_own(tmp_path):
     np.testing.assert_allclose(data["q.x"], np.cos(AXES["k"][:, None] ** 2 * TS), atol=1e-7)
     xarray.testing.assert_equal(data, swept.to_xarray())
     assert isinstance(lj.open_sweep(tmp_path / "own").values, lj.Trajectory)
-
-
-@pytest.mark.slow
-def test_part_of_it(store, tmp_path):
-    """Points not run are NaN but have times; the others have values."""
-    import xarray
-
-    half = quiet(run, store=tmp_path / "store", chunk=1, part=(0, 2))
-    data = xarray.open_zarr(tmp_path / "store").load()
-    not_run = data["result"].values == -1
-    assert 0 < not_run.sum() == not_run.size - half.ran and np.array_equal(data["motion.t"], TS)
-    np.testing.assert_array_equal(np.isnan(data["motion.q.x"]).all("motion.t"), not_run)
-    xarray.testing.assert_equal(data, lj.open_sweep(tmp_path / "store", classes=[Pair]).to_xarray())
-    np.testing.assert_allclose(
-        lj.open_sweep(tmp_path / "store", classes=[Pair]).values["motion"].q["x"][~not_run], EXACT[~not_run], atol=1e-8
-    )
-
-
-@pytest.mark.slow
-def test_copied_and_pickled():
-    """A copy keeps its functions; pickle refuses what has a lambda, in words, unless the values are in a store."""
-    swept = quiet(run)
-    with pytest.raises(pickle.PicklingError, match="cannot be pickled: it is a lambda"):
-        pickle.dumps(swept)
-    assert float(lane(copy.deepcopy(swept).values["motion"], 1, 1).drift()) < 1e-9
 
 
 class Stiff(eqx.Module):

@@ -46,36 +46,10 @@ def final_angle_and_slope(point):
     return {"angle": traj.q[-1], "slope": slope(point), "steps": traj.stats["num_steps"]}
 
 
-def by_loop(run, axes):
-    """Run point by point."""
-    program = jax.jit(run)
-    points = [program({"g": g, "angle": angle}) for g in axes["g"] for angle in axes["angle"]]
-    return jax.tree.map(lambda *x: np.stack(x).reshape(len(axes["g"]), len(axes["angle"])), *points)
-
-
-@pytest.fixture(scope="module")
-def looped():
-    """The loop over the grid."""
-    return by_loop(final_angle_and_slope, AXES)
-
-
 def assert_same(found, expected, rtol, atol):
     """Compare values and gradients."""
     for name in ("angle", "slope"):
         np.testing.assert_allclose(found[name], expected[name], rtol=rtol, atol=atol)
-
-
-@pytest.mark.exhaustive
-def test_same_as_a_loop(looped):
-    """One lane after the other takes the same steps; together, sines round differently, which changes first steps."""
-    in_turn, together = quiet(final_angle_and_slope, layout="map", workers=1), quiet(final_angle_and_slope)
-    assert in_turn.dims == {"g": 3, "angle": 7} and in_turn.ok.all() and together.ok.all()
-    np.testing.assert_array_equal(in_turn.values["steps"], looped["steps"])
-    assert_same(in_turn.values, looped, 1e-10, 1e-12)
-    np.testing.assert_allclose(together.values["steps"], looped["steps"], rtol=0.2)
-    assert_same(together.values, looped, 1e-7, 1e-7)
-    # The gradient integrates as well.
-    assert np.all(in_turn.status.steps > looped["steps"])
 
 
 @pytest.mark.exhaustive

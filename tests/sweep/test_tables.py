@@ -111,20 +111,6 @@ def test_blocks_end_with_the_axes(store):
     np.testing.assert_array_equal(together, np.arange(42))
 
 
-def test_a_short_block_is_mended(store, tmp_path):
-    """Only the points of a short block at the end of a row are computed again."""
-    import xarray
-
-    copied = shutil.copytree(store, tmp_path / "store")
-    file = copied / "y/c/1/1/0"
-    file.write_bytes(file.read_bytes()[:9])
-    with warnings.catch_warnings(record=True):
-        warnings.simplefilter("always")
-        mended = swept(copied)
-    assert mended.ran == 6
-    xarray.testing.assert_equal(xarray.open_zarr(copied).load(), xarray.open_zarr(store).load())
-
-
 def test_other_attributes_are_nobodys_harm(store, tmp_path):
     """Attributes added by a user stay and do not count as damage; nor does consolidating the metadata again."""
     import xarray

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.display.animation import NOWHERE
 from tests.display.web_page.test_page import told
 from tests.systems import motion
 
@@ -131,27 +130,3 @@ def test_what_makes_no_page(swept):
         lj.sweep(lambda p: jnp.ones((4, 40)) * p["a"], {"a": np.ones(2)}, progress=False).to_html()
     with refused("draws a motion", "0 trajectories"):
         swept.to_html(positions=lambda t, q, params: (q, q))
-
-
-@pytest.mark.exhaustive
-def test_films_of_all_lanes():
-    """All lanes share their times; a lane that ends early stays in place; a lane that never started is not shown."""
-    fall = lj.System(lambda t, q, v, params: 0.5 * v**2 / jnp.where(params["g"] > 0, 1.0, 0.0) - params["g"] * q)
-    ground = {"ground": lj.Crossing(lambda t, q, v, params: q)}
-    ts = np.linspace(0.0, 2.0, 41)
-    drop = lambda point: lj.integrate(fall, 2.0, 0.0, {"g": point["g"]}, ts=ts, events=ground, method=lj.Tsit5())
-    swept = lj.sweep(drop, {"g": np.array([-1.0, 0.5, 4.0])}, progress=False)
-    page = swept.to_html(positions=lambda t, q, params: (0.0, q), seconds=2.0, rate=10.0)
-    spec = told(page.html)
-    film = spec["film"]
-    assert (film["frames"], film["start"], film["parts"][0]["points"]) == (21, 0.0, 1)
-    points = np.frombuffer(base64.b64decode(film["parts"][0]["xy"][1]), "<i2").reshape(3, 21, 2)
-    assert np.all(points[0] == NOWHERE) and np.all(points[1:] != NOWHERE)
-    # Pixels count downwards; the scale is calibrated from both ends of the slow lane, which falls by g t²/2 to 1.
-    top, bottom = points[1, [0, -1], 1].astype(float)
-    height = 2.0 - (points[..., 1] - top) / (bottom - top)
-    t = np.linspace(0.0, 2.0, 21)
-    np.testing.assert_allclose(height[1], 2.0 - 0.25 * t**2, atol=1e-2)
-    np.testing.assert_allclose(height[2], np.maximum(2.0 - 2.0 * t**2, 0.0), atol=1e-2)
-    # Twin: lanes in another order would differ.
-    assert np.max(np.abs(height[2] - (2.0 - 0.25 * t**2))) > 0.5

@@ -1,4 +1,4 @@
-"""Constraints at three levels, against derivatives along a motion and closed forms."""
+"""Constraints at three levels, in closed form; their accelerations are in `tests/mechanics/test_accelerations.py`."""
 
 from functools import partial
 
@@ -20,29 +20,8 @@ SYSTEM = lj.System(
         "skate": lj.Nonholonomic(lambda t, q, v, params: v["x"] * jnp.sin(q["y"] + t) - v["y"] * q["x"]),
     },
 )
-T, X, U, A, RATE = 0.3, np.array([0.6, -0.9]), np.array([0.4, 1.1]), np.array([-0.7, 0.2]), 0.25
+T, X, U, RATE = 0.3, np.array([0.6, -0.9]), np.array([0.4, 1.1]), 0.25
 MODEL = model_of(SYSTEM, np.asarray(T), {"x": 0.6, "y": -0.9}, {"x": 0.4, "y": 1.1}, {"rate": RATE})
-
-
-def along(s):
-    """The state at T + s on the parabola with the acceleration A."""
-    return T + s, X + U * s + 0.5 * A * s**2, U + A * s
-
-
-def rates(order):
-    """Derivatives by central differences of g (`order` 2) and of dg/dt, phi (1), along the parabola."""
-    g = lambda s: evaluated(partial(constraints.position_residual, MODEL), *along(s)[:2])[0]
-    of_v = lambda s: evaluated(partial(constraints.velocity_residual, MODEL), *along(s))[0]
-    h = 1e-4
-    return (g(h) - 2 * g(0.0) + g(-h)) / h**2 if order == 2 else (of_v(h) - of_v(-h)) / (2 * h)
-
-
-def test_rows_of_the_acceleration():
-    """A a - gamma is the rate of dg/dt and of phi along a motion with acceleration a; twin: another acceleration."""
-    jacobian, gamma = evaluated(partial(constraints.acceleration_rows, MODEL), T, X, U)
-    np.testing.assert_allclose(jacobian @ A - gamma, rates(1), atol=1e-7)
-    np.testing.assert_allclose((jacobian @ A - gamma)[0], rates(2)[0], atol=1e-6)
-    assert np.abs(jacobian @ (A + 0.1) - gamma - rates(1)).min() > 1e-2
 
 
 def test_residuals_and_closed_forms():

@@ -2,7 +2,6 @@
 
 import re
 import types
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,6 @@ import lagjax as lj
 from lagjax.integrate import failure
 from lagjax.integrate.trajectory.hybrid_trajectory import Switches
 from lagjax.system import State
-from tests.counting import compiles
-from tests.tiers import exhaustive_but
 
 G = 9.81
 FALL = np.sqrt(2 / G)
@@ -79,61 +76,6 @@ def test_a_ball_that_bounces():
     )
 
 
-RESTITUTION, LEVEL = 0.5, 0.0
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("ready_made", exhaustive_but((True,), (True, False)))
-def test_what_functions_read_may_change(monkeypatch, ready_made):
-    """A reset, a restitution and a gap that read globals, as in notebooks: each call uses their current values."""
-    gap = lambda t, q, params: q - LEVEL
-    if ready_made:
-        switch = lj.Switch("flying", to="flying", when=lj.touches(gap, lambda speed: RESTITUTION + 0 * speed))
-    else:
-        guard = lambda t, q, v, params: gap(t, q, params)
-        switch = lj.Switch("flying", to="flying", when=guard, reset=lambda t, q, v, params: -RESTITUTION * v)
-    system, ts = lj.Hybrid({"flying": ball}, [switch], most_switches=4), np.array([0.0, 1.0])
-    ends = lambda: float(in_phases(system, 1.0, 0.0, {"g": G}, ts=ts, estimate_error=False).q[-1])
-    np.testing.assert_allclose(ends(), heights(1.0), rtol=1e-8)
-    monkeypatch.setitem(globals(), "RESTITUTION", 0.75)
-    np.testing.assert_allclose(ends(), heights(1.0, e=0.75), rtol=1e-8)
-    monkeypatch.setitem(globals(), "LEVEL", 0.125)
-    np.testing.assert_allclose(ends(), 0.125 + heights(1.0, 0.875, 0.75), rtol=1e-8)
-
-
-def made_again(e):
-    """Make all functions again, as running a notebook cell again does."""
-    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
-    flying = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, lambda speed: e + 0 * speed))
-    return lj.Hybrid({"flying": system}, [flying], most_switches=4)
-
-
-@pytest.mark.exhaustive
-def test_made_again_it_compiles_nothing():
-    """The same functions made again use the same program; twin: with another number in them they do not."""
-    end = lambda e: float(in_phases(made_again(e), 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0])).q[-1])
-    np.testing.assert_allclose(end(0.5), heights(1.0), rtol=1e-8)
-    with compiles() as found:
-        np.testing.assert_allclose(end(0.5), heights(1.0), rtol=1e-8)
-    assert not found
-    with compiles() as found:
-        np.testing.assert_allclose(end(0.75), heights(1.0, e=0.75), rtol=1e-8)
-    assert found
-
-
-@pytest.mark.exhaustive
-def test_lanes_are_single_runs():
-    """Lanes that switch at different times, and different numbers of times, agree with single runs."""
-    hs = np.array([0.4, 1.0, 3.0, 6.0])
-    together = jax.vmap(lambda h: bounced(h, estimate_error=False, throw=False))(hs)
-    alone = [bounced(h, estimate_error=False, throw=False) for h in hs]
-    assert [len(traj.switches) for traj in alone] == [4, 2, 1, 0]
-    assert np.isnan(together.q[0, -1]) and int(together.result._value[0]) == int(lj.RESULTS.too_many_switches._value)
-    for i, traj in enumerate(alone):
-        np.testing.assert_allclose(together.q[i], traj.q, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(together.switches.t[i], traj.switches.t, rtol=1e-13)
-
-
 def switched(t, v, v_after):
     """A ball whose flights begin with these switches, as far as an error looks at them."""
     few, none = len(t), np.zeros(len(t), int)
@@ -158,15 +100,6 @@ def test_a_guard_below_zero():
     below = failure._below_zero(bouncing, State(0.0, -1.0, 0.0, PARAMS))
     assert re.search("guard of phase 'flying' is below zero at the start: .*is -1.\nUsual cause", below)
     assert "start: .\n" in failure._below_zero(bouncing, State(0.0, 1.0, 0.0, PARAMS))
-
-
-@pytest.mark.slow
-def test_motions_that_fail():
-    """Too many switches, and a start below a guard, are said by `lj.integrate`."""
-    with pytest.raises(RuntimeError, match="(?s)most_switches = 4.*each takes 0.5 of the time.*about t = 1.35457"):
-        lj.integrate(bouncing, 1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
-    with pytest.raises(ValueError, match="guard of phase 'flying' is below zero at the start.*is -1"):
-        lj.integrate(bouncing, -1.0, 0.0, PARAMS, ts=np.array([0.0, 0.25, 0.5, 0.75, 3.0]))
 
 
 def hybrid(to="flying", **switch):
@@ -232,60 +165,6 @@ def test_between_walls():
     np.testing.assert_allclose(found, np.abs((z + v + 1) % 2 - 1), rtol=0, atol=1e-12)
 
 
-SPHERE = {"m": 2.0, "R": 0.25, "g": G, "mu": 0.25}
-
-
-def sphere(t, q, v, p):
-    """A solid sphere in the plane."""
-    spin = 0.2 * p["m"] * p["R"] ** 2 * v["phi"] ** 2
-    return 0.5 * p["m"] * (v["x"] ** 2 + v["y"] ** 2) + spin - p["m"] * p["g"] * q["y"]
-
-
-def sliding(t, q, v, p):
-    """The velocity of the contact."""
-    return v["x"] - p["R"] * v["phi"]
-
-
-def coulomb(t, q, v, multipliers, p):
-    """Friction against a contact that slides forward."""
-    friction = -p["mu"] * multipliers["ground"]
-    return {"x": friction, "y": 0.0, "phi": -p["R"] * friction}
-
-
-ground = lj.Holonomic(lambda t, q, p: q["y"] - p["R"])
-slides = lj.System(sphere, {"ground": ground}, force=coulomb)
-rolls = lj.System(sphere, {"ground": ground, "grip": lj.Nonholonomic(sliding)})
-grip = lj.slips("grip", on="ground", coefficient=lambda p: p["mu"])
-thrown = lj.Hybrid(
-    {"slides": slides, "rolls": rolls},
-    [lj.Switch("slides", to="rolls", when=lj.sticks(sliding)), lj.Switch("rolls", to="slides", when=grip)],
-)
-
-
-def throw(mu, hybrid=thrown, **options):
-    """A sphere thrown without spin."""
-    q0, v0 = {"x": 0.0, "y": 0.25, "phi": 0.0}, {"x": 3.0, "y": 0.0, "phi": 0.0}
-    return in_phases(hybrid, q0, v0, SPHERE | {"mu": mu}, ts=np.linspace(0.0, 1.0, 5), **options)
-
-
-@pytest.mark.exhaustive
-def test_a_sphere_thrown_sliding():
-    """From t = 2 v₀/(7 μ g) on it rolls with 5 v₀/7; the other phase's multiplier is NaN."""
-    when = 6.0 / (7 * G)
-    for rtol in (1e-6, 1e-9, 1e-11):
-        traj = throw(0.25, rtol=rtol)
-        np.testing.assert_allclose(traj.switches.t[0], when / 0.25, rtol=10 * rtol)
-        np.testing.assert_allclose(traj.v["x"][-1], 15 / 7, rtol=10 * rtol)
-    np.testing.assert_allclose(traj.multipliers["ground"], 2.0 * G, rtol=1e-10)
-    assert np.isnan(traj.multipliers["grip"][0]) and abs(traj.multipliers["grip"][-1]) < 1e-9
-    # Twin: with friction that drives the sliding, it never ends.
-    pushing = lambda t, q, v, multipliers, p: jax.tree.map(jnp.negative, coulomb(t, q, v, multipliers, p))
-    driven = lj.System(sphere, {"ground": ground}, force=pushing)
-    hybrid = lj.Hybrid({"slides": driven, "rolls": rolls}, thrown.switches)
-    traj = throw(0.25, hybrid=hybrid)
-    assert len(traj.switches) == 0
-
-
 @pytest.mark.slow
 def test_two_balls_collide():
     """The impulse is that of the metric of M."""
@@ -301,30 +180,6 @@ def test_two_balls_collide():
     when, mean, closing = 1.0 / 3.0, m @ v0 / 4.0, 3.0
     after = mean + 0.5 * closing * np.array([-m[1], m[0]]) / 4.0
     np.testing.assert_allclose(ends(v0), v0[0] * when + after * (1.0 - when), rtol=1e-12)
-
-
-@pytest.mark.exhaustive
-def test_stick_and_slip():
-    """A block on a belt, held by a spring: it sticks, slips and sticks again; the period against its quadrature."""
-    params = {"k": 4.0, "belt": 0.5, "mu_s": 0.4, "mu_k": 0.2, "g": G}
-    oscillator = lambda t, q, v, p: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - 0.5 * p["k"] * q["x"] ** 2 - p["g"] * q["y"]
-    table = lj.Holonomic(lambda t, q, p: q["y"])
-    lags = lambda t, q, v, p: p["belt"] - v["x"]
-    drag = lambda t, q, v, multipliers, p: {"x": p["mu_k"] * multipliers["table"], "y": 0.0}
-    slipping = lj.System(oscillator, {"table": table}, force=drag)
-    sticking = lj.System(oscillator, {"table": table, "belt": lj.Nonholonomic(lambda t, q, v, p: v["x"] - p["belt"])})
-    hold = partial(lj.slips, "belt", on="table", coefficient=lambda p: p["mu_s"])
-    both = lj.Hybrid(
-        {"sticks": sticking, "slips": slipping},
-        [lj.Switch("sticks", to="slips", when=hold()), lj.Switch("slips", to="sticks", when=lj.sticks(lags))],
-    )
-    traj = in_phases(both, {"x": 0.0, "y": 0.0}, {"x": 0.5, "y": 0.0}, params, ts=np.linspace(0.0, 12.0, 61))
-    t = np.asarray(traj.switches.t)[: len(traj.switches)]
-    # It slips about x = μ_k g/k from x = μ_s g/k at the belt's speed, until it has that again; then it rides back.
-    w, off = 2.0, (0.4 - 0.2) * G / 4.0
-    slip, ride = 2 * (np.pi - np.arctan(w * off / 0.5)) / w, 2 * off / 0.5
-    np.testing.assert_allclose(np.diff(t)[0], slip, rtol=1e-9)
-    np.testing.assert_allclose(t[3:] - t[1:-2], slip + ride, rtol=1e-9)
 
 
 @pytest.mark.slow

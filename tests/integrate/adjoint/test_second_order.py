@@ -1,4 +1,4 @@
-"""Second derivatives in every order of the modes, by few parameters and by many."""
+"""Second derivatives at crossings; in every order of the modes: `tests/behaviour/test_compositions.py`."""
 
 import jax
 import jax.numpy as jnp
@@ -9,58 +9,6 @@ import lagjax as lj
 from lagjax.integrate.events import event_times
 
 TS = np.array([0.0, 0.9])
-spring = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * (params * q) ** 2)
-# A force of thirty parameters, which enter as two sums of squares.
-of_many = lj.System(lambda t, q, v, p: 0.5 * v**2 - q * (p["a"] @ p["a"]) - 0.5 * q**2 * (p["b"] @ p["b"]))
-MANY = {"a": np.linspace(0.05, 0.2, 15), "b": np.linspace(0.1, 0.2, 15)}
-
-
-def end(x):
-    """The square of q = q0 cos(k T), integrated."""
-    return lj.integrate(spring, x[0], 0.0, x[1], ts=TS, rtol=1e-11, atol=1e-11).q[-1] ** 2
-
-
-def exact(x):
-    """The same by its formula."""
-    return (x[0] * jnp.cos(0.9 * x[1])) ** 2
-
-
-def of_thirty(p, system=of_many):
-    """The end of a motion with thirty parameters, more than are differentiated in forward mode."""
-    return lj.integrate(system, 0.3, 0.0, p, ts=TS, rtol=1e-10, atol=1e-10, method=lj.Tsit5()).q[-1]
-
-
-def of_thirty_by_hand(p):
-    """The same from the solution of q'' = -A - B q from rest at 0.3."""
-    force, stiffness = p["a"] @ p["a"], p["b"] @ p["b"]
-    rest = -force / stiffness
-    return rest + (0.3 - rest) * jnp.cos(0.9 * jnp.sqrt(stiffness))
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("inner", (jax.jacfwd, jax.jacrev))
-@pytest.mark.parametrize("outer", (jax.jacfwd, jax.jacrev))
-def test_modes_in_any_order(inner, outer):
-    """The Hessian of a motion whose formula is known, with the modes nested in all four ways."""
-    x = jnp.array([0.75, 1.25])
-    np.testing.assert_allclose(outer(inner(end))(x), jax.hessian(exact)(x), atol=1e-8)
-
-
-@pytest.mark.exhaustive
-def test_gradients_of_gradients():
-    """`grad(grad)` by one parameter, jitted and batched, is that of the formula."""
-    second = lambda f: jax.grad(jax.grad(lambda k: f(jnp.stack([0.75, k]))))
-    k = jnp.array([0.5, 1.25, 2.0])
-    np.testing.assert_allclose(jax.jit(jax.vmap(second(end)))(k), jax.vmap(second(exact))(k), atol=1e-8)
-
-
-@pytest.mark.exhaustive
-def test_a_hessian_times_a_vector_by_many_numbers():
-    """`jvp(grad)` by 30 parameters, whose gradient is a replay of the steps, is that of the formula."""
-    along = jax.tree.map(np.cos, MANY)
-    product = lambda f: jax.jvp(jax.grad(f), (MANY,), (along,))[1]
-    found, expected = product(of_thirty), product(of_thirty_by_hand)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), found, expected)
 
 
 falling = lj.System(lambda t, q, v, p: 0.5 * v**2 - p[0] * q)

@@ -1,6 +1,5 @@
 """Methods of equal steps: what they keep over long motions, their derivatives, and what they refuse."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,17 +28,6 @@ def ellipse(eccentricity):
     return np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
 
 
-def on_ellipse(e, ts):
-    """Positions by Kepler's equation, M = E - e sin E, solved by halving: E lies within e of M."""
-    M = np.mod(ts + np.pi, TURN) - np.pi
-    E, low, high = M, M - e, M + e
-    for _ in range(60):
-        E = (low + high) / 2
-        late = E - e * np.sin(E) > M
-        low, high = np.where(late, low, E), np.where(late, E, high)
-    return np.stack([np.cos(E) - e, np.sqrt(1 - e**2) * np.sin(E)], axis=-1)
-
-
 def run(system, start, params, ts, method, dt, **options):
     """A motion whose program serves all lengths of steps."""
     given = {"method": method, "dt0": jnp.asarray(dt), "estimate_error": False} | options
@@ -58,28 +46,6 @@ def slope_of_energy(traj):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("method", "dt"), [(lj.Splitting(6), TURN / 300), (lj.Gauss(3), TURN / 200)], ids=str)
-def test_a_thousand_turns_and_back(method, dt):
-    """Energy, angular momentum, and the way back, on an ellipse of e = 0.6."""
-    start, ts = ellipse(0.6), TURN * np.linspace(0.0, 1000.0, 41)
-    there = run(kepler, start, 1.0, ts, method, dt)
-    slope, rest = slope_of_energy(there)
-    assert slope < 1e-10 and rest < 1e-6 and "drifts by" in repr(there)
-    q, v = np.asarray(there.q), np.asarray(there.v)
-    np.testing.assert_allclose(q[:, 0] * v[:, 1] - q[:, 1] * v[:, 0], 0.8, rtol=1e-12)
-    back = run(kepler, (q[2], v[2]), 1.0, ts[2::-1], method, dt)
-    np.testing.assert_allclose(np.asarray(back.q)[-1], start[0], atol=1e-8)
-
-
-@pytest.mark.exhaustive
-def test_other_steps_drift():
-    """Failing twin: by equal steps of Dopri8 the energy of the same orbit drifts."""
-    fixed = {"stepsize_controller": diffrax.ConstantStepSize(), "throw": False}
-    ts = TURN * np.linspace(0.0, 1000.0, 41)
-    assert slope_of_energy(run(kepler, ellipse(0.6), 1.0, ts, lj.Dopri8(), TURN / 100, **fixed))[0] > 1e-7
-
-
-@pytest.mark.exhaustive
 @pytest.mark.parametrize(("method", "bound"), [(lj.Gauss(3), 1e-8), (lj.Splitting(4), 1e-6)], ids=str)
 def test_half_a_million_steps_on_a_rod(method, bound):
     """The rod's length to round-off, the energy, its tension, and the way back."""
@@ -89,7 +55,7 @@ def test_half_a_million_steps_on_a_rod(method, bound):
     np.testing.assert_allclose(np.sum(q**2, axis=1), 1.0, atol=1e-13)
     np.testing.assert_allclose(np.sum(q * v, axis=1), 0.0, atol=1e-12)
     slope, rest = slope_of_energy(traj)
-    assert rest < bound and slope < bound / 100
+    assert rest < bound and slope < bound / 100 and "drifts by" in repr(traj)
     # The force 2 λ q turns v, against g = 9.81 along -y.
     np.testing.assert_allclose(traj.multipliers["rod"], -(np.sum(v**2, axis=1) - G * q[:, 1]) / 2, rtol=1e-9)
     short = np.linspace(0.0, 100.0, 51)

@@ -28,18 +28,3 @@ def test_a_meter_that_moves(capfd):
     assert all(part in shown for part in ("25.00%", "50.00%", "100.00%"))
     np.testing.assert_array_equal(watched.q, silent.q)
     assert int(watched.stats["num_steps"]) == 400
-
-
-@pytest.mark.exhaustive
-def test_a_saved_motion_goes_on(tmp_path):
-    """A motion that is saved and gone on from is the uninterrupted one, but for what compensated summation carries
-    there, a round-off of the state. Twin: a state kept to single precision."""
-    whole = turns(*START, 0, 128)
-    turns(*START, 0, 64).save(tmp_path / "half.npz")
-    half = lj.load_trajectory(tmp_path / "half.npz", kepler)
-    assert isinstance(half, lj.Trajectory)
-    rest = turns(half.end.q, half.end.v, 64, 128)
-    apart = lambda found: float(np.max(np.abs(found.q - whole.q[64:])))
-    assert apart(rest) < 1e-11
-    single = turns(*(np.asarray(x, np.float32).astype(float) for x in (half.end.q, half.end.v)), 64, 128)
-    assert apart(single) > 1e-7

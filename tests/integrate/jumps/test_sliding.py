@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.integrate.solve import over_jumps
 from tests.integrate.solve.test_over_jumps import GRAVITY, MASS, SPRING, kinetic
 
 
@@ -44,21 +43,6 @@ def test_dry_friction():
     creeping = lambda t, y: [y[1], -SPRING / MASS * y[0] - 0.3 * GRAVITY * np.tanh(y[1] / 1e-3)]
     crept = solve_ivp(creeping, (0.0, 4.0), [0.5, 0.0], "Radau", rtol=1e-6, atol=1e-8).y[0, -1]
     assert abs(crept - right) > 0.05 * abs(right)
-
-
-@pytest.mark.exhaustive
-def test_friction_in_other_words(monkeypatch):
-    """Nested `where`, and |v| in Rayleigh's function; twin: a motion that may not slide is not followed to its rest."""
-    size = 0.3 * MASS * GRAVITY
-    nested = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
-    rayleigh = block(dissipation=lambda t, q, v, p: size * jnp.abs(v))
-    for system in (nested, rayleigh):
-        traj = lj.integrate(system, 0.5, 0.0, ts=[0.0, 4.0])
-        np.testing.assert_allclose(traj.q[-1], rest_of_block(0.3)[0], rtol=1e-7)
-    monkeypatch.setattr(over_jumps, "slidable", lambda jumps, system: ())
-    other = block(lambda t, q, v, p: jnp.where(v > 0, -size, jnp.where(v < 0, size, 0.0)))
-    lost = lj.integrate(other, 0.5, 0.0, ts=[0.0, 4.0], throw=False, max_steps=10_000)
-    assert not lost.q[-1] == traj.q[-1]
 
 
 @pytest.mark.slow

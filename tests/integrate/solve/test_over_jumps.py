@@ -1,7 +1,5 @@
 """Motions over the jumps of their forces: closed forms, their derivatives of first and second order, and sliding."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,19 +98,6 @@ def test_derivatives_over_jumps(name, mode):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("name", SLOPES)
-def test_derivatives_where_jumps_are_ignored(name):
-    """Failing twin: by the start it is one, by an edge or a time zero, and behind a wall far off."""
-    function, at, right, wrong = SLOPES[name]
-    found = jax.jacfwd(partial(function, jumps="ignored"), argnums=tuple(range(len(at))))(*at)
-    for of, expected, known in zip(found, right(*at), wrong):
-        if known is not None:
-            np.testing.assert_allclose(of, known, atol=1e-6)
-        elif name == "wall":
-            assert abs(of - expected) > 0.1
-
-
-@pytest.mark.exhaustive
 def test_more_derivatives_of_a_brake():
     """In lanes, and the second ones; twin: the first one in another lane."""
     lanes = jnp.array([1.8, 2.0, 2.3])
@@ -126,50 +111,6 @@ def test_more_derivatives_of_a_brake():
 MASS, SPRING, GRAVITY = 1.0, 100.0, 9.81
 
 
-@pytest.mark.slow
-def test_stick_and_slip():
-    """A block pulled by a spring on a floor with friction: it sticks, and slips u (s - sin(ω s)/ω) at a time.
-
-    Twin: pulled twice as fast.
-    """
-    pulled = lj.System(
-        lambda t, q, v, p: 0.5 * v**2 - 0.5 * 4.0 * (q - p["u"] * t) ** 2,
-        force=lambda t, q, v, p: -p["mu"] * jnp.sign(v),
-    )
-
-    def right(t, u, mu):
-        q = 0.0
-        while True:
-            # The spring is as strong as friction.
-            begin = (mu / 4.0 + q) / u
-            if t <= begin:
-                return q
-            if t <= begin + np.pi:
-                return q + u * ((t - begin) - np.sin(2 * (t - begin)) / 2)
-            q += u * np.pi
-
-    ts = np.linspace(0.0, 12.0, 13)
-    traj = lj.integrate(pulled, 0.0, 0.0, {"u": 0.5, "mu": 1.0}, ts=ts)
-    np.testing.assert_allclose(traj.q, [right(t, 0.5, 1.0) for t in ts], rtol=1e-8, atol=1e-9)
-    assert traj.stats["num_jumps"] >= 6
-    assert abs(traj.q[-1] - right(12.0, 1.0, 1.0)) > 1
-
-
-@pytest.mark.exhaustive
-def test_a_table():
-    """A force from a table: as from the straight lines between its knots; derivative against a difference quotient."""
-    knots, heights = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
-    tabled = lj.System(kinetic, force=lambda t, q, v, p: p * jnp.interp(q, knots, heights))
-    end = lambda p, **options: lj.integrate(tabled, 1.5, 0.0, p, ts=jnp.array([0.0, 5.0]), **options)
-    exact = end(1.0, jumps="ignored", rtol=1e-12)
-    found = end(1.0)
-    np.testing.assert_allclose(found.q[-1], exact.q[-1], rtol=1e-8)
-    assert found.stats["num_steps"] < end(1.0, jumps="ignored").stats["num_steps"]
-    h = 1e-4
-    quotient = (end(1.0 + h, rtol=1e-12).q[-1] - end(1.0 - h, rtol=1e-12).q[-1]) / (2 * h)
-    np.testing.assert_allclose(jax.grad(lambda p: end(p).q[-1])(1.0), quotient, rtol=1e-6)
-
-
 @pytest.mark.exhaustive
 def test_many_numbers():
     """A gradient by thirty numbers, which replays the steps of each leg; twin: one more number than counted."""
@@ -178,15 +119,6 @@ def test_many_numbers():
     # Rest at the far turning point of a half swing would be at -1 + 2 p; here q = p - (1 - p) cos t until pi.
     found = jax.grad(end)(jnp.full(30, 0.1 / 30))
     np.testing.assert_allclose(found, 1 - np.cos(2.0), rtol=1e-9)
-
-
-@pytest.mark.exhaustive
-def test_a_fit():
-    """The edge and the strength of a brake from its motion without noise; twin: where they started."""
-    ts, true = np.linspace(0.0, 2.0, 21), {"edge": 0.73, "by": 1.7}
-    traj = lj.integrate(brake, 0.0, 2.0, true, ts=ts)
-    fit = lj.fit(brake, lj.Record(ts, traj.q, q0=0.0, v0=2.0), {"edge": 0.5, "by": 1.0})
-    np.testing.assert_allclose([fit.params["edge"], fit.params["by"]], [0.73, 1.7], rtol=1e-9)
 
 
 @pytest.mark.exhaustive
@@ -221,7 +153,7 @@ def test_a_state_on_a_jump_throughout():
 
 @pytest.mark.exhaustive
 def test_what_cannot_be_followed_is_said():
-    """A comparison in a loop, and more jumps than are followed; a value of `jumps` that does not exist."""
+    """A comparison in a loop, and more jumps than are followed."""
     loop = lj.System(kinetic, force=lambda t, q, v, p: jax.lax.fori_loop(0, 2, lambda i, x: jnp.where(x > 0, -x, x), q))
     with pytest.warns(lj.JumpWarning, match="a comparison inside a loop"):
         lj.integrate(loop, 1.0, 0.0, ts=[0.0, 1.0])
@@ -231,5 +163,3 @@ def test_what_cannot_be_followed_is_said():
     with pytest.warns(lj.JumpWarning, match="after 1000 jumps"):
         traj = lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 4000.0], estimate_error=False)
     assert traj.stats["num_jumps"] == 1000 and np.isfinite(traj.q[-1])
-    with pytest.raises(ValueError, match="jumps must be 'found' or 'ignored'"):
-        lj.integrate(ringing, 1.0, 0.0, ts=[0.0, 1.0], jumps=[0.5])

@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -59,17 +58,6 @@ def test_lanes_start_in_their_own_phases():
     assert np.isnan(together.q[2:, -1]).all() and np.isnan(together.end.q[2])
     codes = [int(lj.RESULTS.no_such_phase._value), int(lj.RESULTS.too_many_switches._value)]
     np.testing.assert_array_equal(np.asarray(together.result._value)[2:], codes)
-
-
-@pytest.mark.exhaustive
-def test_by_number_and_by_name():
-    """A number known before tracing is the name's; in a sweep it is an axis."""
-    by = [run(0.0, start).multipliers["floor"][-1] for start in ("lying", 1, np.int64(1), jnp.asarray(1))]
-    np.testing.assert_allclose(by, 10.0)
-    swept = lj.sweep(
-        lambda p: run(0.0, p["phase"]).multipliers["floor"][-1], {"phase": np.array([1, 1])}, progress=False
-    )
-    np.testing.assert_allclose(swept.values, 10.0)
 
 
 @pytest.mark.parametrize("start", [2, -1, 0.0, True, np.array([0, 1]), "sliding"])

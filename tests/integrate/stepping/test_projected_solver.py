@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 import lagjax as lj
 from tests.systems import HORIZONTAL, PARAMS, TS, motion, rod_pendulum
@@ -16,12 +15,6 @@ def test_constraints_hold_at_every_output():
     for name in ("q", "v"):
         of = getattr(traj, name)
         assert float(replace(traj, **{name: of | {"x": of["x"] + 1e-7}}).residual()) > 1e-8
-
-
-@pytest.mark.exhaustive
-def test_constraints_drift_without_projection():
-    """At the same tolerance, without projection, they are off."""
-    assert float(lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=5 * TS, rtol=1e-6, drift="none").residual()) > 1e-8
 
 
 def test_multipliers_belong_to_the_projected_states():

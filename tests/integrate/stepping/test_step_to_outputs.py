@@ -87,15 +87,6 @@ def test_steps_that_have_collapsed_end_a_motion():
 
 
 @pytest.mark.exhaustive
-def test_steps_that_have_collapsed_are_said():
-    """Alone such a motion raises; twin: its neighbour arrives."""
-    ts = np.linspace(0.0, 10.0, 11)
-    with pytest.raises(RuntimeError, match="a hundred times max_steps would not be enough"):
-        lj.integrate(ENDLESS, 1.0, 0.0, 2.0, ts=ts, rtol=1e-5)
-    assert lj.integrate(ENDLESS, 1.0, 0.0, 0.0, ts=ts, rtol=1e-5).result == lj.RESULTS.successful
-
-
-@pytest.mark.exhaustive
 def test_long_honest_motions_go_on():
     """Steps that stay short for long, but arrive: strong damping by an explicit method, at the edge of its stability;
     outputs that crowd together over twelve decades; a comet that passes its sun at 2e-6, there and back."""

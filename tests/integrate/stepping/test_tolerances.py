@@ -18,7 +18,6 @@ from lagjax.integrate.stepping.tolerances import (
     shared,
     tolerances_at,
 )
-from lagjax.numerics.methods.radau import SimplifiedNewton
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, TS, driven, motion, pendulum, rod_pendulum
 
@@ -46,36 +45,6 @@ def test_any_units():
         np.testing.assert_allclose(u * time / length, v, rtol=0, atol=1e-12)
         np.testing.assert_allclose(np.max(off) / length, np.max(error), rtol=1e-3)
         assert float(other.scaled_error) < 1e-3
-
-
-@pytest.mark.exhaustive
-@pytest.mark.filterwarnings("ignore::lagjax.AccuracyWarning")
-def test_an_absolute_tolerance():
-    """Failing twin: it loses a motion of nanometres."""
-    lost, (r, *_) = on_rod(2.0**-30, atol=1e-9)
-    assert np.max(np.abs(r / 2.0**-30 - on_rod()[1][0])) > 1e-3 and float(lost.scaled_error) > 1
-
-
-@pytest.mark.exhaustive
-def test_an_angle_beside_a_length():
-    """A mass on a spring that turns: the unit of length does not affect the angle's tolerance, except for round-off
-    among very light masses."""
-
-    def lagrangian(t, q, v, p):
-        kinetic = 0.5 * p["m"] * (v["r"] ** 2 + (q["r"] * v["psi"]) ** 2)
-        return kinetic - 0.5 * p["k"] * (q["r"] - p["l"]) ** 2 + p["m"] * p["g"] * q["r"] * jnp.cos(q["psi"])
-
-    def run(length=1.0, time=1.0):
-        params = {"m": 2.0, "l": length, "k": 32.0 / time**2, "g": length / time**2}
-        q0, v0 = {"r": 1.25 * length, "psi": 0.0}, {"r": 0.0, "psi": 1.5 / time}
-        traj = lj.integrate(lj.System(lagrangian), q0, v0, params, ts=SPAN * time)
-        return int(traj.stats["num_steps"]), traj.q["psi"], traj.q["r"] / length
-
-    usual = run()
-    for name, units in UNITS.items():
-        other = run(*units)
-        assert abs(other[0] - usual[0]) <= 2, name
-        np.testing.assert_allclose(other[1:], usual[1:], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("start", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], ids=["extent", "speed", "push"])
@@ -181,27 +150,21 @@ def test_at_round_off_without_mass():
 
 @pytest.mark.exhaustive
 def test_rest_at_zero_in_any_units():
-    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps.
-
-    Twin: with a root finder whose tolerance is of the order of a metre, nanometres take other steps.
-    """
+    """From rest at zero, where only the forces to come have a size, any unit of length gives the same steps."""
     late = lj.System(
         lambda t, q, v, p: 0.5 * v**2,
         force=lambda t, q, v, p: p["unit"] * t**3 - 100 * q - 50 * v - 1e3 * q**3 / p["unit"] ** 2,
     )
 
-    def of(unit, method):
-        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=method, rtol=1e-6)
+    def of(unit):
+        traj = lj.integrate(late, 0.0, 0.0, {"unit": unit}, ts=np.array([0.0, 2.0]), method=lj.Radau5(), rtol=1e-6)
         return float(traj.q[-1]) / unit, int(traj.stats["num_steps"])
 
-    in_metres = lj.Radau5(root_finder=SimplifiedNewton(rtol=1e-6, atol=1e-9))
-    (q, steps), (absolute, of_absolute) = of(1.0, lj.Radau5()), of(1.0, in_metres)
+    q, steps = of(1.0)
     for unit in (2.0**-30, 2.0**54):
-        found, count = of(unit, lj.Radau5())
+        found, count = of(unit)
         assert count == steps
         np.testing.assert_allclose(found, q, rtol=1e-13)
-    found, count = of(2.0**-30, in_metres)
-    assert abs(found / absolute - 1) > 1e-10 or count != of_absolute
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Films and figures: interpolation is exact at outputs, of fourth order between, and refused if too coarse; bodies."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,19 +96,6 @@ def test_ends_with_the_motion():
     np.testing.assert_allclose(ended(0.52, lj.RESULTS.not_finite).animate(bob).t[-1], 0.5, atol=1e-15)
     with refused("0 states", "failed at its start"):
         ended(-1.0, lj.RESULTS.start_not_finite).animate(bob)
-
-
-@pytest.mark.exhaustive
-def test_motions_that_end_early():
-    """An event, and a collision that the steps cannot pass: the film ends there."""
-    down = diffrax.Event(lambda t, y, params, **kwargs: y[0])
-    traj = lj.integrate(pendulum, 1.0, 0.0, PARAMS, ts=DENSE, event=down)
-    film = traj.animate(bob)
-    assert np.isnan(traj.q).any() and film.t[-1] == float(traj.end.t) < 1.0
-    np.testing.assert_allclose(film.points["rod"][-1, 1], [0.0, -PARAMS["l"]], atol=1e-9)
-    kepler = lj.System(lambda t, q, v, params: 0.5 * v**2 + 1 / q)
-    traj = lj.integrate(kepler, 1.0, 0.0, ts=np.linspace(0.0, 2.0, 201), throw=False)
-    np.testing.assert_allclose(traj.animate(lambda t, q, params: (q, 0.0)).t[-1], 1.11, atol=1e-12)
 
 
 def test_a_batch_is_animated_lane_by_lane():

@@ -63,26 +63,6 @@ def test_ill_conditioned_and_singular(wider):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("half_bandwidth", exhaustive_but((2,), (1, 2)))
-def test_derivatives_pass_by_the_elimination(half_bandwidth):
-    """Derivatives in both modes of the solution of a linear system known as a function."""
-    a = jnp.asarray(shuffled(9, half_bandwidth))
-    where = banded.band(np.asarray(a) != 0)
-    rows = where.order.rows
-    back = np.argsort(rows)
-    r = jnp.arange(1.0, 10.0)
-
-    def solution(scale):
-        product = lambda x: scale * (a @ x)
-        invert = banded.solver(banded.entries(product, where, a.dtype))
-        return jax.lax.custom_linear_solve(product, r, lambda _, r: invert(r[rows])[back], symmetric=True)
-
-    expected = -jnp.linalg.solve(a, r) / 4
-    for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(mode(solution)(2.0), expected, rtol=1e-12)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", exhaustive_but((2,), range(3)))
 def test_independent_rows_by_pivots(seed):
     """As many independent rows as the rank are kept; without dependent rows all are kept."""

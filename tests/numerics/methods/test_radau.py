@@ -10,11 +10,9 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-import lagjax as lj
 from lagjax.numerics.methods import radau
 from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
 from tests.numerics.methods.driven_pendulum import in_numpy
-from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
 from tests.tiers import exhaustive_but
 
 EXACT = SimplifiedNewton(rtol=1e-12, atol=1e-14)
@@ -28,15 +26,6 @@ def solve(field, y0, args=None, *, tol=1e-8, atol=None, t1=1.0, ts=None, method=
     return diffrax.diffeqsolve(
         diffrax.ODETerm(field), Radau5() if method is None else method, 0.0, t1, options.pop("dt0", 1e-6), y0, args,
         saveat=saveat, stepsize_controller=control, max_steps=2**14, throw=False, **options,
-    )  # fmt: skip
-
-
-def constant(field, y0, args, steps, *, ts=None, t1=1.0, method=None):
-    """Constant steps by plain diffrax; the number of steps may be traced."""
-    saveat = diffrax.SaveAt(t1=True) if ts is None else diffrax.SaveAt(ts=ts)
-    return diffrax.diffeqsolve(
-        diffrax.ODETerm(field), Radau5(root_finder=EXACT) if method is None else method, 0.0, t1, t1 / steps, y0, args,
-        saveat=saveat, throw=False, max_steps=2**12,
     )  # fmt: skip
 
 
@@ -132,58 +121,6 @@ def test_unsolvable_step():
     assert np.isfinite(y1[1:]).all() and np.isinf(error[1:]).all() and np.isfinite(slope[:2]).all()
 
 
-def predator(t, y, args):
-    """Volterra's equations with a seasonal term: nonlinear and not autonomous."""
-    rabbits, foxes = y["rabbits"], y["foxes"]
-    return {"rabbits": rabbits * (1.5 - foxes), "foxes": foxes * (rabbits - 1 + 0.5 * jnp.sin(3 * t))}
-
-
-@pytest.mark.optimised
-@pytest.mark.exhaustive
-def test_order():
-    """Order 5 at the ends of steps; twin: the same measurement finds order 4 for diffrax's interpolant."""
-    integrate = pytest.importorskip("scipy.integrate")
-    ts = np.linspace(0.0, 2.0, 151)[1:]
-    start = {"rabbits": jnp.array(1.25), "foxes": jnp.array(0.5)}
-    right = lambda t, y: [y[0] * (1.5 - y[1]), y[1] * (y[0] - 1 + 0.5 * np.sin(3 * t))]
-    exact = integrate.solve_ivp(right, (0, 2), [1.25, 0.5], "DOP853", ts, rtol=2.5e-14, atol=1e-15).y
-    steps = np.array([12.0, 18.0, 26.0])
-    many = jax.jit(jax.vmap(lambda n: constant(predator, start, None, n, ts=ts, t1=2.0).ys))(steps)
-    errors = np.abs(np.stack([many["rabbits"], many["foxes"]], axis=1) - exact)
-    order = lambda errors: -np.polyfit(np.log(steps), np.log(np.linalg.norm(errors, axis=1)), 1)[0]
-    assert abs(order(errors[:, :, -1]) - 5) < 0.35
-    between = order(errors[:, :, :-1].reshape(3, -1))
-    assert abs(between - 4) < 0.45
-    assert not abs(between - 5) < 0.35
-
-
-@pytest.mark.optimised
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", exhaustive_but(("rod_pendulum",), ("pendulum", "rod_pendulum")))
-def test_order_of_a_motion(name):
-    """Order 5 at outputs between the steps of `lagjax.integrate`, free and under a constraint (round-off)."""
-    integrate = pytest.importorskip("scipy.integrate")
-    ts = np.concatenate([[0.0], np.linspace(0.3, 2.0, 12) + 0.013 * np.sin(7 * np.arange(12.0))])
-    g, length = PARAMS["g"], PARAMS["l"]
-    swing = lambda t, y: [y[1], -g / length * np.sin(y[0])]
-    exact = integrate.solve_ivp(
-        swing, (0, ts[-1]), [np.pi / 2, 0.0], "DOP853", ts, rtol=2.5e-14, atol=1e-15
-    ).y[0]  # fmt: skip
-    system = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] / params["l"] * jnp.cos(q))
-    system, start = (system, (np.pi / 2, 0.0)) if name == "pendulum" else (rod_pendulum, HORIZONTAL)
-    errors, steps = [], np.array([24, 36, 50])
-    for n in steps:
-        traj = lj.integrate(
-            system, *start, PARAMS, ts=ts, method=Radau5(root_finder=EXACT), dt0=jnp.asarray(1 / n),
-            stepsize_controller=diffrax.ConstantStepSize(),
-        )  # fmt: skip
-        angle = traj.q if name == "pendulum" else np.unwrap(np.arctan2(traj.q["x"], -traj.q["y"]))
-        errors.append(np.linalg.norm(angle - exact))
-        if name == "rod_pendulum":
-            assert np.max(np.abs(traj.q["x"] ** 2 + traj.q["y"] ** 2 - length**2)) < 1e-14
-    assert abs(-np.polyfit(np.log(steps), np.log(errors), 1)[0] - 5) < 0.35
-
-
 # Stiff equations -----------------------------------------------------------------------------------------------------
 
 
@@ -245,34 +182,7 @@ def test_stiff_springs_cost_no_steps():
         np.testing.assert_allclose(found.ys[0][0], [np.sin(angle), -np.cos(angle)], atol=1e-7 + 100 / k)
 
 
-@pytest.mark.exhaustive
-def test_kvaerno_with_this_root_finder():
-    """Kvaerno5 on a stiff spring: at most half of the steps that it takes with diffrax's root finder, same accuracy."""
-    k = 1e4
-    steps = {}
-    for name, finder in (("ours", OF_CONTROLLER()), ("diffrax", diffrax.Kvaerno5().root_finder)):
-        found = solve(spring_pendulum, rod_like(k), k, tol=1e-6, t1=2.0, method=diffrax.Kvaerno5(root_finder=finder))
-        steps[name] = int(found.stats["num_steps"])
-        if name == "ours":
-            exact = solve(spring_pendulum, rod_like(k), k, tol=1e-11, t1=2.0, method=diffrax.Dopri8())
-            np.testing.assert_allclose(found.ys[0][0], exact.ys[0][0], atol=1e-5)
-    assert 2 * steps["ours"] < steps["diffrax"]
-
-
 # Derivatives ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.exhaustive
-def test_derivatives_of_a_motion():
-    """A stiff oscillator through `lagjax.integrate`: dq/dk of cos(sqrt(k) t) in both modes."""
-    system = lj.System(lambda t, q, v, params: 0.5 * v**2 - 0.5 * params * q**2)
-    end = lambda k: lj.integrate(
-        system, 1.0, 0.0, k, ts=np.array([0.0, 1.0]), method=Radau5(), rtol=1e-10, atol=1e-10
-    ).q[-1]
-    k = 30.0
-    exact = -np.sin(np.sqrt(k)) / (2 * np.sqrt(k))
-    assert abs(jax.jacfwd(end)(k) - exact) < 1e-7
-    assert abs(jax.grad(end)(k) - exact) < 1e-7
 
 
 # Lanes, precision, failure -------------------------------------------------------------------------------------------
