@@ -17,7 +17,7 @@ import numpy as np
 from lagjax.scenes.woodpecker import PARAMS, TURN, lap, motion
 
 jax.config.update("jax_enable_x64", True)
-# Finite differences, with steps of 1e-5, of the motion computed by SciPy's events, without the library.
+# Finite differences, with steps of 1e-5, of the independent computation that `tests/scenes/test_woodpecker.py` tells of.
 INDEPENDENT = {"mu": -0.61604757, "c": -10.2963651}
 
 
