@@ -14,7 +14,7 @@ from lagjax.bodies.joints import (
     universal,
 )
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
-from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body
+from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body, unit_vector
 from lagjax.bodies.shapes import axis, box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
 from lagjax.bodies.wheels import Surface, rolling, rolling_ellipsoid, rolling_sphere

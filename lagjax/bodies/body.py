@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned
+from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned, unit_vector
 from lagjax.jaxtools import is_traced, numpy_of
 from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
@@ -416,15 +416,11 @@ class Marker:
         """A marker on a body."""
         _check_not_traced(f"place and axis of a marker on '{body.name}'", "point", point, axis)
         along = np.asarray(axis, float)
-        largest = np.max(np.abs(along), initial=0.0)
-        if along.shape != (3,) or not 0 < largest < np.inf:
+        if along.shape != (3,) or not 0 < np.max(np.abs(along)) < np.inf:
             raise ValueError(f"the axis of a marker on '{body.name}' must be three numbers, not all zero: {axis}.")
-        # Squares of the largest and the least numbers are none.
-        along = along / largest
-        along = along / np.sqrt(np.sum(along**2))
+        along = unit_vector(along)
         near = np.eye(3)[1 if abs(along[0]) > 0.9 else 0]
-        first = near - (near @ along) * along
-        first = first / np.sqrt(np.sum(first**2))
+        first = unit_vector(near - (near @ along) * along)
         rows = np.stack([first, np.cross(along, first), along])
         check_takes_params("a point", f"'{body.name}'", point)
         place = point if callable(point) else tuple(np.ravel(np.asarray(point, float)).tolist())

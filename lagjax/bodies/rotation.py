@@ -20,6 +20,12 @@ from lagjax.jaxtools import judging, numpy_of
 _is_larger = judging(jnp.greater)
 
 
+def unit_vector(x: np.ndarray) -> np.ndarray:
+    """A vector of length one, zero for zero; its numbers may be the largest or the least there are."""
+    size = np.abs(x).max()
+    return x if size == 0 else x / size / np.linalg.norm(x / size)
+
+
 def product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """The quaternion that turns as `b` and then as `a`."""
     real = a[0] * b[0] - jnp.dot(a[1:], b[1:])

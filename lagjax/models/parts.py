@@ -198,12 +198,6 @@ def made_up(name: str, known: Container[str]) -> str:
     return name
 
 
-def unit(axis: np.ndarray) -> np.ndarray:
-    """A vector of length one, zero for zero; its numbers may be the largest or the least there are."""
-    size = np.abs(axis).max()
-    return axis if size == 0 else axis / size / np.linalg.norm(axis / size)
-
-
 def file_of(source: str | Path, user: str) -> Path | None:
     """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
     if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):

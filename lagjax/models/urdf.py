@@ -13,6 +13,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lagjax.bodies import unit_vector
 from lagjax.models.meshes import mesh_of
 from lagjax.models.parts import (
     BEFORE_TEXT,
@@ -24,7 +25,6 @@ from lagjax.models.parts import (
     fault_of_inertia,
     file_of,
     merged,
-    unit,
     unmoved,
 )
 from lagjax.models.robot_model import RobotModel
@@ -235,7 +235,7 @@ def _placement(x: XMLElement | None) -> Placement:
     if "quat_xyzw" in x.attributes:
         if "rpy" in x.attributes:
             raise ValueError(f"line {x.line}: <origin> has rpy= and quat_xyzw=.\nFix: leave one of them.")
-        quaternion = unit(x.numbers("quat_xyzw", 4))
+        quaternion = unit_vector(x.numbers("quat_xyzw", 4))
         if not quaternion.any():
             raise ValueError(f"line {x.line}: quat_xyzw= of <origin> is zero, which is no rotation.\nFix: 0 0 0 1.")
         axes = Rotation.from_quat(quaternion)
@@ -305,7 +305,7 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
         if damping and kind not in ("revolute", "continuous", "prismatic"):
             not_taken.append(NotTaken("damping", name, f"line {dynamics.line}"))
             damping = 0.0
-    return RobotJoint(name, TYPES[kind], *ends, _placement(x.one("origin")), unit(axis), line, damping)
+    return RobotJoint(name, TYPES[kind], *ends, _placement(x.one("origin")), unit_vector(axis), line, damping)
 
 
 def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: str) -> list[RobotJoint]:
