@@ -368,12 +368,3 @@ def test_import_waits_for_everything():
     names, new, later = told("print(*dir(lj)); print(*new()); import wave; print(*new())")
     assert {"scenes", "System", "fit"} <= set(names) and {"lagjax", "wave"} <= set(later)
     assert {name for name in new if name.startswith("lagjax")} == {"lagjax"} and "jax" not in new
-
-
-@pytest.mark.slow
-def test_import_waits_for_nothing_that_few_need():
-    """Scenes, and packages used only by fits and scenes, are imported on first access; twin: then they are."""
-    before = "import jax, diffrax; known |= set(sys.modules)"
-    motion, scene = told(f"{before}; lj.integrate; print(*new()); lj.scenes.rolling_hoop; print(*new())")
-    assert not {"lagjax.scenes", "scipy.special", "scipy.linalg", "matplotlib.pyplot"} & set(motion)
-    assert {"lagjax.scenes", "scipy.special"} <= set(scene)

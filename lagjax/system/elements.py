@@ -7,8 +7,8 @@
     SampledControl      a controller that acts at instants and holds its output between them
 
 A `System` with elements moves in modes: each gap is open or closed, and each sliding velocity slides to one side,
-or sticks, or is free since its gap is open or nothing rubs. `integrate` finds the modes that fit the state and changes
-them.
+or sticks, or is free since its gap is open or it rests without friction. `integrate` finds the modes that fit the state
+and changes them.
 
 Source: Glocker, *Set-Valued Force Laws*, §5, §6; Brogliato, *Nonsmooth Mechanics*, §4, §5.
 """

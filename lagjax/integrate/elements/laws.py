@@ -15,8 +15,8 @@ The guard of a mode is above zero as long as it lasts:
     held by others: δ - |s|        apart: -m            pressed: m
 
 A normal force that is a multiplier of a constraint presses from either side (1, -1), with friction μ |λ|: the guard is
-± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion. A sliding
-velocity without friction, since μ or N is zero in the whole motion, is free.
+± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion. What
+rests without friction, since μ or N is zero in the whole motion, is free.
 
 Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
 """
@@ -238,8 +238,8 @@ class Laws(eqx.Module):
         of_rows = modes[..., : len(self.rows)]
         return jnp.where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
 
-    def rubs(self, modes: Int[Array, " k"], params: PyTree) -> Bool[Array, " kT"]:
-        """Which sliding velocities are not free for that the spring that presses them is apart, or nothing rubs."""
+    def rubs(self, modes: Int[Array, " k"]) -> Bool[Array, " kT"]:
+        """Which sliding velocities are not free for that the spring that presses them is apart."""
         pressed = {law.name: modes[slice(*law.at)] == PRESSED for law in self.compliant}
         found = [
             jnp.repeat(pressed[law.source], 1 + law.plane)
@@ -247,8 +247,11 @@ class Laws(eqx.Module):
             else jnp.ones(law.at[1] - law.at[0], bool)
             for law in self.tangents
         ]
-        found = [rubs & ~law.never_rubs(params) for rubs, law in zip(found, self.tangents)]
         return jnp.concatenate([*found, jnp.zeros(0, bool)])
+
+    def never_rubs(self, params: PyTree) -> Bool[Array, " kT"]:
+        """Which sliding velocities have no friction in the whole motion."""
+        return jnp.concatenate([*(law.never_rubs(params) for law in self.tangents), jnp.zeros(0, bool)])
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
         """The parameters in these modes; rows of modes, (..., k), give rows of the rest."""

@@ -466,10 +466,11 @@ class Meeting(eqx.Module):
     def _modes(self, at: AtMeeting, solution: ContactForces) -> Int[Array, " kNT"]:
         """The modes of gaps and of sliding velocities that follow from forces."""
         laws, owners, stays, sides = self.laws, np.array(self.laws.owners, int), solution.stays(), solution.sides()
-        rubs = laws.rubs(at.given.modes, at.given.params)
-        rubs = rubs & ((owners < 0) | jnp.append(stays, True)[owners])
+        rubs = jnp.where(owners >= 0, jnp.append(stays, True)[owners], laws.rubs(at.given.modes))
         slides = jnp.where(laws.in_planes, lengths(sides, laws.partners) > 0, sides).astype(int)
         rests = jnp.where(lengths(solution.bound.leans, laws.partners) > 0, LEANS, STICKS)
+        # What slides without friction has derivatives by it.
+        rests = jnp.where(laws.never_rubs(at.given.params), FREE, rests)
         tangents = jnp.where(rubs, jnp.where(slides != 0, slides, rests), FREE)
         return jnp.concatenate([jnp.where(stays, CLOSED, OPEN), tangents]).astype(at.given.modes.dtype)
 

@@ -46,7 +46,8 @@ CASES = {
     "begins to slide": (0.0, [0, 0, 0.5], [6.1, 0, 0.9], {}, [0, 0, 0.5], [CLOSED, STICKS, SLIDES]),
     "begins to slide back": (0.0, [0, 0, 0.5], [-6.1, 0, 1.1], {}, [0, 0, 0.5], [CLOSED, SLIDES, -SLIDES]),
     "lifted": (0.0, [0, 0, 0.5], [0, 20.1, -1.1], {}, [0, 0, 0.5], [OPEN, -SLIDES, FREE]),
-    "slides without friction": (0.0, [3, 0, 0.5], [0, 0, 0], {"mu": 0.0}, [3, 0, 0.5], [CLOSED, STICKS, FREE]),
+    "slides without friction": (0.0, [3, 0, 0.5], [0, 0, 0], {"mu": 0.0}, [3, 0, 0.5], [CLOSED, STICKS, SLIDES]),
+    "rests without friction": (0.0, [0, 0, 0.5], [0, 0, 0], {"mu": 0.0}, [0, 0, 0.5], [CLOSED, STICKS, FREE]),
     "held down": (0.0, [0, 0, 0.5], [0, 19.9, 0], {}, [0, 0, 0.5], [CLOSED, STICKS, STICKS]),
 }
 
