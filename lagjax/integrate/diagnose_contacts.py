@@ -100,8 +100,8 @@ def _refused(laws, s: State) -> Exception:
     said = ", ".join(f"{role} is {value}" for role, value in found)
     above = any(role.startswith(("every", "the stiffness")) for role, _ in found)
     return ValueError(
-        f"{said}: friction, stiffness and damping are not below zero, a restitution is 0 to 1, and a stiffness and the "
-        "time between instants are above zero.\n"
+        f"{said}: friction, normal forces, stiffness and damping are not below zero, a restitution is 0 to 1, and a "
+        "stiffness and the time between instants are above zero.\n"
         "Usual cause: a number in params, or from a function of them, that is NaN or has another sign or unit.\n"
         f"Fix: {'jnp.exp(p)' if above else 'jnp.abs(p)'} in the function of the element, or another value in params."
     )
