@@ -15,13 +15,11 @@ from tests.integrate.elements.test_motions import moved
 G = 9.81
 
 
-def held() -> lj.System:
-    """A block of mass 1 at a wall, held by a friction of 1 too, and pulled off by a + b t."""
-    floor = lj.Friction(lambda t, q, v, p: v, 1.0, normal=1.0)
-    return lj.System(
-        lambda t, q, v, p: 0.5 * v**2, force=lambda t, q, v, p: p["a"] + p["b"] * t,
-        elements={"wall": lj.Contact(lambda t, q, p: q), "floor": floor},
-    )  # fmt: skip
+# A block of mass 1 at a wall, held by a friction of 1 too, and pulled off by a + b t.
+held = lj.System(
+    lambda t, q, v, p: 0.5 * v**2 + (p["a"] + p["b"] * t) * q,
+    elements={"wall": lj.Contact(lambda t, q, p: q), "floor": lj.Friction(lambda t, q, v, p: v, 1.0, normal=1.0)},
+)
 
 
 @pytest.mark.exhaustive
@@ -32,7 +30,7 @@ def held() -> lj.System:
 def test_a_wall_and_friction_along_one_line(start, a, b):
     """The block rests while a + b t < 1, then q = b (t - t₁)³/6. Twin: with more friction it is elsewhere."""
     gives = (1 - a) / b
-    traj = moved(held(), *start, {"a": a, "b": b}, ts=jnp.array([0.0, 1.0, 4.0]))
+    traj = moved(held, *start, {"a": a, "b": b}, ts=jnp.array([0.0, 1.0, 4.0]))
     np.testing.assert_allclose(traj.q[-1], b * max(4.0 - gives, 0.0) ** 3 / 6, rtol=1e-9, atol=1e-12)
     if gives < 4.0:
         assert np.min(np.abs(np.asarray(traj.switches.t)[: len(traj.switches)] - gives)) < 1e-9
@@ -100,17 +98,17 @@ def test_what_presses_from_one_side():
     def run(v0, fade, mu=0.3, q0=0.0, **options):
         return lj.integrate(block, q0, v0, {"fade": fade, "mu": mu}, ts=np.array([0.0, 0.9]), **options)
 
-    for v0 in (3.0, -3.0):
-        traj = run(v0, 0.5)
-        np.testing.assert_allclose(traj.v[-1], v0 - np.sign(v0) * 0.3 * (0.9 - 0.5 * 0.405), rtol=1e-9)
-        np.testing.assert_allclose(traj.multipliers["floor"], -np.sign(v0) * 0.3 * np.array([1.0, 0.55]), rtol=1e-12)
-    with pytest.raises(RuntimeError, match=r"normal force of 'floor' falls below zero at t = 0.5"):
-        run(3.0, 2.0)
-    for mu in (-0.3, np.nan):
-        with pytest.raises(ValueError, match=f"the coefficient of 'floor' is {mu}"):
-            run(3.0, 0.5, mu)
-    with pytest.raises(ValueError, match="of q0 is nan"):
-        run(3.0, 0.5, q0=np.nan)
+    for way in (1.0, -1.0):
+        traj = run(3.0 * way, 0.5)
+        np.testing.assert_allclose(traj.v[-1], way * (3.0 - 0.3 * (0.9 - 0.5 * 0.405)), rtol=1e-9)
+        np.testing.assert_allclose(traj.multipliers["floor"], -0.3 * way * np.array([1.0, 0.55]), rtol=1e-12)
+    for wrong, error, words in (
+        ({"fade": 2.0}, RuntimeError, "normal force of 'floor' falls below zero at t = 0.5"),
+        ({"fade": 0.5, "mu": -0.3}, ValueError, "the coefficient of 'floor' is -0.3"),
+        ({"fade": 0.5, "q0": np.nan}, ValueError, "of q0 is nan"),
+    ):
+        with pytest.raises(error, match=words):
+            run(3.0, **wrong)
     lanes = jax.vmap(lambda mu: run(3.0, 0.5, mu, throw=False))(np.array([0.3, -0.3]))
     assert np.isnan(lanes.v[:, -1]).tolist() == [False, True]
     refused, codes = lj.RESULTS.element_refused, np.asarray(lanes.result._value)
@@ -146,7 +144,7 @@ def test_guards_that_rest_hide_no_others():
     gap that does not rest, the gap's."""
     given = {name: np.array(1.0) for name in "ab"}
     start = State(*np.zeros((3, 1))[:, 0], given)
-    _, laws = in_modes(held(), start)
+    _, laws = in_modes(held, start)
     # Open and sticking: the friction has 0.4 to spare.
     forces = {"wall": jnp.zeros(()), "floor": jnp.array(0.6)}
     here = [laws.given(given, jnp.array([0, 2]), jnp.array([slack, 1e-3])) for slack in (-1e-15, 1e-15)]
