@@ -216,27 +216,18 @@ def layer(x, w):
     return lax.while_loop(lambda s: s[0] < 2, lambda s: (s[0] + 1, jnp.tanh(w.T @ (w @ s[1]))), (0, x))[1]
 
 
-def check_products(sizes):
-    """Products of these sizes, each in one function, are those of NumPy; twenty sizes share a program."""
-    rng = np.random.default_rng(0)
-    square = lambda a: a @ a @ a.T
-    for some in (sizes[i : i + 20] for i in range(0, len(sizes), 20)):
-        layers = [(rng.normal(size=size), rng.normal(size=(size, size)) / size) for size in some]
-        squares = [rng.normal(size=2 * (int(size**0.5) + 1,)) for size in some]
-        of_all = lambda layers, squares: (
-            [one_function(layer, x, w) for x, w in layers], [one_function(square, a) for a in squares]
-        )  # fmt: skip
-        found = jax.jit(of_all)(layers, squares)
-        for one, (x, w) in zip(found[0], layers):
-            once = np.tanh(w.T @ (w @ x))
-            np.testing.assert_allclose(one, np.tanh(w.T @ (w @ once)), rtol=1e-12, atol=1e-14)
-        for one, a in zip(found[1], squares):
-            np.testing.assert_allclose(one, square(a), rtol=1e-12, atol=1e-12)
-
-
 def test_products_of_many_multiplications():
     """Around 4,096 multiplications, where XLA may take a sum for a library product, which must not occur."""
-    check_products([64, 65])
+    rng, square = np.random.default_rng(0), lambda a: a @ a @ a.T
+    layers = [(rng.normal(size=size), rng.normal(size=(size, size)) / size) for size in (64, 65)]
+    squares = [rng.normal(size=(9, 9)) for _ in layers]
+    found = jax.jit(
+        lambda layers, squares: ([one_function(layer, *x) for x in layers], [one_function(square, a) for a in squares])
+    )(layers, squares)
+    for one, (x, w) in zip(found[0], layers):
+        np.testing.assert_allclose(one, np.tanh(w.T @ (w @ np.tanh(w.T @ (w @ x)))), rtol=1e-12, atol=1e-14)
+    for one, a in zip(found[1], squares):
+        np.testing.assert_allclose(one, square(a), rtol=1e-12, atol=1e-12)
 
 
 def test_a_checkpoint_is_looked_into():

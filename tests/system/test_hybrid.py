@@ -48,11 +48,8 @@ def heights(t, h=1.0, e=0.5):
     first, speed = np.sqrt(2 * h / G), np.sqrt(2 * h * G)
     second = first + 2 * e * first
     flight = lambda s, v: v * s - 0.5 * G * s**2
-    return np.where(
-        t <= first,
-        h - 0.5 * G * t**2,
-        np.where(t <= second, flight(t - first, e * speed), flight(t - second, e**2 * speed)),
-    )
+    flights = [flight(t - first, e * speed), flight(t - second, e**2 * speed)]
+    return np.select([t <= first, t <= second], [h - 0.5 * G * t**2, flights[0]], flights[1])
 
 
 @pytest.mark.exhaustive
@@ -69,11 +66,8 @@ def test_a_ball_that_bounces():
     by_h, by_e = jax.jacrev(of_times_and_end, argnums=(0, 1))(1.0, 0.5)
     np.testing.assert_allclose(by_h[:2], [0.225761820493, 2 * 0.225761820493], rtol=1e-11)
     np.testing.assert_allclose(by_e[:2], [0.0, 0.903047281972], rtol=1e-11, atol=1e-14)
-    step = 1e-6
-    np.testing.assert_allclose(by_h[2], (heights(1.0, 1 + step) - heights(1.0, 1 - step)) / (2 * step), rtol=1e-8)
-    np.testing.assert_allclose(
-        by_e[2], (heights(1.0, 1, 0.5 + step) - heights(1.0, 1, 0.5 - step)) / (2 * step), rtol=1e-8
-    )
+    slope = lambda h, e: (heights(1.0, 1 + h, 0.5 + e) - heights(1.0, 1 - h, 0.5 - e)) / 2e-6
+    np.testing.assert_allclose([by_h[2], by_e[2]], [slope(1e-6, 0.0), slope(0.0, 1e-6)], rtol=1e-8)
 
 
 def switched(t, v, v_after):
@@ -144,10 +138,6 @@ def test_it_comes_to_rest():
     np.testing.assert_allclose(traj.q[4:], 0.0, atol=1e-14)
     np.testing.assert_allclose(traj.multipliers["floor"][4:], G, rtol=1e-12)
     assert np.isnan(traj.multipliers["floor"][0])
-    # Without a phase of rest no phase lasts, and the error says so.
-    dead = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
-    with pytest.raises(RuntimeError, match="No phase lasts"):
-        lj.integrate(dead, 1.0, 0.0, {"g": G}, ts=np.array([0.0, 1.0]))
 
 
 @pytest.mark.exhaustive
@@ -186,11 +176,9 @@ def test_two_balls_collide():
 def test_a_body_that_rests_is_not_taken_to_fly():
     """A body in a flying phase that rests on its support would fall through it: this is refused."""
     touching = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
-    ts = np.array([0.0, 1.0])
-    with pytest.raises(RuntimeError, match="No phase lasts"):
-        lj.integrate(touching, 0.0, 0.0, {"g": G}, ts=ts)
-    with pytest.raises(RuntimeError, match="No phase lasts"):
-        lj.integrate(touching, 0.0, 1e-18, {"g": G}, ts=ts)
+    for v0 in (0.0, 1e-18):
+        with pytest.raises(RuntimeError, match="No phase lasts"):
+            lj.integrate(touching, 0.0, v0, {"g": G}, ts=np.array([0.0, 1.0]))
 
 
 @pytest.mark.slow

@@ -98,29 +98,33 @@ def in_a_cell():
     return falling(lambda: number), put
 
 
+def made(held, read, put):
+    """In what is made anew each time: L with what `read` finds there, and what puts a number there."""
+    return lambda: (lambda kept: (falling(lambda: read(kept)), put(kept)))(held())
+
+
 def inside(kept, key, read=lambda kept, key: kept[key]):
     """In something with entries."""
-    return lambda: _inside(copy.deepcopy(kept), key, read)
-
-
-def _inside(kept, key, read):
-    return falling(lambda: read(kept, key)), into(kept, key)
+    return made(lambda: copy.deepcopy(kept), lambda held: read(held, key), lambda held: into(held, key))
 
 
 in_a_large_array = inside(np.zeros(20_000), 12_345)
 inside_a_jitted_helper = inside(np.zeros(300), 3, lambda kept, key: jax.jit(lambda q: jnp.sum(kept * q))(1.0))
 
 
-def in_a_list_of_a_dictionary():
-    """In a list of a dictionary."""
-    held = {"nested": [0.0]}
-    return falling(lambda: held["nested"][0]), into(held["nested"], 0)
-
-
-def in_a_new_object():
-    """In a new object."""
-    held = types.SimpleNamespace()
-    return falling(lambda: held.inner.g), onto(held, "inner", lambda g: types.SimpleNamespace(g=g))
+new = types.SimpleNamespace
+in_a_list_of_a_dictionary = made(lambda: {"x": [0.0]}, lambda held: held["x"][0], lambda held: into(held["x"], 0))
+in_a_new_object = made(new, lambda held: held.inner.g, lambda held: onto(held, "inner", lambda g: new(g=g)))
+in_a_class = made(lambda: type("OfOne", (Planet,), {}), lambda cls: cls.factor, lambda cls: onto(cls, "factor"))
+in_a_module = made(lambda: types.ModuleType("users"), lambda module: module.g, lambda module: onto(module, "g"))
+# Threads have contexts of their own, and see the default.
+in_a_context_variable = made(lambda: CONTEXT, lambda name: name.get(), lambda name: name.set)
+in_a_static_field = made(lambda: BOX, lambda box: box.inner.g, lambda box: onto(box, "inner", Module))
+in_an_array_of_jax = made(
+    lambda: [jnp.zeros(300)],
+    lambda held: held[0][250],
+    lambda held: lambda g: held.__setitem__(0, held[0].at[250].set(g)),
+)
 
 
 def in_a_table_of_a_method():
@@ -135,18 +139,6 @@ def in_an_object_that_is_called():
     return planet, onto(planet, "inner", lambda g: types.SimpleNamespace(g=g))
 
 
-def in_a_class():
-    """In a class."""
-    cls = type("OfOne", (Planet,), {})
-    return falling(lambda: cls.factor), onto(cls, "factor")
-
-
-def in_a_module():
-    """In a module."""
-    module = types.ModuleType("constants_of_the_user")
-    return falling(lambda: module.g), onto(module, "g")
-
-
 def in_an_import():
     """In an import."""
     sys.modules["lagjax_test_constants"] = module = types.ModuleType("lagjax_test_constants")
@@ -157,13 +149,6 @@ def in_an_import():
         return 0.5 * v**2 - lagjax_test_constants.g * q
 
     return lagrangian, onto(module, "g")
-
-
-def in_a_context_variable():
-    """In a context variable."""
-    # Threads have contexts of their own, and see the default.
-    name = CONTEXT
-    return falling(lambda: name.get()), name.set
 
 
 def in_the_environment():
@@ -215,11 +200,6 @@ def in_code_that_is_replaced():
     )
 
 
-def in_a_static_field():
-    """In a static field."""
-    return falling(lambda: BOX.inner.g), onto(BOX, "inner", Module)
-
-
 def in_a_rule_of_differentiation():
     """In a rule of differentiation."""
     held = [0.0]
@@ -230,12 +210,6 @@ def in_a_rule_of_differentiation():
 
     potential.defjvp(lambda primals, tangents: (held[0] * primals[0], held[0] * tangents[0]))
     return lambda t, q, v, p: 0.5 * v**2 - potential(q), into(held, 0)
-
-
-def in_an_array_of_jax():
-    """In an array of jax."""
-    held = [jnp.zeros(300)]
-    return falling(lambda: held[0][250]), lambda g: held.__setitem__(0, held[0].at[250].set(g))
 
 
 HOLDERS = [f for name, f in list(globals().items()) if name.startswith(("in_", "inside_"))]

@@ -15,13 +15,11 @@ from tests.integrate.elements.test_motions import moved
 G = 9.81
 
 
-def held() -> lj.System:
-    """A block of mass 1 at a wall, held by a friction of 1 too, and pulled off by a + b t."""
-    floor = lj.Friction(lambda t, q, v, p: v, 1.0, normal=1.0)
-    return lj.System(
-        lambda t, q, v, p: 0.5 * v**2, force=lambda t, q, v, p: p["a"] + p["b"] * t,
-        elements={"wall": lj.Contact(lambda t, q, p: q), "floor": floor},
-    )  # fmt: skip
+# A block of mass 1 at a wall, held by a friction of 1 too, and pulled off by a + b t.
+held = lj.System(
+    lambda t, q, v, p: 0.5 * v**2 + (p["a"] + p["b"] * t) * q,
+    elements={"wall": lj.Contact(lambda t, q, p: q), "floor": lj.Friction(lambda t, q, v, p: v, 1.0, normal=1.0)},
+)
 
 
 @pytest.mark.exhaustive
@@ -32,7 +30,7 @@ def held() -> lj.System:
 def test_a_wall_and_friction_along_one_line(start, a, b):
     """The block rests while a + b t < 1, then q = b (t - t₁)³/6. Twin: with more friction it is elsewhere."""
     gives = (1 - a) / b
-    traj = moved(held(), *start, {"a": a, "b": b}, ts=jnp.array([0.0, 1.0, 4.0]))
+    traj = moved(held, *start, {"a": a, "b": b}, ts=jnp.array([0.0, 1.0, 4.0]))
     np.testing.assert_allclose(traj.q[-1], b * max(4.0 - gives, 0.0) ** 3 / 6, rtol=1e-9, atol=1e-12)
     if gives < 4.0:
         assert np.min(np.abs(np.asarray(traj.switches.t)[: len(traj.switches)] - gives)) < 1e-9
@@ -47,20 +45,15 @@ def test_squeezed_at_rest():
     rise = lambda t, q, v, p: v["z"]
 
     def energy(t, q, v, p):
-        pads = 0.05 * (v["left"] ** 2 + v["right"] ** 2)
+        pads = 0.05 * (v["left"] ** 2 + v["right"] ** 2) + (12.0 - 6.0 * t) * (q["left"] - q["right"])
         return pads + 0.5 * m * (v["x"] ** 2 + v["z"] ** 2) - m * G * q["z"]
 
-    def squeeze(t, q, v, p):
-        return {"left": 12.0 - 6.0 * t, "right": 6.0 * t - 12.0, "x": 0.0, "z": 0.0}
-
-    pad = lambda gap: lj.Contact(gap, friction=mu, sliding=rise)
-    pads = {
-        "left": pad(lambda t, q, p: q["x"] - q["left"] - r),
-        "right": pad(lambda t, q, p: q["right"] - q["x"] - r),
-    }
+    gaps = {"left": lambda t, q, p: q["x"] - q["left"] - r, "right": lambda t, q, p: q["right"] - q["x"] - r}
+    pads = {name: lj.Contact(gap, friction=mu, sliding=rise) for name, gap in gaps.items()}
     q0 = {"left": -r, "right": r, "x": 0.0, "z": 0.0}
-    grip = lj.System(energy, force=squeeze, elements=pads)
-    traj = lj.integrate(grip, q0, dict.fromkeys(q0, 0.0), ts=jnp.array([0.0, 1.0, 1.9, 1.96, 2.0]))
+    traj = lj.integrate(
+        lj.System(energy, elements=pads), q0, dict.fromkeys(q0, 0.0), ts=jnp.array([0.0, 1.0, 1.9, 1.96, 2.0])
+    )
     slips = 2 - m * G / (2 * mu) / 6
     fallen = -G * np.maximum(np.asarray(traj.t) - slips, 0.0) ** 3 / (6 * (2 - slips))
     np.testing.assert_allclose(traj.q["z"], fallen, rtol=1e-9, atol=1e-15)
@@ -68,31 +61,26 @@ def test_squeezed_at_rest():
     np.testing.assert_allclose(traj.switches.t[0], slips, atol=1e-9)
 
 
-def on_a_wire(mu: float) -> np.ndarray:
-    """The energies of a bead on a circular wire after 0.3 and 0.45, with friction μ |N|, by SciPy."""
-
-    def field(t, y):
-        normal = G * np.sin(y[0]) - y[1] ** 2
-        return [y[1], -G * np.cos(y[0]) - mu * np.abs(normal) * np.sign(y[1])]
-
-    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12, "max_step": 1e-3}
-    found = solve_ivp(field, (0.0, 0.45), [np.pi / 2 - 0.3, -1.0], t_eval=[0.3, 0.45], **options).y
-    return found[1] ** 2 / 2 + G * np.sin(found[0])
-
-
 @pytest.mark.exhaustive
 def test_a_normal_force_that_holds_from_both_sides():
-    """A bead on a wire, which first carries and then pulls it: friction is μ |N|, the side is a mode. Twin: with the
-    multiplier as it is, friction drives the bead."""
+    """A bead on a wire, which first carries and then pulls it: friction is μ |N|, by SciPy; the side is a mode. Twin:
+    with the multiplier as it is, friction drives the bead."""
     wire = lj.Holonomic(lambda t, q, p: 1.0 - jnp.sqrt(jnp.sum(q**2)))
     along = lambda t, q, v, p: (q[0] * v[1] - q[1] * v[0]) / jnp.sqrt(jnp.sum(q**2))
     rub = lj.Friction(along, 0.2, normal="wire")
     bead = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - G * q[1], {"wire": wire}, elements={"rub": rub})
-    place = np.pi / 2 - 0.3
+    place, ts = np.pi / 2 - 0.3, np.array([0.0, 0.3, 0.45])
     start = np.array([np.cos(place), np.sin(place)]), np.array([np.sin(place), -np.cos(place)])
-    traj = moved(bead, *start, ts=np.array([0.0, 0.3, 0.45]))
+    traj = moved(bead, *start, ts=ts)
+
+    def field(t, y):
+        normal = G * np.sin(y[0]) - y[1] ** 2
+        return [y[1], -G * np.cos(y[0]) - 0.2 * np.abs(normal) * np.sign(y[1])]
+
+    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12, "max_step": 1e-3}
+    angle, rate = solve_ivp(field, (0.0, 0.45), [place, -1.0], t_eval=ts, **options).y
     energies = 0.5 * np.sum(np.asarray(traj.v) ** 2, axis=1) + G * np.asarray(traj.q)[:, 1]
-    np.testing.assert_allclose(energies[1:], on_a_wire(0.2), rtol=1e-7)
+    np.testing.assert_allclose(energies, rate**2 / 2 + G * np.sin(angle), rtol=1e-7)
     assert traj.switches.ways == ("rub", "rub normal") and "rub normal presses" in repr(traj.switches)
     assert np.asarray(traj.modes)[:, 1].tolist() == [-1, -1, 1]
     pressed = np.asarray(traj.multipliers["wire"])
@@ -110,17 +98,17 @@ def test_what_presses_from_one_side():
     def run(v0, fade, mu=0.3, q0=0.0, **options):
         return lj.integrate(block, q0, v0, {"fade": fade, "mu": mu}, ts=np.array([0.0, 0.9]), **options)
 
-    for v0 in (3.0, -3.0):
-        traj = run(v0, 0.5)
-        np.testing.assert_allclose(traj.v[-1], v0 - np.sign(v0) * 0.3 * (0.9 - 0.5 * 0.405), rtol=1e-9)
-        np.testing.assert_allclose(traj.multipliers["floor"], -np.sign(v0) * 0.3 * np.array([1.0, 0.55]), rtol=1e-12)
-    with pytest.raises(RuntimeError, match=r"normal force of 'floor' falls below zero at t = 0.5"):
-        run(3.0, 2.0)
-    for mu in (-0.3, np.nan):
-        with pytest.raises(ValueError, match=f"the coefficient of 'floor' is {mu}"):
-            run(3.0, 0.5, mu)
-    with pytest.raises(ValueError, match="of q0 is nan"):
-        run(3.0, 0.5, q0=np.nan)
+    for way in (1.0, -1.0):
+        traj = run(3.0 * way, 0.5)
+        np.testing.assert_allclose(traj.v[-1], way * (3.0 - 0.3 * (0.9 - 0.5 * 0.405)), rtol=1e-9)
+        np.testing.assert_allclose(traj.multipliers["floor"], -0.3 * way * np.array([1.0, 0.55]), rtol=1e-12)
+    for wrong, error, words in (
+        ({"fade": 2.0}, RuntimeError, "normal force of 'floor' falls below zero at t = 0.5"),
+        ({"fade": 0.5, "mu": -0.3}, ValueError, "the coefficient of 'floor' is -0.3"),
+        ({"fade": 0.5, "q0": np.nan}, ValueError, "of q0 is nan"),
+    ):
+        with pytest.raises(error, match=words):
+            run(3.0, **wrong)
     lanes = jax.vmap(lambda mu: run(3.0, 0.5, mu, throw=False))(np.array([0.3, -0.3]))
     assert np.isnan(lanes.v[:, -1]).tolist() == [False, True]
     refused, codes = lj.RESULTS.element_refused, np.asarray(lanes.result._value)
@@ -156,12 +144,11 @@ def test_guards_that_rest_hide_no_others():
     gap that does not rest, the gap's."""
     given = {name: np.array(1.0) for name in "ab"}
     start = State(*np.zeros((3, 1))[:, 0], given)
-    _, laws = in_modes(held(), start)
+    _, laws = in_modes(held, start)
     # Open and sticking: the friction has 0.4 to spare.
-    found = []
-    for slack in (-1e-15, 1e-15):
-        here = laws.given(given, jnp.array([0, 2]), jnp.array([slack, 1e-3]))
-        found.append(float(OneGuard(laws)(*start[:3], {"wall": jnp.zeros(()), "floor": jnp.array(0.6)}, here)))
+    forces = {"wall": jnp.zeros(()), "floor": jnp.array(0.6)}
+    here = [laws.given(given, jnp.array([0, 2]), jnp.array([slack, 1e-3])) for slack in (-1e-15, 1e-15)]
+    found = [float(OneGuard(laws)(*start[:3], forces, x)) for x in here]
     np.testing.assert_allclose(found, [401.0, 1.0], rtol=1e-9)
 
 
@@ -174,7 +161,5 @@ def test_switches_in_words():
         t, way, none, v, v, v, after, after - v, np.array(4), np.array(False), ("motion",), ("cam", "cam friction"),
         modes, ("gap", "sliding velocity"),
     )  # fmt: skip
-    words = [row.split("  ")[-1].strip() for row in found.in_rows()]
-    assert [row.split(" cam")[-1].strip() for row in found.in_rows()] == [
-        "open", "is struck, then open", "friction slides forward", "friction slides back",
-    ], words  # fmt: skip
+    words = [row.split(" cam")[-1].strip() for row in found.in_rows()]
+    assert words == ["open", "is struck, then open", "friction slides forward", "friction slides back"]

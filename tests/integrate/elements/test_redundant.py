@@ -99,22 +99,15 @@ LENGTH, HEIGHT = 1.0, 0.5
 LOWEST = -np.arcsin(HEIGHT / LENGTH)
 
 
-def rod() -> lj.System:
-    """A pivoted rod above a floor below its pivot, which a torque that grows with time lifts."""
-
-    def energy(t, q, v, p):
-        return LENGTH**2 / 6 * v**2 - G * LENGTH / 2 * jnp.sin(q) + p["torque"] * t * q
-
-    tip = lj.Contact(
-        lambda t, q, p: HEIGHT + LENGTH * jnp.sin(q), friction=lambda p: p["mu"],
-        sliding=lambda t, q, v, p: -LENGTH * jnp.sin(q) * v,
-    )  # fmt: skip
-    return lj.System(energy, elements=lj.Elements({"floor": tip}, most_switches=8))
-
-
-def swung(p) -> lj.HybridTrajectory:
-    """The rod let fall."""
-    return moved(rod(), 0.5, 0.0, p, ts=jnp.array([0.0, 1.0, 4.0, 4.4]))
+tip = lj.Contact(
+    lambda t, q, p: HEIGHT + LENGTH * jnp.sin(q), friction=lambda p: p["mu"],
+    sliding=lambda t, q, v, p: -LENGTH * jnp.sin(q) * v,
+)  # fmt: skip
+# A pivoted rod above a floor below its pivot, which a torque that grows with time lifts.
+rod = lj.System(
+    lambda t, q, v, p: LENGTH**2 / 6 * v**2 - G * LENGTH / 2 * jnp.sin(q) + p["torque"] * t * q,
+    elements=lj.Elements({"floor": tip}, most_switches=8),
+)
 
 
 @pytest.mark.exhaustive
@@ -122,7 +115,7 @@ def test_modes_of_an_arm_at_rest():
     """Two forces for one freedom: the shortest have the friction tan 30° N, which sticks, or is at its bound where that
     is above μ N. Twin: both coefficients."""
     for mu, mode in ((0.3, "is held by others"), (1.0, "sticks")):
-        found = lj.explain(rod(), 0.0, LOWEST, 0.0, {"mu": mu, "torque": 1.0})
+        found = lj.explain(rod, 0.0, LOWEST, 0.0, {"mu": mu, "torque": 1.0})
         assert dict(found.modes) == {"floor": "closed", "floor friction": mode}
 
 
@@ -131,63 +124,59 @@ def test_an_arm_of_one_freedom():
     """It rests from its first touch on, as its tip can neither slide nor lift, with N cos + μ N sin = (weight - torque)
     at the bound of friction, until the torque outweighs the weight. Twin: without friction N cos alone is that."""
     weight, up, across = G * LENGTH / 2 * np.cos(LOWEST), LENGTH * np.cos(LOWEST), -LENGTH * np.sin(LOWEST)
-    found = {mu: swung({"mu": mu, "torque": 1.0}) for mu in (0.3, 0.0)}
-    for mu, traj in found.items():
+    ts, rests = jnp.array([0.0, 1.0, 4.0, 4.4]), {}
+    swung = lambda mu: moved(rod, 0.5, 0.0, {"mu": mu, "torque": 1.0}, ts=ts)
+    for mu in (0.3, 0.0):
+        traj = rests[mu] = swung(mu)
         assert len(traj.switches) == 2
         np.testing.assert_allclose(traj.q[1:3], LOWEST, atol=1e-12)
         np.testing.assert_allclose(traj.multipliers["floor"][1], (weight - 1.0) / (up + mu * across), rtol=1e-9)
         np.testing.assert_allclose(traj.switches.t[1], weight, rtol=1e-9)
-    assert found[0.3].multipliers["floor"][1] < 0.9 * found[0.0].multipliers["floor"][1]
+    assert rests[0.3].multipliers["floor"][1] < 0.9 * rests[0.0].multipliers["floor"][1]
     # Where sticking needs less than μ N it has the shortest forces, along (up, across).
-    traj = swung({"mu": 1.0, "torque": 1.0})
+    traj = swung(1.0)
     both = [float(traj.multipliers[name][1]) for name in ("floor", "floor friction")]
     np.testing.assert_allclose(both, (weight - 1.0) / (up**2 + across**2) * np.array([up, across]), rtol=1e-9)
 
 
-def pushed(p) -> lj.HybridTrajectory:
-    """A box of edge 2 on its lower corners, pushed at its centre by p["push"] + p["rate"] t of its weight."""
-    at = np.array([[-1.0, -1.0], [1.0, -1.0]])
+@pytest.mark.exhaustive
+def test_a_box_that_is_pushed():
+    """A box of edge 2 on its lower corners, pushed at its centre by a growing part of its weight, slides where that
+    exceeds μ, at t = 2, and not before, whatever corner has all the friction that it can, from t = 4/3 on; or at
+    t = 3.8 to the other side. Twin: a corner with half of the friction."""
 
-    def places(q):
+    def corners(q):
         c, s = jnp.cos(q["angle"]), jnp.sin(q["angle"])
-        return q["x"] + c * at[:, 0] - s * at[:, 1], q["y"] + s * at[:, 0] + c * at[:, 1]
+        return q["x"] + c * jnp.array([-1.0, 1.0]) + s, q["y"] + s * jnp.array([-1.0, 1.0]) - c
 
     def energy(t, q, v, p):
         kinetic = (v["x"] ** 2 + v["y"] ** 2 + BOX[2] * v["angle"] ** 2) / 2
         return kinetic - G * q["y"] + (p["push"] + p["rate"] * t) * G * q["x"]
 
     floor = lj.Contact(
-        lambda t, q, p: places(q)[1], friction=MU,
-        sliding=lambda t, q, v, p: jax.jvp(lambda q: places(q)[0], (q,), (v,))[1],
+        lambda t, q, p: corners(q)[1], friction=MU,
+        sliding=lambda t, q, v, p: jax.jvp(lambda q: corners(q)[0], (q,), (v,))[1],
     )  # fmt: skip
     box = lj.System(energy, elements=lj.Elements({"floor": floor}, most_switches=8))
-    still = {name: 0.0 for name in ("x", "y", "angle")}
-    return moved(box, still | {"y": 1.0}, still, p, ts=jnp.array([0.0, 1.0, 1.9, 3.0]))
-
-
-@pytest.mark.exhaustive
-def test_a_box_that_is_pushed():
-    """It slides where the push exceeds μ of the weight, at t = 2, and not before, whatever corner has all the friction
-    that it can, from t = 4/3 on; or at t = 3.8 to the other side. Twin: a corner with half of the friction."""
-    traj = pushed({"push": 0.0, "rate": 0.25})
+    still, ts = {"x": 0.0, "y": 0.0, "angle": 0.0}, jnp.array([0.0, 1.0, 1.9, 3.0])
+    pushed = lambda push, rate: moved(box, still | {"y": 1.0}, still, {"push": push, "rate": rate}, ts=ts)
+    traj = pushed(0.0, 0.25)
     np.testing.assert_allclose(traj.switches.t[:2], [4 / 3, 2.0], rtol=1e-9)
     np.testing.assert_allclose(traj.q["x"], [0.0, 0.0, 0.0, 0.25 * G / 6], atol=1e-12)
     carried = float(jnp.sum(traj.multipliers["floor friction"][2])) - MU * float(traj.multipliers["floor"][2, 0])
     np.testing.assert_allclose(carried, -1.9 * 0.25 * G, rtol=1e-9)
-    back = pushed({"push": 0.45, "rate": -0.25})
+    back = pushed(0.45, -0.25)
     assert np.asarray(back.modes[0])[2:].tolist() == [3, 2] and float(back.q["x"][-1]) == 0.0
     np.testing.assert_allclose(back.multipliers["floor"][0], G * np.array([0.55, 1.45]) / 2, rtol=1e-9)
 
 
-def brake() -> lj.System:
-    """A block on a rail along y, pushed across it, with a brake along a line that turns from across to along it."""
-
-    def energy(t, q, v, p):
-        return (v[0] ** 2 + v[1] ** 2) / 2 + p["across"] * q[0] + p["along"] * q[1]
-
-    turning = lj.Friction(lambda t, q, v, p: jnp.cos(t) * v[0] + jnp.sin(t) * v[1], 0.3, normal=1.0)
-    rail = {"rail": lj.Holonomic(lambda t, q, p: q[0])}
-    return lj.System(energy, rail, elements=lj.Elements({"brake": turning}, most_switches=8))
+# A block on a rail along y, pushed across it, with a brake along a line that turns from across to along it.
+turning = lj.Friction(lambda t, q, v, p: jnp.cos(t) * v[0] + jnp.sin(t) * v[1], 0.3, normal=1.0)
+brake = lj.System(
+    lambda t, q, v, p: (v[0] ** 2 + v[1] ** 2) / 2 + p["across"] * q[0] + p["along"] * q[1],
+    {"rail": lj.Holonomic(lambda t, q, p: q[0])},
+    elements=lj.Elements({"brake": turning}, most_switches=8),
+)
 
 
 def test_what_others_hold_lasts_while_it_is_still():
@@ -195,7 +184,7 @@ def test_what_others_hold_lasts_while_it_is_still():
     Twin: in mode 2, 0.3 less the force, of which the velocity is no part."""
     given, still = {"across": np.array(1.0), "along": np.array(0.0)}, np.zeros(2)
     start = State(np.array(0.3), still, still, given)
-    _, laws = in_modes(brake(), start)
+    _, laws = in_modes(brake, start)
     force = {"rail": np.zeros(()), "brake": np.array(0.05)}
 
     @jax.jit
@@ -216,11 +205,9 @@ def test_what_others_hold_no_more():
 
     Between outputs `traj.at` has no forces while others hold it.
     """
-    system, ts, zero = brake(), jnp.array([0.0, 0.5, 1.5]), np.zeros(2)
     for across, along in ((1.0, 0.0), (-1.0, 0.0), (1.0, 0.1), (-1.0, 0.1)):
-        given = {"across": across, "along": along}
-        traj = lj.integrate(system, zero, zero, given, ts=ts, rtol=1e-10, estimate_error=False)
-        assert isinstance(traj, lj.HybridTrajectory)
+        given, ts = {"across": across, "along": along}, jnp.array([0.0, 0.5, 1.5])
+        traj = moved(brake, np.zeros(2), np.zeros(2), given, ts=ts, rtol=1e-10)
         assert np.ravel(traj.modes).tolist() == [3, 1 if along else 2, 2]
         slid = along * 0.5 - 0.3 * (1 - np.cos(0.5)) if along else 0.0
         np.testing.assert_allclose(traj.v[:, 1], [0.0, slid, 0.0], atol=1e-7)

@@ -115,15 +115,15 @@ def test_two_periods_and_an_event():
     system = lj.System(lambda t, q, v, p: 0.5 * v["x"] ** 2, force=lambda t, q, v, p: {"x": q["u"], "u": 0.0, "w": 0.0},
                        elements={"u": inner, "w": outer})  # fmt: skip
     start = {"x": 0.0, "u": 0.0, "w": 0.0}, {"x": 0.0}
-    x, v, u, w, t = 0.0, 0.0, 0.0, 0.0, 0.0
-    passes, k = None, 0
-    while passes is None:
-        outer_acts, inner_acts = k % 3 == 0, k % 2 == 1
-        u, w = 4.0 * w - 2.0 * v if inner_acts else u, 1.0 - x if outer_acts else w
-        if x + 0.1 * v + 0.005 * u > 0.5:
-            passes = t + float(np.asarray(brentq(lambda s: x + v * s + 0.5 * u * s**2 - 0.5, 0.0, 0.1, xtol=1e-15)))
-        x, v, k = x + 0.1 * v + 0.005 * u, v + 0.1 * u, k + 1
-        t = 0.1 * k
+    x = v = u = w = 0.0
+    for k in range(50):
+        u, w = 4.0 * w - 2.0 * v if k % 2 == 1 else u, 1.0 - x if k % 3 == 0 else w
+        after = x + 0.1 * v + 0.005 * u
+        if after > 0.5:
+            break
+        x, v = after, v + 0.1 * u
+    reached = lambda s: x + v * s + 0.5 * u * s**2 - 0.5
+    passes = 0.1 * k + float(np.asarray(brentq(reached, 0.0, 0.1, xtol=1e-15)))
     half = {"half": lj.Crossing(lambda t, q, v, p: q["x"] - 0.5)}
     traj = moved(system, *start, None, ts=np.array([0.0, 5.0]), events=half, rtol=1e-12)
     np.testing.assert_allclose(traj.end.t, passes, rtol=1e-12)

@@ -48,8 +48,8 @@ def test_an_actuator_with_a_stop():
 
 @pytest.mark.exhaustive
 def test_a_cost_beside_friction():
-    """The integral of v² while dry friction stops a block on a spring: A² ω π/2 for each half swing A; its derivative.
-    Twin: the derivative without that of the amplitudes is zero."""
+    """The integral of v² while dry friction stops a block on a spring: A² ω π/2 for each half swing A; derivatives in
+    both modes. Twin: the derivative without that of the amplitudes is zero."""
     costly = lj.System(
         lambda t, q, v, mu: 0.5 * v["x"] ** 2 - 0.5 * K * q["x"] ** 2,
         states={"cost": lambda t, q, v, mu: v["x"] ** 2},
@@ -60,8 +60,9 @@ def test_a_cost_beside_friction():
     last = run(MU)
     np.testing.assert_allclose(last.q["x"][-1], REST, atol=1e-10)
     np.testing.assert_allclose(last.q["cost"][-1], 5 * np.pi * np.sum(swings**2), rtol=1e-10)
-    found = jax.jacrev(lambda mu: jnp.stack([run(mu).q["x"][-1], run(mu).q["cost"][-1]]))(MU)
-    np.testing.assert_allclose(found, [BY_MU, 10 * np.pi * np.sum(swings * by_mu)], rtol=1e-8)
+    ends = lambda mu: (lambda q: jnp.stack([q["x"][-1], q["cost"][-1]]))(run(mu).q)
+    for found in (jax.jvp(ends, (MU,), (1.0,))[1], jax.jacrev(ends)(MU)):
+        np.testing.assert_allclose(found, [BY_MU, 10 * np.pi * np.sum(swings * by_mu)], rtol=1e-8)
 
 
 @pytest.mark.exhaustive

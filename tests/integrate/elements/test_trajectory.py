@@ -63,8 +63,8 @@ def test_between_outputs():
 
 @pytest.mark.slow
 def test_in_a_file(tmp_path):
-    """It comes back bit for bit, with its modes, and continues. Twins: with another restitution, or another friction
-    of the same sliding velocity, it is another system."""
+    """It comes back bit for bit, and continues; in a dataset modes are a variable by their names. Twins: with another
+    restitution, or another friction of the same sliding velocity, it is another system."""
     traj, path = computed(), tmp_path / "motion.npz"
     traj.save(path)
     numbers = lambda traj: jax.tree.leaves((traj.rows(), traj.switches, traj.end, traj.events, traj.stats))
@@ -73,18 +73,13 @@ def test_in_a_file(tmp_path):
         for a, b in zip(numbers(traj), numbers(found), strict=True):
             assert a.dtype == b.dtype and np.asarray(a).tobytes() == np.asarray(b).tobytes()
     assert repr(again) == repr(traj) and np.array_equal(again.at(0.7).q, traj.at(0.7).q)
+    modes = again.to_xarray()["modes"]
+    assert modes.dims == ("t", "mode") and modes.sel(mode="floor friction").values.tolist() == [0, 0, 2]
     kept = {"friction": floor.friction, "sliding": floor.sliding}
     others = lj.Contact(floor.gap, 0.6, **kept), lj.Contact(floor.gap, E, **kept | {"friction": 0.2})
     for other, words in zip(others, ("the restitution of 'floor'", "the coefficients of 'floor friction'")):
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path, lj.System(block.lagrangian, elements={"floor": other}))
-
-
-@pytest.mark.slow
-def test_as_a_dataset():
-    """The modes are a variable with the names of the modes as coordinate."""
-    modes = computed().to_xarray()["modes"]
-    assert modes.dims == ("t", "mode") and modes.sel(mode="floor friction").values.tolist() == [0, 0, 2]
 
 
 @pytest.mark.exhaustive
@@ -108,26 +103,18 @@ def test_energy_by_element():
 def test_energy_of_what_moves():
     """A table that goes up and down does work on what lies on it, and a belt on what it carries."""
     table = lj.Contact(lambda t, q, p: q - 0.1 * jnp.sin(t))
-    lifted = lj.System(lambda t, q, v, p: 0.5 * v**2 - 10.0 * q, elements={"table": table})
-    traj = lj.integrate(lifted, 0.0, 0.1, ts=np.array([0.0, 1.0]), estimate_error=False)
-    work = lj.energy_ledger(traj).elements["table"].total[-1]
-    np.testing.assert_allclose(work, np.sin(1.0) + 0.005 * (np.cos(1.0) ** 2 - 1), rtol=1e-8)
     belt = lj.Friction(lambda t, q, v, p: v - 1.0, 0.5, normal=10.0)
-    carried = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * q**2, elements={"belt": belt})
-    traj = lj.integrate(carried, 0.0, 0.0, ts=np.array([0.0, 1.0]), estimate_error=False)
-    assert isinstance(traj, lj.HybridTrajectory)
-    ledger = lj.energy_ledger(traj)
-    h = 0.5 * (traj.v**2 + traj.q**2)
-    np.testing.assert_allclose(ledger.elements["belt"].total[-1], h[-1] - h[0], rtol=1e-8)
-    assert np.asarray(traj.modes)[:, 0].tolist() == [-1, 2]
-
-
-AT_STATES = (
-    ([0.0, 1.0], [0.0, 0.0], ("open", "free"), 2),
-    ([0.0, 0.0], [1.0, 0.0], ("closed", "slides"), 1),
-    ([0.0, 0.0], [0.0, 0.0], ("closed", "sticks"), 0),
-)
-NUMBERS = {"open": 0, "free": 0, "closed": 1, "slides": 1, "sticks": 2}
+    for name, element, potential, v0, modes in (
+        ("table", table, lambda q: 10.0 * q, 0.1, [1, 1]),
+        ("belt", belt, lambda q: 0.5 * q**2, 0.0, [-1, 2]),
+    ):
+        system = lj.System(lambda t, q, v, p, V=potential: 0.5 * v**2 - V(q), elements={name: element})
+        traj = lj.integrate(system, 0.0, v0, ts=np.array([0.0, 1.0]), estimate_error=False)
+        assert isinstance(traj, lj.HybridTrajectory) and np.asarray(traj.modes)[:, 0].tolist() == modes
+        work, energy = lj.energy_ledger(traj).elements[name].total[-1], 0.5 * traj.v**2 + potential(traj.q)
+        np.testing.assert_allclose(work, energy[-1] - energy[0], rtol=1e-8)
+        if name == "table":
+            np.testing.assert_allclose(work, np.sin(1.0) + 0.005 * (np.cos(1.0) ** 2 - 1), rtol=1e-8)
 
 
 def in_modes(monkeypatch, v, modes, found=True):
@@ -139,10 +126,14 @@ def in_modes(monkeypatch, v, modes, found=True):
 def test_explained(monkeypatch):
     """The modes at a state, and how free it is in them, in words and as a dict."""
     rows = []
-    for q, v, modes, free in AT_STATES:
-        in_modes(monkeypatch, v, [NUMBERS[mode] for mode in modes])
-        found = lj.explain(block, 0.0, np.array(q), np.array(v), PARAMS)
-        assert dict(found.modes) == dict(zip(("floor", "floor friction"), modes))
+    for y, x_dot, numbers, words, free in (
+        (1.0, 0.0, [0, 0], ("open", "free"), 2),
+        (0.0, 1.0, [1, 1], ("closed", "slides"), 1),
+        (0.0, 0.0, [1, 2], ("closed", "sticks"), 0),
+    ):
+        in_modes(monkeypatch, [x_dot, 0.0], numbers)
+        found = lj.explain(block, 0.0, np.array([0.0, y]), np.array([x_dot, 0.0]), PARAMS)
+        assert dict(found.modes) == dict(zip(("floor", "floor friction"), words))
         rows.append(dict(found.rows))
         assert rows[-1]["in these modes"].startswith(f"{free} degree")
         assert "forces" not in rows[-1] and not found.problem
@@ -156,14 +147,6 @@ def test_explained(monkeypatch):
     between = lj.explain(lj.System(block.lagrangian, elements={"walls": walls}), 0.0, np.zeros(2), np.zeros(2), PARAMS)
     assert "not unique: 2 hold, 1 of them independent" in dict(between.rows)["forces"]
     assert "Painlevé" in str(between.problem)
-
-
-@pytest.mark.slow
-def test_modes_at_states():
-    """The modes that are found at states are those that fit."""
-    for q, v, modes, _ in AT_STATES:
-        found = lj.explain(block, 0.0, np.array(q), np.array(v), PARAMS)
-        assert dict(found.modes) == dict(zip(("floor", "floor friction"), modes))
 
 
 @pytest.mark.slow
@@ -200,38 +183,28 @@ def test_fitted():
 
 
 @pytest.mark.exhaustive
-def test_a_lane_of_a_batch(tmp_path):
-    """A lane of a batch, which has its own modes, continues, before and after it was in a file."""
-    mu = jnp.array([MU, 2 * MU])
-    lanes = jax.vmap(thrown)(mu)
-    lanes.save(tmp_path / "lanes.npz")
-    for batch in (lanes, lj.load_trajectory(tmp_path / "lanes.npz", block)):
-        lane = jax.tree.map(lambda x: x[1], batch)
-        np.testing.assert_allclose(lane.at(0.7).v[0], THROWN - 2 * MU * (1 + E) * G * FALL, atol=1e-8)
-
-
-@pytest.mark.exhaustive
-def test_switches_of_lanes():
+def test_switches_of_lanes(tmp_path):
     """Each lane of a batch has its own switches: a block on a spring stops every half swing, nearer by 2 μ g / k, and
-    rests where the spring is weaker. Twin: the stops of another lane."""
+    rests where the spring is weaker; a lane continues, before and after it was in a file. Twin: another lane's stops.
+    """
     k, lost = 100.0, 0.3 * G / 100.0
     table = lj.Friction(lambda t, q, v, p: v, 0.3, normal=G)
     system = lj.System(lambda t, q, v, p: 0.5 * v**2 - 0.5 * k * q**2, elements={"table": table})
-
-    def released(q0):
-        return lj.integrate(system, q0, 0.0, ts=jnp.array([0.0, 2.0]), rtol=1e-10, estimate_error=False)
-
-    starts = np.array([1.0, 2.0, 3.0, 5.0]) * 2 * lost
+    released = lambda q0: lj.integrate(system, q0, 0.0, ts=[0.0, 2.0], rtol=1e-10, estimate_error=False)
+    starts, counts, stops = np.array([1.0, 2.0, 3.0, 5.0]) * 2 * lost, [1, 2, 3, 5], np.arange(1, 6)
     lanes = jax.vmap(released)(jnp.asarray(starts))
     assert isinstance(lanes, lj.HybridTrajectory)
-    found, counts, stops = lanes.switches, [1, 2, 3, 5], np.arange(1, 6)
-    expected = [(-1.0) ** stops * (q0 - 2 * stops * lost) for q0 in starts]
+    found, expected = lanes.switches, (-1.0) ** stops * (starts[:, None] - 2 * stops * lost)
     assert found.count.tolist() == counts
     for lane, count in enumerate(counts):
         np.testing.assert_allclose(found.t[lane, :count], np.pi / 10 * stops[:count], atol=1e-9)
-        np.testing.assert_allclose(found.q[lane, :count], expected[lane][:count], atol=1e-9)
+        np.testing.assert_allclose(found.q[lane, :count], expected[lane, :count], atol=1e-9)
         assert np.all(np.isnan(found.t[lane, count:])) and found.modes[lane, count - 1].tolist() == [2]
-    assert abs(float(found.q[3, 2]) - expected[2][2]) > 1e-3
+    assert abs(float(found.q[3, 2]) - expected[2, 2]) > 1e-3
+    lanes.save(tmp_path / "lanes.npz")
+    for batch in (lanes, lj.load_trajectory(tmp_path / "lanes.npz", system)):
+        swings = jax.tree.map(lambda x: x[1], batch).at(0.1).q
+        np.testing.assert_allclose(swings, lost + (starts[1] - lost) * np.cos(1.0), atol=1e-8)
 
 
 @pytest.mark.exhaustive

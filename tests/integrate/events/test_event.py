@@ -61,18 +61,6 @@ def test_a_ball_bounces_fifty_times():
     np.testing.assert_allclose(t, 2 * 3.0 / G * (1 - restitution**50) / (1 - restitution), rtol=1e-12)
 
 
-# The positions of crossings.
-
-
-def test_a_section_by_going_on_where_it_ended():
-    """Each turn ends exactly once: ten tops are one period apart."""
-    t, q, v = 0.0, 0.0, 1.0
-    for turn in range(10):
-        end = swing(q, v, 3.0, [t, t + 5.0, t + 10.0], stop=0.0).end
-        t, q, v = (float(x) for x in (end.t, end.q, end.v))
-        assert t == pytest.approx((2 * turn + 0.5) * np.pi, abs=1e-7)
-
-
 def test_recorded_until_a_terminal_one():
     """In the step that ends the motion, crossings and outputs are recorded up to the end, with their states."""
     for end in (1.0, 1.5, 2.5, 3.1):
