@@ -131,7 +131,8 @@ class Rows(NamedTuple):
         x, u = jnp.max(self.root_mass[None] * known, axis=1)
         forced = jnp.max(self.root_mass * a)
         way = forced * span**2
-        x = jnp.where(x <= rounding(way), FROM_NOTHING[0] * way, x)
+        # And what moves from zero goes as far as it comes.
+        x = jnp.where(x <= rounding(way), jnp.maximum(FROM_NOTHING[0] * way, u * span), x)
         u = jnp.maximum(u, jnp.sqrt(x * jnp.maximum(jnp.max(self.root_mass * jnp.abs(self.acceleration)), forced)))
         least = LIGHT * jnp.max(self.root_mass)
         heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
