@@ -116,6 +116,7 @@ def test_two_periods_and_an_event():
                        elements={"u": inner, "w": outer})  # fmt: skip
     start = {"x": 0.0, "u": 0.0, "w": 0.0}, {"x": 0.0}
     x = v = u = w = 0.0
+    k = 0
     for k in range(50):
         u, w = 4.0 * w - 2.0 * v if k % 2 == 1 else u, 1.0 - x if k % 3 == 0 else w
         after = x + 0.1 * v + 0.005 * u
