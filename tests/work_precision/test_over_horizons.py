@@ -7,7 +7,7 @@ import pytest
 from scipy import special
 
 import lagjax as lj
-from lagjax.work_precision.over_horizons import Needed
+from lagjax.work_precision.over_horizons import STEPS, Needed
 from tests.by_hand import swing
 from tests.systems import PARAMS, pendulum
 
@@ -85,3 +85,8 @@ def test_bad_horizons():
         lj.work_precision(pendulum, 1.0, 0.0, PARAMS, ts=[0.0, 1.0], methods=[lj.Gauss(2)])
     with pytest.raises(TypeError, match="outside jit"):
         jax.jit(lambda q: lj.horizons(pendulum, q, 0.0, PARAMS, period=2.0).error)(jnp.asarray(1.0))
+
+
+def test_steps_are_from_long_to_short():
+    """A ladder of steps ends where round-off begins for order 6, at thousands in a period."""
+    assert STEPS[0] < 3 and STEPS[-1] > 2000 and all(a < b for a, b in zip(STEPS, STEPS[1:]))
