@@ -154,8 +154,8 @@ def test_backlash_in_a_drive():
 @pytest.mark.parametrize(
     ("sliding", "v0", "ends", "steps"),
     [
-        (lambda t, q, v, mu: v[0], [0.3, 0.0, 0.0], [3.0, 100.0, 1e4], 25),
-        (lambda t, q, v, mu: v[:2], [1.2, 1.6, 0.0], [3.0, 100.0], 120),
+        (lambda t, q, v, mu: v[0], [0.3, 0.0, 0.0], [3.0, 100.0, 1e4], 20),
+        (lambda t, q, v, mu: v[:2], [1.2, 1.6, 0.0], [3.0, 100.0], 100),
     ],
 )
 @pytest.mark.filterwarnings("error")
