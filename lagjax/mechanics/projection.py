@@ -92,12 +92,12 @@ def velocity_change(model: Model, t: Array, q: PyTree, v: PyTree, change: Array)
     return model.tree(equations_of(model).displacement(t, q, v)(change))
 
 
-def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes | None = None):
+def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes | None = None, least=0.0):
     """Return the largest relative residual along a trajectory, of positions and velocities.
 
     A residual is taken relative to `Σ_j |A_ij| Q`, with Q the largest coordinate on the trajectory (the largest
     velocity for the velocity level): to the residual that a displacement as large as the motion would cause. `given`:
-    for a system with elements, the modes in each row.
+    for a system with elements, the modes in each row. `least` (2, 1): Q is at least this.
     """
     equations = equations_of(model)
 
@@ -107,7 +107,7 @@ def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes 
 
     residual, slope, size = jax.vmap(at)(t, q, v, given)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
-    scale = jnp.nanmax(size, axis=0, keepdims=True) * slope
+    scale = jnp.maximum(jnp.nanmax(size, axis=0, keepdims=True), least) * slope
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
 
 

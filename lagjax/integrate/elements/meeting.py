@@ -122,21 +122,27 @@ class Rows(NamedTuple):
         of_rows = lax.fori_loop(0, own.size, next_to_next, jnp.abs(self.jacobian) @ jnp.abs(a))
         return jnp.maximum(jnp.abs(a), jnp.max(jnp.abs(self.response) * (step * of_rows)[:, None], axis=0))
 
-    def sizes(self, known: Float[Array, "2 n"], a: Float[Array, " n"], span: Float[Array, ""]) -> Float[Array, "2 n"]:
-        """How large coordinates and velocities become, where all share one size, measured in √M_ii times them.
+    def sizes(self, known: Float[Array, "2 n"], a: Float[Array, " n"], span: Float[Array, ""]) -> Float[Array, "3 n"]:
+        """How large coordinates and velocities become, where all share one size, measured in √M_ii times them; and the
+        velocities that they have had, zero where nothing has moved.
 
         A motion that is at rest now, at x, has velocities of the size √(a x). What rests at zero, but for the round-off
         of accelerations `a` in the time `span`, has the size that a motion from there is given (`tolerances.py`).
         """
+        forced, free = jnp.max(self.root_mass * a), jnp.max(self.root_mass * jnp.abs(self.acceleration))
+        least, faster = rounding(forced * jnp.stack([span**2, span])), jnp.maximum(free, forced)
         x, u = jnp.max(self.root_mass[None] * known, axis=1)
-        forced = jnp.max(self.root_mass * a)
-        way = forced * span**2
-        # And what moves from zero goes as far as it comes.
-        x = jnp.where(x <= rounding(way), jnp.maximum(FROM_NOTHING[0] * way, u * span), x)
-        u = jnp.maximum(u, jnp.sqrt(x * jnp.maximum(jnp.max(self.root_mass * jnp.abs(self.acceleration)), forced)))
-        least = LIGHT * jnp.max(self.root_mass)
-        heavy = jnp.maximum(self.root_mass, jnp.where(least > 0, least, 1.0))
-        return jnp.stack([x, u])[:, None] / heavy[None]
+        u = jnp.where(u > least[1], u, 0.0)
+        # What moves from zero goes as far as it comes until forces stop it.
+        until = jnp.where(faster * span > u, u / jnp.where(faster > 0, faster, 1.0), span)
+        starts, way = x <= least[0], u * until
+        moved = jnp.maximum(u, jnp.sqrt(free * jnp.where(starts, way, x)))
+        way = jnp.where(u > 0, jnp.maximum(way, least[0]), FROM_NOTHING[0] * forced * span**2)
+        x = jnp.where(starts, way, x)
+        u = jnp.maximum(u, jnp.sqrt(x * faster))
+        light = LIGHT * jnp.max(self.root_mass)
+        heavy = jnp.maximum(self.root_mass, jnp.where(light > 0, light, 1.0))
+        return jnp.stack([x, u, moved])[:, None] / heavy[None]
 
 
 class AsFound(NamedTuple):
@@ -240,7 +246,8 @@ class Meeting(eqx.Module):
         at = self._at(t, q, v, given)
         rows = self._rows(at)
         forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
-        moved, sizes = rows.sizes(sizes, 0.0 * forced, span)[1], rows.sizes(sizes, forced, span)
+        *sizes, moved = rows.sizes(sizes, forced, span)
+        sizes = jnp.stack(sizes)
         contacts = stop_gradient(self._as_found(at, fired, rows.jacobian, sizes, moved))
         allowed = jnp.asarray(True)
         if impacts and self.laws.normals:

@@ -164,6 +164,11 @@ def rounding(others: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
     return ROUNDED * jnp.finfo(others.dtype).eps * others
 
 
+def rounded(nothing: Float[Array, "..."]) -> Float[Array, "..."]:
+    """How large the others are, where this is the round-off in numbers that are zero."""
+    return nothing / (ROUNDED * jnp.finfo(nothing.dtype).eps)
+
+
 class AsNothing(eqx.Module):
     """The `atol` of each coordinate and each velocity for iterations inside a step, from the start alone.
 

@@ -78,6 +78,8 @@ def allowed(xp: ModuleType, size: int, span, tolerance):
     largest = xp.max(size, axis=1, keepdims=True)
     others = xp.maximum(largest, largest[::-1] * xp.asarray([[span], [1 / span]]))
     nothing = (size <= NOTHING * tolerances) & (size <= SMALL * others)
+    # Those by the motion's own size are its round-off: what is no larger has no digits at all.
+    nothing = nothing | (size <= tolerance[1]) if tolerance[1].ndim == 2 else nothing
     return xp.minimum(EXPECTED * tolerances, xp.where(nothing, np.inf, DIGITS_LEFT * size))
 
 

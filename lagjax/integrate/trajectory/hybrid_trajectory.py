@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
+from lagjax.integrate.stepping.tolerances import rounded
 from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import mode_in_words
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
@@ -255,13 +256,18 @@ def _of_phases(function: Callable, trajectory):
 
 
 def _residual_in(model: Model, i: int, trajectory, given: InModes | None):
-    return _worst(model, i, trajectory.phase, trajectory.t, trajectory.q, trajectory.v, given)
+    motion = trajectory.phase, trajectory.t, trajectory.q, trajectory.v
+    nothing = trajectory.tolerance[1]
+    # What rests at zero has the size of which its round-off is that of the forces that hold it.
+    least = rounded(jnp.min(nothing, axis=1)[:, None]) if given is not None and nothing.ndim == 2 else 0.0
+    return _worst(model, i, *motion, given, least)
 
 
 @compiled
-def _worst(model: Model, i: int, phase: Array, t: Array, q: PyTree, v: PyTree, given: InModes | None):
+def _worst(model: Model, i: int, phase: Array, t: Array, q: PyTree, v: PyTree, given: InModes | None, least: Any):
     in_phase = phase == i
     # Outputs of other phases are replaced by the first of this phase, which does not change the maximum.
     at = jnp.where(in_phase, jnp.arange(phase.size), jnp.argmax(in_phase))
     t, q, v, given = jax.tree.map(partial(jnp.take, indices=at, axis=0), (t, q, v, given))
-    return lax.cond(jnp.any(in_phase), lambda: worst_residual(model, t, q, v, given), lambda: jnp.zeros_like(t[0]))
+    worst = lambda: worst_residual(model, t, q, v, given, least)
+    return lax.cond(jnp.any(in_phase), worst, lambda: jnp.zeros_like(t[0]))

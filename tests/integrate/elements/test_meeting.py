@@ -11,7 +11,7 @@ from lagjax.integrate.elements.compliant import Compliant
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.in_modes import in_modes
 from lagjax.integrate.elements.laws import Laws, Normal
-from lagjax.integrate.elements.meeting import Meeting
+from lagjax.integrate.elements.meeting import Meeting, Rows
 from lagjax.integrate.elements.sampled import Sampled
 from lagjax.system import State
 
@@ -143,3 +143,24 @@ def test_instants_of_a_control():
     np.testing.assert_allclose(instant, [0.1, 0.1, 0.1, 0.4, 0.7], rtol=1e-15)
     np.testing.assert_allclose(output, np.where(t >= 0.4 - 1e-12, 2 * t + period, -t), rtol=1e-15)
     assert number.tolist() == [1, 1, 1, 1, 2]
+
+
+def test_sizes_of_what_rests_and_of_what_starts_from_zero():
+    """What starts from zero with v goes v²/a, however long it is followed, or v T, in any units; velocities of
+    round-off move nothing. Twins: in a shorter time it goes less far, and a velocity above round-off moves."""
+
+    @jax.jit
+    @jax.vmap
+    def sizes(v, T, unit):
+        root_mass, a, one = jnp.array([1.0, 2.0]) / unit, jnp.array([0.0, 10.0]) * unit, jnp.eye(2)
+        rows = Rows(one, one, one, jnp.zeros((2, 0)), root_mass, a)
+        return rows.sizes(jnp.zeros((2, 2)).at[1, 1].set(v), a, T)[:, 1]
+
+    speeds, times, units = np.array([0.3, 0.3, 0.3e6, 0.3, 1e-81, 0.0, 1e-12]), np.full(7, 3.0), np.ones(7)
+    times[1], times[3], units[2] = 1e4, 0.01, 1e6
+    brief, long, small, short, round_off, nothing, slow = np.asarray(sizes(speeds, times, units))
+    np.testing.assert_allclose(brief, [0.3**2 / 10, 0.3, 0.3], rtol=1e-14)
+    np.testing.assert_allclose([long, small / 1e6], [brief, brief], rtol=1e-14)
+    np.testing.assert_allclose(short[0], 0.003, rtol=1e-14)
+    np.testing.assert_array_equal(round_off, nothing)
+    assert nothing[2] == 0 and nothing[0] > 0 and slow[2] > 0
