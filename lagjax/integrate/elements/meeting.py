@@ -221,9 +221,13 @@ class Meeting(eqx.Module):
         return Meeting(self.system, self.laws, rtol, stop_gradient(forced))
 
     def __call__(
-        self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"], instant: Bool[Array, ""]
-    ) -> tuple[PyTree, Met, Int[Array, ""]]:
-        """What happens at the end of a leg: q, and the first of the modes that end there, or are at an `instant`."""
+        self, end: Snapshot, given: InModes, sizes: Float[Array, "2 n"], instant: Bool[Array, ""],
+        begins: Bool[Array, ""],
+    ) -> tuple[PyTree, Met, Int[Array, ""]]:  # fmt: skip
+        """What happens at the end of a leg: q, and the first of the modes that end there, or are at an `instant`.
+
+        Where a motion `begins` no mode ends, and gaps that close are left to their guards.
+        """
         guards = self.laws.last(end.t, end.q, end.v, end.multipliers, given)
         slack = self.laws.slack(given)
         size = jnp.where(slack > 0, slack, 1.0)
@@ -235,11 +239,11 @@ class Meeting(eqx.Module):
         q, after = self.laws.acted(end.t, end.q, end.v, given)
         acts = after.modes[guards.size :] != given.modes[guards.size :]
         first = jnp.where(instant, guards.size + jnp.argmax(jnp.append(acts, True)), least)
-        return q, self.met(end.t, q, end.v, after, fired, sizes), first.astype(jnp.int32)
+        return q, self.met(end.t, q, end.v, after, fired & ~begins, sizes, ~begins), first.astype(jnp.int32)
 
     def met(
         self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"],
-        impacts: bool = True,
+        impacts: Bool[Array, ""] | bool = True,
     ) -> Met:  # fmt: skip
         """The modes and velocities after a meeting. `fired`: the modes whose guards are zero; `sizes`: the largest
         coordinates and velocities of the motion. Without `impacts` gaps that close stay open."""
@@ -250,9 +254,10 @@ class Meeting(eqx.Module):
         sizes = jnp.stack(sizes)
         contacts = stop_gradient(self._as_found(at, fired, rows.jacobian, sizes, moved))
         allowed = jnp.asarray(True)
-        if impacts and self.laws.normals:
+        if impacts is not False and self.laws.normals:
             struck = self._struck(at, rows, contacts.closed)
-            at, allowed = at._replace(u=at.u + struck.impulses() @ rows.response), struck.allowed()
+            impulses = jnp.where(impacts, struck.impulses(), 0.0)
+            at, allowed = at._replace(u=at.u + impulses @ rows.response), struck.allowed() | ~jnp.asarray(impacts)
         given, reach = self.laws.pressed(*at.state[:3], given, fired, sizes)
         at = at._replace(given=given)
         decided = self._decided(*stop_gradient((at, rows, contacts)))

@@ -135,7 +135,8 @@ class PhaseWay(NamedTuple):
     """How far the legs have come: the state from which the next one starts, and the results of all before.
 
     `continues`: whether there is a next one. `events`: the recorded crossings. `sizes_so_far`: the largest coordinates
-    and velocities, (2, n); `least`: the sizes below which numbers counted as zero. `modes`: None without elements.
+    and velocities, (2, n); `least`: the sizes below which numbers counted as zero. `modes`: None without elements;
+    `begins`: whether the modes that fit the start are still to be found, in a leg of no length.
     """
 
     t: Float[Array, ""]
@@ -154,6 +155,7 @@ class PhaseWay(NamedTuple):
     settled: Bool[Array, ""]
     result: Any
     modes: Modes | None
+    begins: Bool[Array, ""]
 
 
 def solved_in_legs(
@@ -175,7 +177,8 @@ def solved_in_legs(
 
     # Each turn takes every lane at least one leg further.
     most = hybrid.most_switches
-    way = over_legs(next_legs, lambda way: way.switches.count <= most, first, most + 1, adjoint)
+    turns = most + 1 + any(phase.meeting is not None for phase in phases)
+    way = over_legs(next_legs, lambda way: way.switches.count <= most, first, turns, adjoint)
     rows = way.rows
     return {
         "q": rows.q,
@@ -218,23 +221,24 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
     dtype, many = ts.dtype, ts.shape[0]
     model = model_of(hybrid, ts[0], q0, v0, params)
     multipliers = reduce(lambda all, of: all | of, (phase.zero_multipliers() for phase in model.phases))
-    met, modes = None, None
+    modes = None
     if phase.meeting is not None:
-        q0, met = phase.meeting.first(ts[0], q0, v0, params)
-        v0, modes = met.v, Modes(met.modes, met.slack)
-        multipliers = multipliers | phase.meeting.laws.acting(ts[0], q0, v0, multipliers, phase.given(params, modes))
+        # With all gaps open, until the first leg, of no length, has found what fits the start.
+        given = phase.meeting.laws.at_first(ts[0], params)
+        modes = Modes(given.modes, given.slack)
+        acting = jax.eval_shape(phase.meeting.laws.acting, ts[0], q0, v0, multipliers, given)
+        multipliers = multipliers | jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), acting)
     of_modes = None if modes is None else jnp.zeros((many, modes.modes.size), jnp.int32)
     rows = OutputRows(*unknown((q0, v0, multipliers), many), jnp.full(many, NO_PHASE, jnp.int32), of_modes)
     switches = switches_before_any(hybrid, q0, v0, None if phase.meeting is None else phase.meeting.laws)
     # A motion in no phase would never end.
     first, phases = jnp.asarray(hybrid.first, jnp.int32), len(hybrid.systems)
     exists, refused = (first >= 0) & (first < phases), RESULTS.no_such_phase
-    if met is not None and phase.meeting is not None:
-        met = met._replace(allowed=met.allowed & phase.meeting.laws.allow(ts[0], params))
-        exists, refused = met.found & met.presses & met.allowed, _obeyed(met, RESULTS.no_contact_forces)
-        known = all_finite((q0, v0))
-        exists, refused = exists & known, RESULTS.where(known, refused, RESULTS.start_not_finite)
-    known = jax.tree.map(lambda x: jnp.where(exists, x, jnp.nan), (q0, v0))
+    if phase.meeting is not None:
+        known, allowed = all_finite((q0, v0)), phase.meeting.laws.allow(ts[0], params)
+        exists, refused = known & allowed, RESULTS.where(known, RESULTS.element_refused, RESULTS.start_not_finite)
+    begins = jnp.asarray(phase.meeting is not None)
+    known = jax.tree.map(lambda x: jnp.where(exists & ~begins, x, jnp.nan), (q0, v0))
     start = Snapshot(ts[0], *known, unknown(multipliers))
     zero, least = jnp.asarray(0), jnp.zeros((2, model.n), dtype) if settings.by_size else settings.atol
     stats = {name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
@@ -243,7 +247,7 @@ def _first_leg(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array
         switches=switches, events=nothing(phase.guards, phase.events, q0, v0, start.multipliers), end=start,
         stats=stats, sizes_so_far=sizes_of(q0, v0), least=least,
         scaled_error=jnp.where(exists, jnp.zeros((), dtype), jnp.inf), settled=jnp.asarray(True),
-        result=RESULTS.where(exists, RESULTS.successful, refused), modes=modes,
+        result=RESULTS.where(exists, RESULTS.successful, refused), modes=modes, begins=begins,
     )  # fmt: skip
 
 
@@ -268,14 +272,16 @@ def _leg(
     until = phase.until(way.modes, ts, params)
     system, params = hybrid.systems[i], phase.given(params, way.modes)
     ahead, place = outputs_ahead(ts, way.t)
+    begins = in_phase & way.begins
     # Lanes in other phases stand still.
-    times = jnp.where(in_phase, jnp.minimum(ahead, until), way.t)
+    times = jnp.where(in_phase & ~begins, jnp.minimum(ahead, until), way.t)
     settings = settings if system.constraints else replace(settings, drift="none")
     forced = None if phase.meeting is None else phase.meeting.forced
     found = apart(
         solved, system, way.q, way.v, params, times, phase.guards, settings, adjoint, way.sizes_so_far, forced
     )
     result, end, onward, events = found["result"], found["end"], jnp.asarray(False), found["events"]
+    result = RESULTS.where(begins, RESULTS.successful, result)
     after, target, switches = After(way.q, way.v, jnp.asarray(False), way.modes), way.phase, way.switches
     rows, known = {name: found[name] for name in ROWS}, (ts > way.t) & (ts <= end.t)
     if phase.meeting is not None:
@@ -284,21 +290,22 @@ def _leg(
         acting = jax.vmap(partial(laws.acting, given=params))(*every)
         rows["multipliers"] = rows["multipliers"] | {name: x[:-1] for name, x in acting.items()}
         end = end._replace(multipliers=end.multipliers | {name: x[-1] for name, x in acting.items()})
-    instant = in_phase & jnp.isfinite(until) & (result == RESULTS.successful)
-    if phase.guards is not None and phase.switches or phase.has_instants:
+    instant = in_phase & ~begins & jnp.isfinite(until) & (result == RESULTS.successful)
+    if phase.guards is not None and phase.switches or phase.meeting is not None:
         count, terminal = len(phase.switches), () if phase.guards is None else phase.guards.terminal
         crossings = [] if phase.guards is None else [events[kind.name] for kind in phase.guards.kinds]
         when = [jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings]
         of_events = [t for t, ends in zip(when[count:], terminal[count:]) if ends]
         when = [*when[:count], *[jnp.where(instant, until, jnp.inf)] * phase.has_instants]
         uncertain = in_phase & reduce(jnp.logical_or, (x.uncertain for x in crossings[:count]), jnp.asarray(False))
-        times_of = jnp.stack(when), jnp.stack([*of_events, jnp.asarray(jnp.inf, ts.dtype)])
+        never = jnp.asarray(jnp.inf, ts.dtype)
+        times_of = jnp.stack(when or [never]), jnp.stack([*of_events, never])
         ending = apart(
             _ending, phase, result, end, times_of, in_phase, instant, way, params, resolution(ts), settings.rtol
         )  # fmt: skip
         result, end, onward = ending.result, ending.end, ending.onward
-        after, target, new = apart(_switched, system, ending, params, phase, way.sizes_so_far, instant)
-        switches = _recorded(way.switches, onward, new, together=len(hybrid.systems) == 1)
+        after, target, new = apart(_switched, system, ending, params, phase, way.sizes_so_far, instant, begins)
+        switches = _recorded(way.switches, onward & ~begins, new, together=len(hybrid.systems) == 1)
         switches = eqx.tree_at(lambda s: s.uncertain, switches, switches.uncertain | uncertain)
         # A motion in the wrong phase is wrong from that phase's start on, its first output included.
         invalid = in_phase & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
@@ -307,10 +314,11 @@ def _leg(
         if after.found is not None:
             result = RESULTS.where(onward, _obeyed(after, result), result)
             onward = onward & after.found & after.presses & after.allowed
-        broken = onward & ~all_finite((after.q, after.v))
-        result, onward = RESULTS.where(broken, RESULTS.reset_not_finite, result), onward & ~broken
+        broken = (onward | begins) & ~all_finite((after.q, after.v))
+        why = RESULTS.where(begins, RESULTS.start_not_finite, RESULTS.reset_not_finite)
+        result, onward = RESULTS.where(broken, why, result), onward & ~broken
     rows = jax.tree.map(lambda x: x[place], rows)
-    known = known | (way.switches.count == 0) & (ts <= way.t)
+    known = (known | (way.switches.count == 0) & (ts <= way.t)) & ~begins
     of_modes = None if way.modes is None else way.modes.modes[None]
     if phase.has_instants:
         assert phase.meeting is not None and after.modes is not None
@@ -320,17 +328,21 @@ def _leg(
         rows["q"] = jax.tree.map(lambda x, y: jnp.where(like(new, x), y[None], x), rows["q"], after.q)
     known = known & (result != RESULTS.guard_below_zero) & reached(rows["q"])
     end = end._replace(multipliers=unknown(way.end.multipliers) | end.multipliers)
+    # Nothing is known from a leg of no length, but for the modes and velocities that fit the start.
+    sizes = jnp.where(begins, sizes_of(after.q, after.v), jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)))
+    end = where(onward, end._replace(q=after.q, v=after.v), where(begins, way.end, end))
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
+    error = jnp.maximum(way.scaled_error, found["scaled_error"])
+    stats = {name: n + found["stats"][name] for name, n in way.stats.items()}
+    least, error, stats = where(begins, (way.least, way.scaled_error, way.stats), (least, error, stats))
     further = PhaseWay(
         t=jnp.where(onward, end.t, way.t), q=where(onward, after.q, way.q), v=where(onward, after.v, way.v),
         phase=jnp.where(onward, target, way.phase), continues=onward & (end.t < ts[-1]),
         rows=_filled(way.rows, in_phase & known, rows, i, of_modes), switches=switches,
-        events=with_those_of(events, way.events),
-        end=where(onward, end._replace(q=after.q, v=after.v), end),
-        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
-        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
-        scaled_error=jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf),
-        settled=way.settled & found["settled"], result=result, modes=where(onward, after.modes, way.modes),
+        events=with_those_of(events, way.events), end=end, stats=stats, sizes_so_far=sizes, least=least,
+        scaled_error=jnp.where(ended_well(result), error, jnp.inf),
+        settled=way.settled & (found["settled"] | begins), result=result,
+        modes=where(onward, after.modes, way.modes), begins=way.begins & ~begins,
     )  # fmt: skip
     # Outputs and switches are those of before in the other lanes.
     return where(in_phase, further, way)._replace(rows=further.rows, switches=further.switches)
@@ -362,15 +374,16 @@ def _ending(
     # An event that ends the motion at the time of a switch comes first.
     when, of_events = times
     by_event = jnp.any(of_events <= jnp.min(when) + at_one_time)
-    switched = in_phase & ((result == RESULTS.event_occurred) & ~by_event | instant)
+    begins = in_phase & way.begins
+    switched = in_phase & ((result == RESULTS.event_occurred) & ~by_event | instant | begins)
     at_once = switched & (end.t - way.t <= at_one_time)
     # A switch at once happens where the leg begins, so that its time has the derivatives of that.
     t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
     end = Snapshot(t, q, v, end.multipliers)
     below = is_below(end, params, phase.guards, len(phase.switches), rtol)
     refused, full = at_once & at_start & below, way.switches.count >= way.switches.t.shape[0]
-    missed = (result == RESULTS.successful) & below
-    onward = switched & ~refused & ~full & ~missed
+    missed = (result == RESULTS.successful) & below & ~begins
+    onward = begins | switched & ~refused & ~full & ~missed
     failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
     result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
     result = RESULTS.where(onward, RESULTS.successful, result)
@@ -416,7 +429,10 @@ class After(NamedTuple):
     allowed: Bool[Array, ""] | None = None
 
 
-def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array):
+def _switched(
+    system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array,
+    begins: Array,
+):  # fmt: skip
     """Return the state after the phase's first switch, the next phase, and the fields of that switch."""
     _, first, end, _ = ending
     if phase.meeting is None:
@@ -425,7 +441,7 @@ def _switched(system: System, ending: PhaseEnding, params: PyTree, phase: Phase,
         after = jax.tree.map(lambda *x: _one_of(first, x), *states)
     else:
         sizes = jnp.maximum(sizes_so_far, sizes_of(end.q, end.v))
-        q, met, number = phase.meeting(end, params, sizes, instant)
+        q, met, number = phase.meeting(end, params, sizes, instant, begins)
         first = jnp.zeros_like(first)
         after = After(q, met.v, jnp.asarray(False), Modes(met.modes, met.slack), met.found, met.presses, met.allowed)
     momentum = partial(jax.grad(system.lagrangian, argnums=2), end.t)
