@@ -103,11 +103,11 @@ def worst_residual(model: Model, t: Array, q: PyTree, v: PyTree, given: InModes 
 
     def at(t: Array, q: PyTree, v: PyTree, row: InModes | None):
         here = equations if row is None else equations_of(model.of(given_in(row, model.params.params)))
-        return *residuals_and_slopes(here, t, q, v), level_size(jnp.stack(model.vectors(q, v)))
+        return *residuals_and_slopes(here, t, q, v), jnp.maximum(level_size(jnp.stack(model.vectors(q, v))), least)
 
     residual, slope, size = jax.vmap(at)(t, q, v, given)
     # Outputs after an event or a failure are NaN and say nothing about the constraints.
-    scale = jnp.maximum(jnp.nanmax(size, axis=0, keepdims=True), least) * slope
+    scale = jnp.nanmax(size, axis=0, keepdims=True) * slope
     return jnp.nanmax(jnp.abs(residual) / jnp.where(scale > 0, scale, 1.0))
 
 
