@@ -1,10 +1,10 @@
-"""A motion over the jumps and kinks of its forces: one solve after another, each in one mode (`jumps/find.py`).
+"""A motion over the jumps and kinks of its forces: outcomes of comparisons as modes of an automaton (`legs.py`).
 
-In a mode the equations are smooth, and each leg ends where the guard of one of its comparisons is zero. There the mode
-changes and the state does not; the time and the state carry their derivatives (`event_times.py`) into the next leg,
-so that derivatives of all orders get the jump: with the flows φ₋ and φ₊ of both sides and the time τ at which a
-neighbouring motion crosses, the neighbour goes on from φ₊(-τ) φ₋(τ). If both sides push the motion back it goes along
-the jump (`integrate/jumps/sliding.py`), until a share of the mixture leaves [0, 1].
+In a mode (`jumps/find.py`) the equations are smooth, and each leg ends where the guard of one of its comparisons is
+zero. There the mode changes and the state does not; the time and the state carry their derivatives (`event_times.py`)
+into the next leg, so that derivatives of all orders get the jump: with the flows φ₋ and φ₊ of both sides and the time τ
+at which a neighbouring motion crosses, the neighbour goes on from φ₊(-τ) φ₋(τ). If both sides push the motion back it
+goes along the jump (`integrate/jumps/sliding.py`), until a share of the mixture leaves [0, 1].
 
 After very many jumps, and where a mode turns out to be wrong, the rest of the motion is integrated with the comparisons
 as they are, which is right too, with more steps and without the jumps' part of the derivatives; `stats["lost_jumps"]`
@@ -21,33 +21,34 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.events.event import LONG, Crossings, EventKind, Guards
+from lagjax.integrate.events.event import LONG, EventKind, Guards
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.integrate.settings import Settings
-from lagjax.integrate.solve.one_motion import resolution, solved
-from lagjax.integrate.solve.segments import (
+from lagjax.integrate.solve.legs import (
     AT_ONCE,
-    ROWS,
+    Leg,
+    Place,
+    Then,
+    Way,
+    before_any,
     is_below,
     nothing,
-    outputs_ahead,
     over_legs,
-    reached,
     sizes_of,
+    times_of,
     unknown,
-    with_those_of,
 )
+from lagjax.integrate.solve.one_motion import resolution
 from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import IN_TIME, apart, like, stop_gradient, where
-from lagjax.system import Model, System, model_of, warn
+from lagjax.jaxtools import IN_TIME, apart, stop_gradient, where
+from lagjax.system import System, model_of, warn
 
 # The most jumps that are followed in a motion.
 MOST_JUMPS = 1000
@@ -135,27 +136,51 @@ def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
     return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
 
 
-class ModeWay(NamedTuple):
-    """How far the legs have come, as in `segments.py`; `modes`, `slides`, `free` as in `Given`; `count` of all
-    jumps."""
+class Outcomes(NamedTuple):
+    """The mode of a motion over jumps: as in `Given`."""
 
-    t: Float[Array, ""]
-    q: PyTree[Float[Array, "..."]]
-    v: PyTree[Float[Array, "..."]]
     modes: Float[Array, " n"]
     slides: Bool[Array, " n"]
     free: Bool[Array, ""]
-    count: Int[Array, ""]
-    continues: Bool[Array, ""]
-    rows: dict[str, Any]
-    events: dict[str, Crossings]
-    end: Snapshot
-    stats: dict[str, Array]
-    sizes_so_far: Array
-    least: Array
-    scaled_error: Float[Array, ""]
-    settled: Bool[Array, ""]
-    result: Any
+
+
+class OverJumps(Place):
+    """The modes of a piecewise system, in a motion over `ts`; the first guards are theirs."""
+
+    def __init__(self, piecewise: Piecewise, guards: Guards, ts: Array, settings: Settings):
+        self.piecewise, self.guards, self.ts, self.settings = piecewise, guards, ts, settings
+        self.system = piecewise.smooth
+
+    def given(self, params: PyTree, mode: Outcomes) -> Given:
+        return Given(params, *mode)
+
+    def until(self, ahead: Float[Array, " T"], way: Way) -> Float[Array, " T"]:
+        if not self.piecewise.pauses or self.settings.jump_ts is None:
+            return ahead
+        # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
+        # derivative is one half for an output at that time.
+        pause = _next(self.settings.jump_ts, way.t, resolution(self.ts))
+        return jnp.where(ahead > pause, pause, ahead)
+
+    def then(self, leg: Leg) -> Then:
+        """What follows a leg: the mode beyond a comparison; the same, after a pause; or the same leg without modes."""
+        way, given, ts, (modes, slides, free) = leg.way, leg.given, self.ts, leg.way.mode
+        when, of_events = times_of(self.guards, leg.events, len(self.piecewise.guards), ts.dtype)
+        ends = leg.result, leg.end, jnp.stack(when), of_events, way, given, ts, self.settings
+        ending = apart(_ending, self.piecewise, self.guards, *ends)
+        onward = leg.here & ending.onward
+        paused = leg.here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (ending.end.t < ts[-1])
+        # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
+        beyond, along = apart(_beyond, self.piecewise, ending.first, leg.end, given)
+        again = leg.here & ending.wrong
+        mode = Outcomes(
+            jnp.where(onward, beyond, modes), jnp.where(onward, along, slides),
+            free | again | (onward & (way.count + 1 >= MOST_JUMPS)),
+        )  # fmt: skip
+        end, at_first = ending.end, way.t <= ts[0]
+        return Then(
+            onward, onward | paused, again, end, end.q, end.v, mode, None, ending.result, leg.events, leg.rows, at_first
+        )
 
 
 def solved_over_jumps(
@@ -164,27 +189,21 @@ def solved_over_jumps(
 ):  # fmt: skip
     """Return the fields of the trajectory, like `one_motion.solved`."""
     model = model_of(system, ts[0], q0, v0, params)
-    small = model.n + model.m <= 24
-    piecewise = piecewise_of(jumps, system, small)
+    piecewise = piecewise_of(jumps, system, small=model.n + model.m <= 24)
     modes = stop_gradient(jumps.modes(system, ts[0], q0, v0, params))
-    both = _together(piecewise, guards)
-    first = _first(model, q0, v0, ts, guards, modes, settings)
-
-    def next_leg(way: ModeWay) -> ModeWay:
-        return _leg(piecewise, both, guards, way, params, ts, settings, adjoint)
-
+    mode = Outcomes(modes, jnp.zeros(modes.shape, bool), jnp.asarray(False))
+    multipliers, sizes = unknown(model.zero_multipliers()), sizes_of(q0, v0)
+    # A motion that rests at zero, held by friction, has round-off alone to tell its size.
+    sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
+    start, names = Snapshot(ts[0], q0, v0, multipliers), () if guards is None else [kind.name for kind in guards.kinds]
+    rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, ts.shape[0])
+    events = nothing(guards, names, q0, v0, multipliers)
+    first = before_any(start, start, mode, sizes, settings, rows, events)
     turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
-    way = over_legs(next_leg, lambda way: way.count <= MOST_JUMPS, first, turns, adjoint)
-    return {
-        **way.rows,
-        "end": way.end,
-        "stats": way.stats | {"num_jumps": way.count, "lost_jumps": way.free},
-        "tolerance": (settings.rtol, way.least),
-        "scaled_error": way.scaled_error,
-        "result": way.result,
-        "settled": way.settled,
-        "events": way.events,
-    }
+    place = OverJumps(piecewise, _together(piecewise, guards), ts, settings)
+    way = over_legs([place], first, params, ts, lambda place: settings, adjoint, MOST_JUMPS, turns)
+    stats = way.stats | {"num_jumps": way.count, "lost_jumps": way.mode.free}
+    return way.fields(settings) | {"stats": stats}
 
 
 def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
@@ -197,67 +216,6 @@ def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
     if guards is None:
         return Guards(piecewise.guards, kinds)
     return Guards((*piecewise.guards, *map(OfParams, guards.functions)), (*kinds, *guards.kinds))
-
-
-def _first(model: Model, q0: PyTree, v0: PyTree, ts: Array, guards, modes: Array, settings: Settings) -> ModeWay:
-    dtype, many = ts.dtype, ts.shape[0]
-    multipliers = unknown(model.zero_multipliers())
-    rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, many)
-    sizes, zero = sizes_of(q0, v0), jnp.asarray(0)
-    # A motion that rests at zero, held by friction, has round-off alone to tell its size.
-    sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
-    names = () if guards is None else [kind.name for kind in guards.kinds]
-    return ModeWay(
-        t=ts[0], q=q0, v=v0, modes=modes, slides=jnp.zeros(modes.shape, bool), free=jnp.asarray(False), count=zero,
-        continues=jnp.asarray(True), rows=rows, events=nothing(guards, names, q0, v0, multipliers),
-        end=Snapshot(ts[0], q0, v0, multipliers),
-        stats={name: zero for name in ("num_steps", "num_accepted_steps", "num_rejected_steps")},
-        sizes_so_far=sizes, least=jnp.zeros_like(sizes) if settings.by_size else settings.atol,
-        scaled_error=jnp.zeros((), dtype), settled=jnp.asarray(True), result=RESULTS.successful,
-    )  # fmt: skip
-
-
-def _leg(
-    piecewise: Piecewise, guards: Guards, recorded, way: ModeWay, params: PyTree, ts: Array, settings: Settings,
-    adjoint: Any,
-) -> ModeWay:  # fmt: skip
-    """Return the way after one more leg."""
-    (ahead, place), here = outputs_ahead(ts, way.t), way.continues
-    times = jnp.where(here, ahead, way.t)
-    if piecewise.pauses and settings.jump_ts is not None:
-        # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
-        # derivative is one half for an output at that time.
-        pause = _next(settings.jump_ts, way.t, resolution(ts))
-        times = jnp.where(times > pause, pause, times)
-    given = Given(params, way.modes, way.slides, way.free)
-    found = apart(solved, piecewise.smooth, way.q, way.v, given, times, guards, settings, adjoint, way.sizes_so_far)
-    crossings = [found["events"][kind.name] for kind in guards.kinds]
-    when = jnp.stack([jnp.where(jnp.isfinite(x.t[0]), x.t[0], jnp.inf) for x in crossings])
-    ending = apart(_ending, piecewise, guards, found["result"], found["end"], when, way, given, ts, settings)
-    end, onward = ending.end, here & ending.onward
-    paused = here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (end.t < ts[-1])
-    # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
-    modes, slides = apart(_beyond, piecewise, ending.first, found["end"], given)
-    moves = onward | paused
-    # What a leg found whose mode was wrong does not count.
-    counts = here & ~ending.wrong
-    rows = jax.tree.map(lambda x: x[place], {name: found[name] for name in ROWS})
-    known = ((ts > way.t) & (ts <= end.t) | (way.t <= ts[0]) & (ts <= way.t)) & reached(rows["q"])
-    rows = jax.tree.map(lambda x, y: jnp.where(like(counts & known, x), y, x), way.rows, rows)
-    least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
-    again = here & ending.wrong
-    further = way._replace(
-        t=jnp.where(moves, end.t, way.t), q=where(moves, end.q, way.q), v=where(moves, end.v, way.v),
-        modes=jnp.where(onward, modes, way.modes), slides=jnp.where(onward, slides, way.slides),
-        free=way.free | again | (onward & (way.count + 1 >= MOST_JUMPS)), count=way.count + onward,
-        continues=again | (moves & (end.t < ts[-1])), rows=rows,
-        events=where(counts, with_those_of(found["events"], way.events), way.events), end=where(counts, end, way.end),
-        stats={name: n + found["stats"][name] for name, n in way.stats.items()},
-        sizes_so_far=jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v)), least=least,
-        scaled_error=jnp.where(counts, jnp.maximum(way.scaled_error, found["scaled_error"]), way.scaled_error),
-        settled=way.settled & found["settled"], result=RESULTS.where(again, RESULTS.successful, ending.result),
-    )  # fmt: skip
-    return where(here, further, way)
 
 
 def _next(jump_ts, t: Array, resolution: Array):
@@ -277,14 +235,14 @@ class ModeEnding(NamedTuple):
 
 
 def _ending(
-    piecewise, guards: Guards, result, end: Snapshot, when: Array, way: ModeWay, given, ts: Array, settings: Settings
-) -> ModeEnding:
-    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not."""
+    piecewise: Piecewise, guards: Guards, result, end: Snapshot, when: Array, of_events: Array, way: Way, given: Given,
+    ts: Array, settings: Settings,
+) -> ModeEnding:  # fmt: skip
+    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not;
+    `of_events`: the first of an event that ends the motion."""
     count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
     # An event of the user's that ends the motion at the time of a jump comes first.
-    ends = jnp.where(guards.terminal, when, jnp.inf)[count:]
-    when = when[:count]
-    by_event = jnp.any(ends <= jnp.min(when) + at_one_time)
+    by_event = of_events <= jnp.min(when) + at_one_time
     onward = (result == RESULTS.event_occurred) & ~by_event
     at_once = onward & (end.t - way.t <= at_one_time)
     # A jump at once happens where the leg begins, so that its time has the derivatives of that.
@@ -293,7 +251,7 @@ def _ending(
     # Where a force jumps in time, the side of which a guard is belongs to the next leg.
     whole = end.t >= last
     below = ended_well(result) & ~onward & whole & is_below(end, given, guards, count, settings.rtol)
-    wrong = ~way.free & (
+    wrong = ~given.free & (
         below | ~ended_well(result) & (result != RESULTS.max_steps_reached) & (result != RESULTS.no_progress)
     )
     result = RESULTS.where(onward, RESULTS.successful, result)

@@ -1,6 +1,6 @@
 """The compiled program behind `integrate`: the choice of the program and of the method, and the cache of programs.
 
-The program itself is in `one_motion.py`, and for motions in phases in `segments.py`.
+The program itself is in `one_motion.py`, and the loop of motions in modes in `legs.py`.
 
 Of a kind of motion there are two programs, of which the second is compiled only if the first is not enough. One program
 with the robust way as a branch (`lax.cond`) gives the first answer of a pendulum on a rod after 3.0 times that of bare
@@ -31,7 +31,7 @@ from lagjax.integrate.solve.error_estimate import with_errors, with_errors_insid
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost
-from lagjax.integrate.solve.segments import solved_in_legs
+from lagjax.integrate.solve.segments import solved_in_phases
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.trajectory import Trajectory
@@ -173,7 +173,7 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     jumps = None if settings.jumps == "ignored" else followed(settings, model, start)
     in_time = jumps if jumps is not None and jumps.in_time else None
     jumps = jumps if jumps is not None and jumps.count else None
-    solve = solved_in_legs if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
+    solve = solved_in_phases if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
 
     def solve_arrays(x, fixed, adjoint: Any, differentiated):
         rest, settings = eqx.combine(fixed, static)

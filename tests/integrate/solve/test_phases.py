@@ -8,7 +8,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.solve.phases import phases_in, traced_phases
-from lagjax.integrate.solve.segments import _first_leg
+from lagjax.integrate.solve.segments import _first
 from lagjax.system import coordinates
 
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
@@ -32,8 +32,8 @@ def test_a_number_that_no_phase_has():
     def begin(q, start):
         state = coordinates.state(0.0, q, 0.0, {"g": 10.0})
         system = traced_phases(hybrid.starting(start), state)
-        way = _first_leg(system, *state[1:], TS, phases_in(system, state, {})[0], settings)
-        return way.phase, way.continues, way.result._value, way.end.q, way.q
+        way = _first(system, *state[1:], TS, phases_in(system, state, {})[0], settings)
+        return way.mode.phase, way.continues, way.result._value, way.end.q, way.q
 
     phase, continues, result, end, _ = begin(np.array([5.0, 0.0, 5.0, 5.0]), np.array([0, 1, 7, -1]))
     np.testing.assert_array_equal(phase, [0, 1, 1, 0])
