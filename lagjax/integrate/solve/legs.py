@@ -252,8 +252,34 @@ def times_of(guards: Guards | None, events: dict[str, Crossings], count: int, dt
     return when[:count], jnp.min(jnp.stack([*ends, never]))
 
 
-def is_below(end: Snapshot, params: PyTree, guards: Guards | None, count: int, rtol: Array):
-    """Whether one of the first `count` guards is below zero by more than errors can cause."""
+class Ending(NamedTuple):
+    """How a leg ends: whether it is `by_guard`, of those that end its mode the `first`, or was `asked` to end; whether
+    that is `at_once`, where it began; whether such a guard is `below` zero by more than errors can cause."""
+
+    by_guard: Bool[Array, ""]
+    first: Int[Array, ""]
+    at_once: Bool[Array, ""]
+    below: Bool[Array, ""]
+    end: Snapshot
+
+
+def ending_of(
+    guards: Guards | None, count: int, leg: Leg, when: Array, of_events: Array, asked: Bool[Array, ""] | bool,
+    resolution: Array, rtol: Array,
+) -> Ending:  # fmt: skip
+    """How a leg ends. `when`: the times at which its first `count` guards cross, and others at which it was `asked` to
+    end; infinite for those that do not. `of_events`: the first of an event that ends the motion."""
+    at_one_time, (t, q, v, multipliers), way = AT_ONCE * resolution, leg.end, leg.way
+    # An event that ends the motion at the time of a change comes first.
+    by_guard = (leg.result == RESULTS.event_occurred) & ~(of_events <= jnp.min(when) + at_one_time) | asked
+    at_once = by_guard & (t - way.t <= at_one_time)
+    # A change at once happens where the leg begins, so that its time has the derivatives of that.
+    end = Snapshot(*where(at_once, (way.t, way.q, way.v), (t, q, v)), multipliers)
+    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
+    return Ending(by_guard, first, at_once, _is_below(end, leg.given, guards, count, rtol), end)
+
+
+def _is_below(end: Snapshot, params: PyTree, guards: Guards | None, count: int, rtol: Array):
     if guards is None or not count:
         return jnp.asarray(False)
     state = stop_gradient(tuple(end))

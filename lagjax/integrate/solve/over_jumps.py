@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.events.event import LONG, EventKind, Guards
 from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
@@ -35,7 +35,7 @@ from lagjax.integrate.solve.legs import (
     Then,
     Way,
     before_any,
-    is_below,
+    ending_of,
     nothing,
     over_legs,
     sizes_of,
@@ -47,7 +47,7 @@ from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import IN_TIME, apart, stop_gradient, where
+from lagjax.jaxtools import IN_TIME, apart, stop_gradient
 from lagjax.system import System, model_of, warn
 
 # The most jumps that are followed in a motion.
@@ -164,23 +164,26 @@ class OverJumps(Place):
 
     def then(self, leg: Leg) -> Then:
         """What follows a leg: the mode beyond a comparison; the same, after a pause; or the same leg without modes."""
-        way, given, ts, (modes, slides, free) = leg.way, leg.given, self.ts, leg.way.mode
-        when, of_events = times_of(self.guards, leg.events, len(self.piecewise.guards), ts.dtype)
-        ends = leg.result, leg.end, jnp.stack(when), of_events, way, given, ts, self.settings
-        ending = apart(_ending, self.piecewise, self.guards, *ends)
-        onward = leg.here & ending.onward
-        paused = leg.here & (ending.result == RESULTS.successful) & ~onward & ~ending.wrong & (ending.end.t < ts[-1])
+        way, given, (modes, slides, free), guards = leg.way, leg.given, leg.way.mode, self.piecewise.guards
+        last, options = self.ts[-1], (resolution(self.ts), self.settings.rtol)
+        when, of_events = times_of(self.guards, leg.events, len(guards), last.dtype)
+        by_jump, first, _, below, end = apart(
+            ending_of, self.guards, len(guards), leg, jnp.stack(when), of_events, False, *options
+        )
+        ends_well, whole = ended_well(leg.result), end.t >= last
+        gives_up = (leg.result == RESULTS.max_steps_reached) | (leg.result == RESULTS.no_progress)
+        # Where a force jumps in time, the side of which a guard is belongs to the next leg.
+        again = leg.here & ~free & (ends_well & ~by_jump & whole & below | ~ends_well & ~gives_up)
+        onward, result = leg.here & by_jump, RESULTS.where(by_jump, RESULTS.successful, leg.result)
+        paused = leg.here & (result == RESULTS.successful) & ~onward & ~again & ~whole
         # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
-        beyond, along = apart(_beyond, self.piecewise, ending.first, leg.end, given)
-        again = leg.here & ending.wrong
+        beyond, along = apart(_beyond, self.piecewise, first, leg.end, given)
         mode = Outcomes(
             jnp.where(onward, beyond, modes), jnp.where(onward, along, slides),
             free | again | (onward & (way.count + 1 >= MOST_JUMPS)),
         )  # fmt: skip
-        end, at_first = ending.end, way.t <= ts[0]
-        return Then(
-            onward, onward | paused, again, end, end.q, end.v, mode, None, ending.result, leg.events, leg.rows, at_first
-        )
+        moves, at_first = onward | paused, way.t <= self.ts[0]
+        return Then(onward, moves, again, end, end.q, end.v, mode, None, result, leg.events, leg.rows, at_first)
 
 
 def solved_over_jumps(
@@ -221,42 +224,6 @@ def _together(piecewise: Piecewise, guards: Guards | None) -> Guards:
 def _next(jump_ts, t: Array, resolution: Array):
     """The next of the times of jumps."""
     return jnp.min(jnp.where(jump_ts > t + AT_ONCE * resolution, jump_ts, jnp.inf))
-
-
-class ModeEnding(NamedTuple):
-    """How a leg ends: `onward`: a mode changes, the one with the number `first`; `wrong`: the leg is to be repeated
-    with the comparisons as they are."""
-
-    onward: Bool[Array, ""]
-    wrong: Bool[Array, ""]
-    first: Int[Array, ""]
-    end: Snapshot
-    result: Any
-
-
-def _ending(
-    piecewise: Piecewise, guards: Guards, result, end: Snapshot, when: Array, of_events: Array, way: Way, given: Given,
-    ts: Array, settings: Settings,
-) -> ModeEnding:  # fmt: skip
-    """Find out what ends a leg; `when`: the times at which its guards cross, infinite for those that do not;
-    `of_events`: the first of an event that ends the motion."""
-    count, at_one_time, last = len(piecewise.guards), AT_ONCE * resolution(ts), ts[-1]
-    # An event of the user's that ends the motion at the time of a jump comes first.
-    by_event = of_events <= jnp.min(when) + at_one_time
-    onward = (result == RESULTS.event_occurred) & ~by_event
-    at_once = onward & (end.t - way.t <= at_one_time)
-    # A jump at once happens where the leg begins, so that its time has the derivatives of that.
-    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
-    end = Snapshot(t, q, v, end.multipliers)
-    # Where a force jumps in time, the side of which a guard is belongs to the next leg.
-    whole = end.t >= last
-    below = ended_well(result) & ~onward & whole & is_below(end, given, guards, count, settings.rtol)
-    wrong = ~given.free & (
-        below | ~ended_well(result) & (result != RESULTS.max_steps_reached) & (result != RESULTS.no_progress)
-    )
-    result = RESULTS.where(onward, RESULTS.successful, result)
-    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-    return ModeEnding(onward, wrong, first, end, result)
 
 
 def _beyond(piecewise: Piecewise, first: Array, end: Snapshot, given: Given):

@@ -19,13 +19,13 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
-    AT_ONCE,
+    Ending,
     Leg,
     Place,
     Then,
     Way,
     before_any,
-    is_below,
+    ending_of,
     nothing,
     over_legs,
     sizes_of,
@@ -136,13 +136,21 @@ class InPhase(Place):
             when = jnp.stack([*when, jnp.where(instant, until, jnp.inf)])
             kinds = () if phase.guards is None else phase.guards.kinds[:count]
             uncertain = here & reduce(jnp.logical_or, (events[x.name].uncertain for x in kinds), jnp.asarray(False))
+            leg = leg._replace(result=result, end=end)
             ending = apart(
-                _ending, phase, result, end, when, of_events, here, instant, leg.begins, way, given, resolution(ts),
+                ending_of, phase.guards, count, leg, when, of_events, instant | leg.begins, resolution(ts),
                 self.settings.rtol,
             )  # fmt: skip
-            result, end, onward = ending.result, ending.end, ending.onward
-            switched = ending, given, phase, way.sizes_so_far, instant, leg.begins
-            after, target, new = apart(_switched, self.system, *switched)
+            switched, end, below = here & ending.by_guard, ending.end, ending.below & ~leg.begins
+            refused, full = ending.at_once & (way.count == 0) & below, way.count >= way.record.t.shape[0]
+            missed = (result == RESULTS.successful) & below
+            onward = leg.begins | switched & ~refused & ~full & ~missed
+            failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
+            result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
+            result = RESULTS.where(onward, RESULTS.successful, result)
+            after, target, new = apart(
+                _switched, self.system, ending, given, phase, way.sizes_so_far, instant, leg.begins
+            )
             together = len(self.hybrid.systems) == 1
             record = _recorded(way.record, way.count, onward & ~leg.begins, new, together)
             record = eqx.tree_at(lambda s: s.uncertain, record, record.uncertain | uncertain)
@@ -243,41 +251,6 @@ def _obeyed(met: Any, otherwise: Any):
     return RESULTS.where(met.allowed, result, RESULTS.element_refused)
 
 
-class PhaseEnding(NamedTuple):
-    """How a leg ends: `onward`: whether another one follows; `first`: by which of the phase's switches; the result."""
-
-    onward: Bool[Array, ""]
-    first: Int[Array, ""]
-    end: Snapshot
-    result: Any
-
-
-def _ending(
-    phase: Phase, result, end: Snapshot, when: Array, of_events: Array, here: Array, instant: Array, begins: Array,
-    way: Way, params: PyTree, resolution: Array, rtol: Array,
-) -> PhaseEnding:  # fmt: skip
-    """Find out what ends a leg; `when`: the times at which its guards cross, and that of the instant, infinite for
-    those that do not; `of_events`: the first of an event that ends the motion; `instant`: whether it ends at one of a
-    sampled control."""
-    at_one_time, at_start = AT_ONCE * resolution, way.count == 0
-    # An event that ends the motion at the time of a switch comes first.
-    by_event = of_events <= jnp.min(when) + at_one_time
-    switched = here & ((result == RESULTS.event_occurred) & ~by_event | instant | begins)
-    at_once = switched & (end.t - way.t <= at_one_time)
-    # A switch at once happens where the leg begins, so that its time has the derivatives of that.
-    t, q, v = where(at_once, (way.t, way.q, way.v), (end.t, end.q, end.v))
-    end = Snapshot(t, q, v, end.multipliers)
-    below = is_below(end, params, phase.guards, len(phase.switches), rtol)
-    refused, full = at_once & at_start & below, way.count >= way.record.t.shape[0]
-    missed = (result == RESULTS.successful) & below & ~begins
-    onward = begins | switched & ~refused & ~full & ~missed
-    failed = RESULTS.where(refused, RESULTS.guard_below_zero, RESULTS.too_many_switches)
-    result = RESULTS.where(missed, RESULTS.guard_not_seen, RESULTS.where(switched, failed, result))
-    result = RESULTS.where(onward, RESULTS.successful, result)
-    first = jnp.argmax(when <= jnp.min(when) + at_one_time)
-    return PhaseEnding(onward, first, end, result)
-
-
 class After(NamedTuple):
     """The state after a switch; with elements, their modes, and whether there are any."""
 
@@ -291,11 +264,11 @@ class After(NamedTuple):
 
 
 def _switched(
-    system: System, ending: PhaseEnding, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array,
+    system: System, ending: Ending, params: PyTree, phase: Phase, sizes_so_far: Array, instant: Array,
     begins: Array,
 ):  # fmt: skip
     """Return the state after the phase's first switch, the next phase, and the fields of that switch."""
-    _, first, end, _ = ending
+    first, end = ending.first, ending.end
     if phase.meeting is None:
         number = jnp.asarray(phase.switches, jnp.int32)[first]
         states = [After(*reset(end.t, end.q, end.v, end.multipliers, params)) for reset in phase.resets]
