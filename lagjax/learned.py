@@ -88,9 +88,15 @@ class Network(eqx.Module):
             raise ValueError(f"angles names {listed(unknown)}, but the coordinates are {listed(names)}.")
         _check_activation(activation)
         self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in accepted_names)
-        mlp = eqx.nn.MLP(len(flat) + sum(self.angular), out or "scalar", width, depth, activation, key=key)
-        last = jax.tree.map(lambda x: first * x, mlp.layers[-1])
-        self.mlp = eqx.tree_at(lambda mlp: mlp.layers[-1], mlp, last)
+        takes = len(flat) + sum(self.angular)
+
+        # One program: JAX's random numbers one by one take XLA a second.
+        @eqx.filter_jit
+        def drawn(key):
+            mlp = eqx.nn.MLP(takes, out or "scalar", width, depth, activation, key=key)
+            return eqx.tree_at(lambda mlp: mlp.layers[-1], mlp, jax.tree.map(lambda x: first * x, mlp.layers[-1]))
+
+        self.mlp = drawn(key)
 
     def __call__(self, q: PyTree[ArrayLike]) -> Array:
         """The network at coordinates `q`: a scalar, or `(out,)`."""
@@ -270,9 +276,8 @@ def _times(t: ArrayLike, q: PyTree) -> Array:
 
 def _check_activation(activation: Callable):
     with jax.ensure_compile_time_eval():
-        curvature = jax.vmap(jax.grad(jax.grad(lambda x: activation(x))))
-        at = np.asarray(curvature(jnp.asarray(CHECKED_AT)))
-        nearby = np.asarray(curvature(jnp.asarray(CHECKED_AT + DISTANCE)))
+        curvature = jax.jit(jax.vmap(jax.grad(jax.grad(lambda x: activation(x)))))
+        at, nearby = (np.asarray(curvature(x)) for x in (CHECKED_AT, CHECKED_AT + DISTANCE))
     if not np.all(np.isfinite(at)):
         raise ValueError(
             f"the activation {activation!r:.60} has no finite curvature at {CHECKED_AT[~np.isfinite(at)][0]:g}.\n"

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import NamedTuple, overload
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
@@ -212,18 +213,24 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     assembly, found = traced_phases(system, s), _explain(replace(system, elements=None), s)
     laws, met = assembly.laws, modes_at(assembly, s)
     kinds = dict(zip(laws.names, laws.modes_in_words(np.asarray(met.modes))))
-    given = assembly.given(s.params, met.modes)
-    model = model_of(assembly.systems[0], *s[:3], given)
-    values = np.asarray(laws.last(s.t, s.q, met.v, model.zero_multipliers(), given))
+
+    # One program: the operations one by one take XLA a second.
+    @jax.jit
+    def at(t, q, v, modes):
+        here, open_ones = assembly.given(s.params, modes), assembly.given(s.params)
+        model = model_of(assembly.systems[0], t, q, v, here)
+        x, u = model.vectors(q, v)
+        held = [constraints.jacobian(model.of(given), t, x, u) for given in (here, open_ones)]
+        return laws.last(t, q, v, model.zero_multipliers(), here), laws.holds(modes), held
+
+    values, holds, held = jax.tree.map(np.asarray, at(s.t, s.q, met.v, met.modes))
     now = [
         f"{name} {mode}" + (f" (gap {value:.6g})" if mode == "open" else "")
         for (name, mode), value in zip_longest(kinds.items(), values)
     ]
-    both, state = (given, assembly.given(s.params)), (s.t, *model.vectors(s.q, met.v))
-    held = [constraints.jacobian(model.of(modes), *state) for modes in both]
-    here, open_rank = (int(np.linalg.matrix_rank(np.asarray(rows))) for rows in held)
+    here, open_rank = (int(np.linalg.matrix_rank(rows)) for rows in held)
     free = found.degrees_of_freedom - here + open_rank
-    equations = int(np.sum(laws.holds(met.modes))) + laws.equations - len(laws.rows)
+    equations = int(np.sum(holds)) + laws.equations - len(laws.rows)
     at_once = "one after the other" if laws.impacts == "sequential" else "all at once"
     gaps, slips = laws.count
     together = f"up to {gaps + slips} forces of contacts that touch, as a complementarity problem"
@@ -304,7 +311,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         coordinates=tuple(names),
         equations=tuple(equations),
         degrees_of_freedom=free,
-        position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
+        position_freedoms=len(names) - int(jax.jit(independent_rows)(np.asarray(jacobian)[holonomic]).sum()),
         dependent=groups,
         mass_matrix=mass,
         structure=found_structure,

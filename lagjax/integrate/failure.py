@@ -73,7 +73,8 @@ def _raise(trajectory, start: State, settings: Settings, about_guards: str, wher
     result = trajectory.result
     model, start = trajectory.model, coordinates.as_arrays(start, start.t.dtype)
     if is_among(result, [RESULTS.start_off_constraints]):
-        tolerances = (START_TOLERANCES * np.asarray(tol) for tol in tolerances_at(start, trajectory.t, settings))
+        found = jax.jit(lambda start, ts: tolerances_at(start, ts, settings))(start._replace(params=None), trajectory.t)
+        tolerances = (START_TOLERANCES * np.asarray(tolerance) for tolerance in found)
         raise ValueError(where + arguments.off_constraints(model, start, *tolerances))
     if is_among(result, arguments.REFUSED):
         arguments.check_finite(start)

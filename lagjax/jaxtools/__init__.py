@@ -90,6 +90,7 @@ from lagjax.jaxtools.tracing import (
     is_traced,
     numpy_of,
     takes_for_regular,
+    to_jax,
 )
 from lagjax.jaxtools.trees import decided, like, stop_gradient, where, without_init
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
@@ -74,6 +75,12 @@ def full_products():
 def numpy_of(tree: PyTree):
     """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
     return jnp if is_traced(tree) else np
+
+
+def to_jax(x: Any) -> Array:
+    """A copy of a NumPy array as one of JAX's: `jnp.asarray` without a dtype compiles a program for each shape."""
+    x = np.array(x)
+    return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype))
 
 
 def is_traced(tree: PyTree) -> bool:

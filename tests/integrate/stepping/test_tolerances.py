@@ -19,6 +19,7 @@ from lagjax.integrate.stepping.tolerances import (
     tolerances_at,
 )
 from tests.by_hand import by_hand
+from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, TS, driven, motion, pendulum, rod_pendulum
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
@@ -195,12 +196,9 @@ def test_forces_that_cancel():
     """Round-off of accelerations a in a step h leaves 8 ε a h² and 8 ε a h, of the larger a beside a time; a start that
     is no more than that is at rest. Twin: a start a thousand times farther is none."""
     forced, eps = Forced(np.array([0.0, 1.0, 3.0]), np.array([[0.0, 2.0], [4.0, 2.0], [1.0, 0.0]])), np.finfo(float).eps
-    np.testing.assert_array_equal([forced.near(np.array(t)) for t in (0.0, 2.0, 3.0)], [[4.0, 2.0]] * 3)
-    np.testing.assert_allclose(
-        forced.left_over(np.array([4.0, 2.0]), np.array(0.1)), 8 * eps * np.array([[0.04, 0.02], [0.4, 0.2]])
-    )
-    still = [
-        scales_of(np.ones(2), size * np.ones(2), np.zeros(2), np.zeros(2), np.array(3.0), forced=forced).unknown
-        for size in (1e-16, 1e-9)
-    ]
-    assert [bool(x) for x in still] == [True, False]
+    near, left_over = by_numpy(Forced.near), by_numpy(Forced.left_over)
+    np.testing.assert_array_equal([near(forced, t) for t in (0.0, 2.0, 3.0)], [[4.0, 2.0]] * 3)
+    found = left_over(forced, np.array([4.0, 2.0]), 0.1)
+    np.testing.assert_allclose(found, 8 * eps * np.array([[0.04, 0.02], [0.4, 0.2]]))
+    scales = by_numpy(lambda q, forced: scales_of(1.0 + 0.0 * q, q, 0.0 * q, 0.0 * q, 3.0, forced=forced))
+    assert [bool(scales(size * np.ones(2), forced).unknown) for size in (1e-16, 1e-9)] == [True, False]

@@ -125,7 +125,7 @@ def test_a_million_outputs(tmp_path):
 
 def test_parameters(tmp_path):
     """All data in params come back, and networks with functions of JAX; a function of the user's is refused by name."""
-    net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
+    net = eqx.filter_jit(eqx.nn.MLP)(1, 1, 4, 1, key=jax.random.key(0))
     params = {"f": jnp.cos, "net": net, "half": np.ones(2, jnp.bfloat16), "n": 3, "x": 2.5, "who": "me", "no": None}
     params |= {"many": [True, (1, np.float32(2.0))], "inf": float("inf"), "by number": {7: np.arange(3)}}
     check(of_springs(1.0, {"of": params}), springs, tmp_path / "x.npz")
