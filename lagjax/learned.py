@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from lagjax.jaxtools import at_once
 from lagjax.mechanics import accelerations, listed, mass_matrix
 from lagjax.system import Hybrid, System, coordinates
 
@@ -275,7 +276,7 @@ def _times(t: ArrayLike, q: PyTree) -> Array:
 
 
 def _check_activation(activation: Callable):
-    with jax.ensure_compile_time_eval():
+    with at_once():
         curvature = jax.jit(jax.vmap(jax.grad(jax.grad(lambda x: activation(x)))))
         at, nearby = (np.asarray(curvature(x)) for x in (CHECKED_AT, CHECKED_AT + DISTANCE))
     if not np.all(np.isfinite(at)):

@@ -84,6 +84,7 @@ from lagjax.jaxtools.tracing import (
     SILENT,
     WATCHED,
     as_usual,
+    at_once,
     full_products,
     is_differentiated,
     is_eager,

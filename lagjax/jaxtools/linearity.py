@@ -18,6 +18,7 @@ from jax.extend.core import JaxprEqn
 from jax.typing import DTypeLike
 
 from lagjax.jaxtools.jaxpr import ADDITIVE, BILINEAR, LINEAR_IN_FIRST, ClosedJaxpr, Literal, stands_for
+from lagjax.jaxtools.tracing import at_once
 
 CONSTANT, LINEAR, OTHER = range(3)
 # Sizes of the multipliers that are tried, with random signs, and the states at which they are.
@@ -34,7 +35,7 @@ def is_linear(function: Callable, count: int, dtype: DTypeLike, rest) -> bool:
     if max(_kinds(closed, given), default=CONSTANT) < OTHER:
         return True
     # The numbers below are computed at once, also while JAX traces the caller.
-    with jax.ensure_compile_time_eval():
+    with at_once():
         return _holds(jax.jit(partial(_with_slope, function)), zero, rest)
 
 

@@ -22,6 +22,7 @@ from jax.extend.core import JaxprEqn
 from jaxtyping import Array, Bool
 
 from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
+from lagjax.jaxtools.tracing import at_once
 
 
 class SparseValue(NamedTuple):
@@ -186,7 +187,7 @@ def _by_positions(move, source, indices, equation: JaxprEqn):
     if any(x.known is None for x in indices):
         return [None]
     # Positions count from one, as zero means that nothing is taken: a gather fills float32 with NaN, made zero here.
-    with jax.ensure_compile_time_eval():
+    with at_once():
         taken = np.nan_to_num(np.asarray(move(_positions(source), *(x.known for x in indices)))).astype(int)
     taken = np.where((taken >= 0) & (taken <= source.sets.size), taken, 0)
     return [SparseValue(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
@@ -202,7 +203,7 @@ def _scatter(operands: Sequence, params: dict, equation: JaxprEqn):
     onto, indices, updates = operands
     if indices.known is None:
         return [None]
-    with jax.ensure_compile_time_eval():
+    with at_once():
         zeros, places = np.zeros(onto.sets.shape, np.float32), indices.known
 
         def add(updates: Array) -> Array:

@@ -38,6 +38,15 @@ def is_eager() -> bool:
     return get_opaque_trace_state() == _EAGER
 
 
+def at_once():
+    """A context in which what JAX is not tracing is computed, also while it traces something else.
+
+    In `jax.ensure_compile_time_eval` alone, each constant of a program that is traced there is compiled and computed by
+    itself, in thirty milliseconds: where JAX traces nothing, no context is needed.
+    """
+    return nullcontext() if is_eager() else jax.ensure_compile_time_eval()
+
+
 def as_usual(function: Callable) -> Callable:
     """The same function, with JAX's settings for finding errors off, whatever the user has set for his own code.
 

@@ -15,7 +15,7 @@ G = 9.81
 
 def angular_acceleration(body, q, a):
     """Ω' in space: of ė e* + ... only 2 vec(ë e*) has a vector part."""
-    return spin_in_space(body.pose(q).quaternion, body.rates(a).quaternion)
+    return by_numpy(spin_in_space)(body.pose(q).quaternion, body.rates(a).quaternion)
 
 
 def test_rotations():
@@ -309,8 +309,9 @@ def test_numbers_of_other_kinds():
     """Integers, and axes of any length, are taken; a function of params is checked by nobody here."""
     pose = lj.Pose.at((0, 0, 1), axis=(0, 0, 10), angle=1)
     np.testing.assert_allclose(pose.quaternion, [np.cos(0.5), 0.0, 0.0, np.sin(0.5)], atol=1e-15)
-    np.testing.assert_allclose(pose.spin(pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
-    assert a_rod(1, (1, 1, 1)).kinetic({"rod": pose}, {"rod": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5
+    spin, energy = by_numpy(lj.Pose.spin), by_numpy(a_rod(1, (1, 1, 1)).kinetic)
+    np.testing.assert_allclose(spin(pose, pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
+    assert energy({"rod": pose}, {"rod": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5
     for size in (1e-200, 1.0, 1e200):
         np.testing.assert_allclose(ROD.at(axis=(0.0, 3 * size, 4 * size)).frame[2], [0.0, 0.6, 0.8], rtol=1e-15)
     lj.rolling(ROD.at(), GROUND, lambda params: params["r"])

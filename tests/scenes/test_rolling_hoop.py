@@ -64,7 +64,7 @@ def single_evaluations():
 
 def test_closed_forms_match_the_references():
     """Forces, departures, elliptic motion and flight agree with the references to 1e-12."""
-    found = by_numpy(single_evaluations)()
+    found = single_evaluations()
     for key, value in found.items():
         assert float(value) == pytest.approx(reference(key), rel=1e-12), key
     # No key of §2 is omitted except those of slipping.

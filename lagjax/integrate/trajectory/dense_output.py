@@ -25,7 +25,7 @@ from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
-from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of
+from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of, to_jax
 from lagjax.mechanics import accelerations
 from lagjax.system import InModes, System, given_in
 
@@ -79,7 +79,7 @@ def at(trajectory, t: ArrayLike) -> Snapshot:
         if rows.size:
             here = jax.tree.map(lambda x, rows=rows: x[rows], (nodes, given))
             _fill(found, rows, trajectory, phase, *here, times[rows])
-    return jax.tree.map(lambda x: jnp.asarray(x.reshape(t.shape + x.shape[1:])), found)
+    return jax.tree.map(lambda x: to_jax(x.reshape(t.shape + x.shape[1:])), found)
 
 
 def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None, times):

@@ -4,8 +4,10 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 from jaxtyping import Array, Bool
+
+from lagjax.jaxtools import to_jax
 
 
 # Type checkers take equinox's enumerations for Python's, which cannot have more items than their parent.
@@ -93,4 +95,4 @@ def in_words(code: Any) -> str:
 
 def item(result: Any, value: Any):
     """The result with the number `value`; `result`: any known one."""
-    return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))
+    return eqx.tree_at(lambda r: r._value, result, value if isinstance(value, jax.Array) else to_jax(value))
