@@ -466,14 +466,13 @@ def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
 
 def _three(what: str, given: ArrayLike) -> Float[Array, "3"]:
     """A vector; a `ValueError` that begins with `what`, unless it has three numbers."""
-    known = not is_traced(given)
-    found = np.asarray(given, jax.dtypes.canonicalize_dtype(float)) if known else jnp.asarray(given, float)
+    found = numpy_of(given).asarray(given, jax.dtypes.canonicalize_dtype(float))
     if found.shape != (3,):
         raise ValueError(
             f"{what} must be three numbers, and has shape {found.shape}.\n"
             "Usual cause: a plane, or one number about an axis.\nFix: all of them, (0.0, 0.0, 1.0)."
         )
-    return to_jax(found) if known else found
+    return to_jax(found)
 
 
 def _check_not_traced(what: str, role: str, *given: Any):

@@ -96,7 +96,7 @@ def about(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:
     axis, half = xp.asarray(axis, dtype), xp.asarray(angle, dtype) / 2
     with np.errstate(all="ignore"):
         found = xp.concatenate([xp.cos(half)[None], xp.sin(half) * axis / xp.sqrt(xp.sum(axis**2))])
-    return to_jax(found) if xp is np else found
+    return to_jax(found)
 
 
 def quaternion_of(turned: Float[Array, "3 3"]) -> Float[Array, "4"]:

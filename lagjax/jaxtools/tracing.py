@@ -87,7 +87,9 @@ def numpy_of(tree: PyTree):
 
 
 def to_jax(x: Any) -> Array:
-    """A copy of a NumPy array as one of JAX's: `jnp.asarray` without a dtype compiles a program for each shape."""
+    """A copy of a NumPy array as one of JAX's, which stay: `jnp.asarray` without a dtype compiles for each shape."""
+    if isinstance(x, Array):
+        return x
     x = np.array(x)
     return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype))
 

@@ -4,7 +4,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 from jaxtyping import Array, Bool
 
 from lagjax.jaxtools import to_jax
@@ -95,4 +94,4 @@ def in_words(code: Any) -> str:
 
 def item(result: Any, value: Any):
     """The result with the number `value`; `result`: any known one."""
-    return eqx.tree_at(lambda r: r._value, result, value if isinstance(value, jax.Array) else to_jax(value))
+    return eqx.tree_at(lambda r: r._value, result, to_jax(value))
