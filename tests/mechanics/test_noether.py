@@ -30,13 +30,13 @@ def test_charges_in_closed_form():
         "E": lj.Generator.time_translation(),
         "screw": lj.Generator.screw("z", 0.5),
     }
-    found = jax.jit(
+    found = by_numpy(
         jax.vmap(lambda q, v: {name: lj.noether_charge(system, g)(0.0, q, v, params) for name, g in generators.items()})
     )(q, v)
     for name, value in found.items():
         np.testing.assert_allclose(value, exact[name], atol=1e-12)
     assert np.max(np.abs(found["screw"] - found["L_z"])) > 0.1
-    assert np.max(np.abs(np.asarray(found["L_z"]) + exact["L_z"])) > 0.1
+    assert np.max(np.abs(found["L_z"] + exact["L_z"])) > 0.1
 
 
 def test_a_charge_has_derivatives():
