@@ -10,7 +10,7 @@ At its end pytest prints what was compiled and how much memory a worker had; the
     pytest -m slow
                         tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,
                         orders, events, degenerate and large systems, mechanisms to their end, fits and their
-                        uncertainties, random systems; code of README and docs, short notebooks, the types.
+                        uncertainties, random systems; code of README and docs, short notebooks, the package's types.
     pytest -m slow --all-sizes
                         also the tests marked `exhaustive`, before a release and after a change of what they test
                         (`.ci/release`), for two hours: those that compile or train for longer; further sizes, seeds,
