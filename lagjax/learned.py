@@ -89,15 +89,9 @@ class Network(eqx.Module):
             raise ValueError(f"angles names {listed(unknown)}, but the coordinates are {listed(names)}.")
         _check_activation(activation)
         self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in accepted_names)
-        takes = len(flat) + sum(self.angular)
-
-        # One program: JAX's random numbers one by one take XLA a second.
-        @eqx.filter_jit
-        def drawn(key):
-            mlp = eqx.nn.MLP(takes, out or "scalar", width, depth, activation, key=key)
-            return eqx.tree_at(lambda mlp: mlp.layers[-1], mlp, jax.tree.map(lambda x: first * x, mlp.layers[-1]))
-
-        self.mlp = drawn(key)
+        mlp = eqx.nn.MLP(len(flat) + sum(self.angular), out or "scalar", width, depth, activation, key=key)
+        last = jax.tree.map(lambda x: first * x, mlp.layers[-1])
+        self.mlp = eqx.tree_at(lambda mlp: mlp.layers[-1], mlp, last)
 
     def __call__(self, q: PyTree[ArrayLike]) -> Array:
         """The network at coordinates `q`: a scalar, or `(out,)`."""
