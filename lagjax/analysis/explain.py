@@ -2,10 +2,10 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from typing import NamedTuple, overload
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
@@ -14,6 +14,7 @@ from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate import found as jumps_found
 from lagjax.integrate import modes_at, nystrom_for, traced_phases
+from lagjax.jaxtools import compiled
 from lagjax.mechanics import (
     Structure,
     accelerations,
@@ -213,17 +214,7 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     assembly, found = traced_phases(system, s), _explain(replace(system, elements=None), s)
     laws, met = assembly.laws, modes_at(assembly, s)
     kinds = dict(zip(laws.names, laws.modes_in_words(np.asarray(met.modes))))
-
-    # One program: the operations one by one take XLA a second.
-    @jax.jit
-    def at(t, q, v, modes):
-        here, open_ones = assembly.given(s.params, modes), assembly.given(s.params)
-        model = model_of(assembly.systems[0], t, q, v, here)
-        x, u = model.vectors(q, v)
-        held = [constraints.jacobian(model.of(given), t, x, u) for given in (here, open_ones)]
-        return laws.last(t, q, v, model.zero_multipliers(), here), laws.holds(modes), held
-
-    values, holds, held = jax.tree.map(np.asarray, at(s.t, s.q, met.v, met.modes))
+    values, holds, held = _held(assembly, s._replace(v=met.v), met.modes)
     now = [
         f"{name} {mode}" + (f" (gap {value:.6g})" if mode == "open" else "")
         for (name, mode), value in zip_longest(kinds.items(), values)
@@ -254,6 +245,17 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     # Of the equations without elements.
     kept = [row for row in found.rows if row[0] not in ("solved", "first answer", "velocities", "network")]
     return replace(found, rows=(*kept, *rows), modes=tuple(kinds.items()), problem=problem)
+
+
+# One program: its operations one by one take XLA a second.
+@partial(compiled, in_numpy=True)
+def _held(assembly, s: coordinates.State, modes):
+    """The guards in these modes, which of them hold, and the rows of what holds in these and in none."""
+    here, open_ones = assembly.given(s.params, modes), assembly.given(s.params)
+    model = model_of(assembly.systems[0], *s[:3], here)
+    x, u = model.vectors(s.q, s.v)
+    rows = [constraints.jacobian(model.of(given), s.t, x, u) for given in (here, open_ones)]
+    return assembly.laws.last(*s[:3], model.zero_multipliers(), here), assembly.laws.holds(modes), rows
 
 
 def _explain(system: System, s: coordinates.State) -> Explanation:
@@ -311,7 +313,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         coordinates=tuple(names),
         equations=tuple(equations),
         degrees_of_freedom=free,
-        position_freedoms=len(names) - int(jax.jit(independent_rows)(np.asarray(jacobian)[holonomic]).sum()),
+        position_freedoms=len(names) - int(compiled(independent_rows)(np.asarray(jacobian)[holonomic]).sum()),
         dependent=groups,
         mass_matrix=mass,
         structure=found_structure,
