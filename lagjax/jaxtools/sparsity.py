@@ -210,7 +210,7 @@ def _scatter(operands: Sequence, params: dict, equation: JaxprEqn):
             return lax.scatter_add(zeros, places, updates, params["dimension_numbers"], mode=params["mode"])
 
         like = jax.ShapeDtypeStruct(updates.sets.shape, jnp.float32)
-        (target,) = jax.jit(jax.linear_transpose(add, like))(_positions(onto))
+        (target,) = jax.linear_transpose(add, like)(_positions(onto))
     sets = np.append(np.array([0], object), np.ravel(onto.sets))
     np.bitwise_or.at(sets, np.ravel(np.asarray(target)).astype(int), np.ravel(updates.sets))
     return [SparseValue(sets[1:].reshape(onto.sets.shape))]
