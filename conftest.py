@@ -10,7 +10,7 @@ At its end pytest prints what was compiled and how much memory a worker had; the
     pytest -m slow
                         tests that compile for 3 to 20 s, or have processes of their own: derivatives in both modes,
                         orders, events, degenerate and large systems, mechanisms to their end, fits and their
-                        uncertainties, random systems; code of README and docs, short notebooks, the types.
+                        uncertainties, random systems; code of README and docs, short notebooks, the package's types.
     pytest -m slow --all-sizes
                         also the tests marked `exhaustive`, before a release and after a change of what they test
                         (`.ci/release`), for two hours: those that compile or train for longer; further sizes, seeds,
@@ -33,7 +33,6 @@ import pytest  # noqa: E402
 from jax._src import compiler  # noqa: E402
 
 from lagjax.jaxtools.cache import PROGRAMS  # noqa: E402
-from lagjax.jaxtools.compiled import are_known  # noqa: E402
 from tests import counting  # noqa: E402
 from tests.tiers import SLOW_EXAMPLES  # noqa: E402
 
@@ -55,19 +54,14 @@ allowed = [MOST_PAGES]
 # The maps are counted once in ten tests: the list of 30,000 takes the kernel 10 ms.
 tests = itertools.count()
 backend_compile: Any = getattr(compiler, "backend_compile_and_load", None)
-# The older loop emitter takes two thirds of the time of XLA; one module of LLVM's instead of up to 32, which share
-# helper functions and a pool of threads, another eighth less of the processors', all of which the workers use anyhow.
-COMPILED_FASTER = [("xla_cpu_use_fusion_emitters", False), ("xla_cpu_parallel_codegen_split_count", 1)]
-# The XLA of jax 0.11 has no other emitters.
-COMPILED_FASTER = [(name, value) for name, value in COMPILED_FASTER if are_known({name: value})]
 
 
 def compile_faster(backend, module, devices, options, callbacks):
-    """Compile with `COMPILED_FASTER` where few optimisations are asked for, and count."""
+    """Compile with `counting.COMPILED_FASTER` where few optimisations are asked for, and count."""
     counting.about_to_compile(module)
     if jax.config.read("jax_disable_most_optimizations"):
         # By JAX's own function: `XLA_FLAGS` would change the optimised tests too, which run in the same process.
-        options.env_option_overrides = [*options.env_option_overrides, *COMPILED_FASTER]
+        options.env_option_overrides = [*options.env_option_overrides, *counting.COMPILED_FASTER]
     return backend_compile(backend, module, devices, options, callbacks)
 
 

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from lagjax.jaxtools import at_once
 from lagjax.mechanics import accelerations, listed, mass_matrix
 from lagjax.system import Hybrid, System, coordinates
 
@@ -269,10 +270,9 @@ def _times(t: ArrayLike, q: PyTree) -> Array:
 
 
 def _check_activation(activation: Callable):
-    with jax.ensure_compile_time_eval():
-        curvature = jax.vmap(jax.grad(jax.grad(lambda x: activation(x))))
-        at = np.asarray(curvature(jnp.asarray(CHECKED_AT)))
-        nearby = np.asarray(curvature(jnp.asarray(CHECKED_AT + DISTANCE)))
+    with at_once():
+        curvature = jax.jit(jax.vmap(jax.grad(jax.grad(lambda x: activation(x)))))
+        at, nearby = (np.asarray(curvature(x)) for x in (CHECKED_AT, CHECKED_AT + DISTANCE))
     if not np.all(np.isfinite(at)):
         raise ValueError(
             f"the activation {activation!r:.60} has no finite curvature at {CHECKED_AT[~np.isfinite(at)][0]:g}.\n"

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -30,6 +31,13 @@ def by_numpy(function):
         return jax.tree.unflatten(results, run(program, *leaves))
 
     return evaluated
+
+
+def network(*sizes, **options):
+    """A network of equinox's, of random numbers by NumPy."""
+    shaped = eqx.filter_eval_shape(lambda: eqx.nn.MLP(*sizes, **options, key=jax.random.key(0)))
+    random = np.random.default_rng(0)
+    return jax.tree.map(lambda x: random.normal(size=x.shape) if isinstance(x, jax.ShapeDtypeStruct) else x, shaped)
 
 
 class Equations(NamedTuple):

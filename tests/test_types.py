@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.tiers import exhaustive_but
+
 ROOT = Path(__file__).parent.parent
 CHECKED = ("lagjax", "tests")
 
@@ -21,12 +23,13 @@ pytestmark = [
 ]
 
 
-def checked(root):
-    """The result of the checker for a project: the number of files read, and its errors, one line each."""
+def checked(root, folders=()):
+    """The result of the checker for a project or folders of it: the number of files, and errors, one a line."""
     root = root.resolve()
     # Without --pythonpath it uses the first interpreter on the path, which may have another version of JAX, or none.
     told = subprocess.run(
-        [sys.executable, "-m", "basedpyright", "--level", "error", "--outputjson", "--pythonpath", sys.executable],
+        [sys.executable, "-m", "basedpyright", "--level", "error", "--outputjson", "--pythonpath", sys.executable]
+        + list(folders),
         cwd=root, capture_output=True, text=True,
     )  # fmt: skip
     assert told.returncode in (0, 1), told.stdout + told.stderr
@@ -40,11 +43,14 @@ def checked(root):
     return found["summary"]["filesAnalyzed"], errors
 
 
-def test_no_type_errors():
-    """Every file of the package and of its tests is read, and none has an error."""
-    count, errors = checked(ROOT)
+# The files of the tests take another minute.
+@pytest.mark.parametrize("folders", exhaustive_but([CHECKED[:1]], [CHECKED[:1], ()]), ids=["package", "with its tests"])
+def test_no_type_errors(folders):
+    """Every file of the package, and with no folder given of its tests too, is read, and none has an error."""
+    count, errors = checked(ROOT, folders)
     assert errors == [], "\n".join(errors)
-    assert count == sum(len(list((ROOT / folder).rglob(kind))) for folder in CHECKED for kind in ("*.py", "*.pyi"))
+    files = (ROOT.joinpath(folder).rglob(kind) for folder in folders or CHECKED for kind in ("*.py", "*.pyi"))
+    assert count == sum(len(list(found)) for found in files)
 
 
 def test_the_type_check_can_fail(tmp_path):
@@ -54,9 +60,9 @@ def test_the_type_check_can_fail(tmp_path):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "right.py").write_text("def length() -> float:\n    return 1.0\n")
         (tmp_path / folder / "wrong.py").write_text('import nowhere\n\ndef length() -> float:\n    return "1.0"\n')
-    count, errors = checked(tmp_path)
-    assert count == 4
-    for folder in CHECKED:
-        about = [error for error in errors if error.startswith(f"{folder}/wrong.py")]
-        assert len(about) == 2 and "nowhere" in about[0] and "reportReturnType" in about[1], errors
-    assert len(errors) == 4
+    for folders in ((), CHECKED[:1]):
+        count, errors = checked(tmp_path, folders)
+        for folder in folders or CHECKED:
+            about = [error for error in errors if error.startswith(f"{folder}/wrong.py")]
+            assert len(about) == 2 and "nowhere" in about[0] and "reportReturnType" in about[1], errors
+        assert count == len(errors) == 2 * len(folders or CHECKED)

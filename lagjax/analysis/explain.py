@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from typing import NamedTuple, overload
 
@@ -13,6 +14,7 @@ from lagjax.display import by_line
 from lagjax.display import plots as plot
 from lagjax.integrate import found as jumps_found
 from lagjax.integrate import modes_at, nystrom_for, traced_phases
+from lagjax.jaxtools import compiled
 from lagjax.mechanics import (
     Structure,
     accelerations,
@@ -212,18 +214,14 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     assembly, found = traced_phases(system, s), _explain(replace(system, elements=None), s)
     laws, met = assembly.laws, modes_at(assembly, s)
     kinds = dict(zip(laws.names, laws.modes_in_words(np.asarray(met.modes))))
-    given = assembly.given(s.params, met.modes)
-    model = model_of(assembly.systems[0], *s[:3], given)
-    values = np.asarray(laws.last(s.t, s.q, met.v, model.zero_multipliers(), given))
+    values, holds, held = _held(assembly, s._replace(v=met.v), met.modes)
     now = [
         f"{name} {mode}" + (f" (gap {value:.6g})" if mode == "open" else "")
         for (name, mode), value in zip_longest(kinds.items(), values)
     ]
-    both, state = (given, assembly.given(s.params)), (s.t, *model.vectors(s.q, met.v))
-    held = [constraints.jacobian(model.of(modes), *state) for modes in both]
-    here, open_rank = (int(np.linalg.matrix_rank(np.asarray(rows))) for rows in held)
+    here, open_rank = (int(np.linalg.matrix_rank(rows)) for rows in held)
     free = found.degrees_of_freedom - here + open_rank
-    equations = int(np.sum(laws.holds(met.modes))) + laws.equations - len(laws.rows)
+    equations = int(np.sum(holds)) + laws.equations - len(laws.rows)
     at_once = "one after the other" if laws.impacts == "sequential" else "all at once"
     gaps, slips = laws.count
     together = f"up to {gaps + slips} forces of contacts that touch, as a complementarity problem"
@@ -247,6 +245,17 @@ def _with_elements(system: System, s: coordinates.State) -> Explanation:
     # Of the equations without elements.
     kept = [row for row in found.rows if row[0] not in ("solved", "first answer", "velocities", "network")]
     return replace(found, rows=(*kept, *rows), modes=tuple(kinds.items()), problem=problem)
+
+
+# One program: its operations one by one take XLA a second.
+@partial(compiled, in_numpy=True)
+def _held(assembly, s: coordinates.State, modes):
+    """The guards in these modes, which of them hold, and the rows of what holds in these and in none."""
+    here, open_ones = assembly.given(s.params, modes), assembly.given(s.params)
+    model = model_of(assembly.systems[0], *s[:3], here)
+    x, u = model.vectors(s.q, s.v)
+    rows = [constraints.jacobian(model.of(given), s.t, x, u) for given in (here, open_ones)]
+    return assembly.laws.last(*s[:3], model.zero_multipliers(), here), assembly.laws.holds(modes), rows
 
 
 def _explain(system: System, s: coordinates.State) -> Explanation:
@@ -304,7 +313,7 @@ def _explain(system: System, s: coordinates.State) -> Explanation:
         coordinates=tuple(names),
         equations=tuple(equations),
         degrees_of_freedom=free,
-        position_freedoms=len(names) - int(independent_rows(jacobian[holonomic]).sum()),
+        position_freedoms=len(names) - int(compiled(independent_rows)(np.asarray(jacobian)[holonomic]).sum()),
         dependent=groups,
         mass_matrix=mass,
         structure=found_structure,

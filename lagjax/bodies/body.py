@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned, unit_vector
-from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.jaxtools import is_traced, numpy_of, to_jax
 from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
 # By how much of their sum moments of inertia may miss the triangle inequality: those of thin plates reach it.
@@ -466,13 +466,13 @@ def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
 
 def _three(what: str, given: ArrayLike) -> Float[Array, "3"]:
     """A vector; a `ValueError` that begins with `what`, unless it has three numbers."""
-    found = jnp.asarray(given, float)
+    found = numpy_of(given).asarray(given, jax.dtypes.canonicalize_dtype(float))
     if found.shape != (3,):
         raise ValueError(
             f"{what} must be three numbers, and has shape {found.shape}.\n"
             "Usual cause: a plane, or one number about an axis.\nFix: all of them, (0.0, 0.0, 1.0)."
         )
-    return found
+    return to_jax(found)
 
 
 def _check_not_traced(what: str, role: str, *given: Any):

@@ -9,12 +9,13 @@ that move would have to be known to all that reads q (outputs, events, fits), wh
 Source: Goldstein, *Classical Mechanics*, §4.5; Diebel, *Representing Attitude* (2006), Eqs. 125, 146 and 160.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from lagjax.jaxtools import judging, numpy_of
+from lagjax.jaxtools import is_traced, judging, numpy_of, to_jax
 
 # Not a jump of a force that reads a quaternion: e and -e are one rotation.
 _is_larger = judging(jnp.greater)
@@ -28,6 +29,8 @@ def unit_vector(x: np.ndarray) -> np.ndarray:
 
 def product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """The quaternion that turns as `b` and then as `a`."""
+    if not is_traced((a, b)):
+        return to_jax(_product_of_numbers(np.asarray(a), np.asarray(b)))
     real = a[0] * b[0] - jnp.dot(a[1:], b[1:])
     return jnp.concatenate([real[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
 
@@ -89,9 +92,11 @@ def _bilinear(form: ArrayLike, a: Float[Array, "4"], b: Float[Array, "4"]) -> Fl
 
 def about(axis: ArrayLike, angle: ArrayLike) -> Float[Array, "4"]:
     """The rotation by an angle about an axis of any length."""
-    axis = jnp.asarray(axis, float)
-    half = jnp.asarray(angle, float) / 2
-    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis / jnp.sqrt(jnp.sum(axis**2))])
+    xp, dtype = numpy_of((axis, angle)), jax.dtypes.canonicalize_dtype(float)
+    axis, half = xp.asarray(axis, dtype), xp.asarray(angle, dtype) / 2
+    with np.errstate(all="ignore"):
+        found = xp.concatenate([xp.cos(half)[None], xp.sin(half) * axis / xp.sqrt(xp.sum(axis**2))])
+    return to_jax(found)
 
 
 def quaternion_of(turned: Float[Array, "3 3"]) -> Float[Array, "4"]:

@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 
 from lagjax.bodies.body import Body, Ground, Marker, valued
 from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Shape, surface
+from lagjax.jaxtools import compiled
 
 Place = Body | Ground | Marker | ArrayLike
 # The least thickness of a body's box beside its length.
@@ -153,7 +154,12 @@ def level(place: Marker, f: Callable) -> Shape:
 
 
 def _values(f: Callable, points: np.ndarray, params: PyTree) -> np.ndarray:
-    return np.asarray(jax.vmap(lambda r: jnp.asarray(f(r, params), float))(jnp.asarray(points)))
+    return _at_points(f, points, params)
+
+
+@partial(compiled, in_numpy=True)
+def _at_points(f: Callable, points: np.ndarray, params: PyTree):
+    return jax.vmap(lambda r: jnp.asarray(f(r, params), float))(points)
 
 
 def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:

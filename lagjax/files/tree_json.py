@@ -18,7 +18,7 @@ import numpy as np
 
 from lagjax.display import is_plain, printable
 from lagjax.files.table import Table, check_field, fields_of, listed, name_of_function
-from lagjax.jaxtools import without_init
+from lagjax.jaxtools import to_jax, without_init
 from lagjax.numerics import tolerance_of_the_controller
 
 # Structures are nested no deeper than this.
@@ -256,7 +256,7 @@ class Reader:
                 f"it holds {x.dtype} arrays, and JAX works in 32 bits here, which would lose half of their digits.\n"
                 'Fix: jax.config.update("jax_enable_x64", True) before the first array.'
             )
-        return jnp.asarray(x)
+        return to_jax(x)
 
     def _object(self, kind, node, inside):
         cls, allowed, of_table = self._table.class_of(**node[kind])

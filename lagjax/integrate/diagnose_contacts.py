@@ -134,9 +134,13 @@ def at_contacts(laws, user: System, s: State) -> AtContacts:
     def slips(u: Array):
         return jnp.concatenate([law.slips(t, q, model.tree(u), params) for law in laws.tangents] or [u[:0]])
 
-    mass = np.asarray(jax.hessian(model.lagrangian, argnums=2)(t, x, u))
-    held = np.asarray(constraints.jacobian(model, t, x, u))
-    of_gaps, of_slips = np.asarray(jax.jacfwd(gaps)(x)), np.asarray(jax.jacfwd(slips)(u))
+    # One program: its operations one by one take XLA a second.
+    @jax.jit
+    def at(x: Array, u: Array):
+        mass, held = jax.hessian(model.lagrangian, argnums=2)(t, x, u), constraints.jacobian(model, t, x, u)
+        return mass, held, jax.jacfwd(gaps)(x), jax.jacfwd(slips)(u), gaps(x), slips(u)
+
+    mass, held, of_gaps, of_slips, open_by, sliding = map(np.asarray, at(x, u))
     rows, m = np.concatenate([of_gaps, of_slips]), len(held)
     saddle = np.block([[mass, held.T], [held, np.zeros((m, m))]])
     known = np.concatenate([rows.T, np.zeros((m, len(rows)))])
@@ -144,7 +148,7 @@ def at_contacts(laws, user: System, s: State) -> AtContacts:
     own = of_gaps - of_gaps @ np.linalg.pinv(held, rcond=FIXED) @ held
     fixed = np.linalg.norm(own, axis=1) <= FIXED * np.linalg.norm(of_gaps, axis=1)
     size = np.max(np.abs(x), initial=1e-300)
-    return AtContacts(np.asarray(gaps(x)), np.asarray(slips(u)), response, fixed & (len(held) > 0), CLOSED * size)
+    return AtContacts(open_by, sliding, response, fixed & (len(held) > 0), CLOSED * size)
 
 
 def _against_constraints(laws, user: System, s: State) -> Exception | None:

@@ -230,7 +230,8 @@ def _attempts(trajectory: Trajectory, settings: Settings):
     # Tolerances from the start: near a singularity sizes differ from those at the start.
     first = State(*jax.tree.map(lambda x: x[0], (trajectory.t, trajectory.q, trajectory.v)), params)
     at_start = _on_path(model, first.t, (first.q, first.v), 0.0)
-    tolerance = tolerances_at(first, trajectory.t, settings, a=at_start)
+    of_start = jax.jit(lambda first, ts, a: tolerances_at(first, ts, settings, a=a))
+    tolerance = of_start(first._replace(params=None), trajectory.t, at_start)
 
     def attempt(t0, t1, y: PyTree):
         return _attempt(method, terms, jnp.asarray(t0), jnp.asarray(t1), y, params, tolerance)

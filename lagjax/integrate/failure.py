@@ -24,7 +24,7 @@ from lagjax.integrate.trajectory.error_report import columns
 from lagjax.integrate.trajectory.parts import pack
 from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import as_usual, primitive
+from lagjax.jaxtools import as_usual, compiled, primitive
 from lagjax.mechanics import accelerations, describe, explain_failure
 from lagjax.system import Hybrid, State, coordinates
 
@@ -73,7 +73,8 @@ def _raise(trajectory, start: State, settings: Settings, about_guards: str, wher
     result = trajectory.result
     model, start = trajectory.model, coordinates.as_arrays(start, start.t.dtype)
     if is_among(result, [RESULTS.start_off_constraints]):
-        tolerances = (START_TOLERANCES * np.asarray(tol) for tol in tolerances_at(start, trajectory.t, settings))
+        found = compiled(tolerances_at)(start._replace(params=None), trajectory.t, settings)
+        tolerances = (START_TOLERANCES * np.asarray(tolerance) for tolerance in found)
         raise ValueError(where + arguments.off_constraints(model, start, *tolerances))
     if is_among(result, arguments.REFUSED):
         arguments.check_finite(start)

@@ -13,9 +13,9 @@ from types import FunctionType
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import is_traced
+from lagjax.jaxtools import at_once, compiled, is_traced
 from lagjax.system import State, coordinates, warn
 
 # Round-off of an R with several terms, in units of the last place.
@@ -31,9 +31,8 @@ def warn_of_odd_dissipation(dissipation: Callable | None, state: State) -> None:
         return
     t, q, v, params = coordinates.as_arrays(state, state.t.dtype)
     # While JAX traces something else, values that it does not trace can still be checked.
-    with jax.ensure_compile_time_eval():
-        v = _without_zeros(v)
-        both = [dissipation(t, q, jax.tree.map(lambda x: sign * x, v), params) for sign in (1, -1)]
+    with at_once():
+        both = _both_ways(dissipation, t, q, _without_zeros(v), params)
     if is_traced(both):
         return
     plus, minus = map(float, both)
@@ -52,9 +51,14 @@ def warn_of_odd_dissipation(dissipation: Callable | None, state: State) -> None:
         _in_order.add(dissipation)
 
 
+@compiled
+def _both_ways(dissipation: Callable, t: Array, q: PyTree, v: PyTree, params: PyTree):
+    return [dissipation(t, q, jax.tree.map(lambda x: sign * x, v), params) for sign in (1, -1)]
+
+
 def _without_zeros(v: PyTree):
     """The velocities, each zero replaced by an irregular number."""
-    flat, unflatten = coordinates.flatten(v)
+    flat = coordinates.vector(v)
     usual = np.max(np.abs(flat)) or 1.0
     irregular = usual * (0.5 + np.modf(0.6180339887 * np.arange(1, len(flat) + 1))[0])
-    return unflatten(jnp.asarray(np.where(np.asarray(flat) == 0, irregular, flat), flat.dtype))
+    return coordinates.like(v, np.where(flat == 0, irregular, flat).astype(flat.dtype))

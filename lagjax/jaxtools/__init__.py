@@ -84,12 +84,14 @@ from lagjax.jaxtools.tracing import (
     SILENT,
     WATCHED,
     as_usual,
+    at_once,
     full_products,
     is_differentiated,
     is_eager,
     is_traced,
     numpy_of,
     takes_for_regular,
+    to_jax,
 )
 from lagjax.jaxtools.trees import decided, like, stop_gradient, where, without_init
 from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one

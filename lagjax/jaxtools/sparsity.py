@@ -22,6 +22,7 @@ from jax.extend.core import JaxprEqn
 from jaxtyping import Array, Bool
 
 from lagjax.jaxtools.jaxpr import ACCUMULATING, ELEMENTWISE, IN_NUMPY, REDUCING, interpreted
+from lagjax.jaxtools.tracing import at_once
 
 
 class SparseValue(NamedTuple):
@@ -186,11 +187,15 @@ def _by_positions(move, source, indices, equation: JaxprEqn):
     if any(x.known is None for x in indices):
         return [None]
     # Positions count from one, as zero means that nothing is taken: a gather fills float32 with NaN, made zero here.
-    with jax.ensure_compile_time_eval():
-        positions = jnp.arange(1, source.sets.size + 1, dtype=jnp.float32).reshape(source.sets.shape)
-        taken = np.nan_to_num(np.asarray(move(positions, *(jnp.asarray(x.known) for x in indices)))).astype(int)
+    with at_once():
+        taken = np.nan_to_num(np.asarray(move(_positions(source), *(x.known for x in indices)))).astype(int)
     taken = np.where((taken >= 0) & (taken <= source.sets.size), taken, 0)
     return [SparseValue(np.append(np.array([0], object), np.ravel(source.sets))[taken])]
+
+
+def _positions(x) -> np.ndarray:
+    """The positions of the entries of a value, from one."""
+    return np.arange(1, x.sets.size + 1, dtype=np.float32).reshape(x.sets.shape)
 
 
 def _scatter(operands: Sequence, params: dict, equation: JaxprEqn):
@@ -198,15 +203,14 @@ def _scatter(operands: Sequence, params: dict, equation: JaxprEqn):
     onto, indices, updates = operands
     if indices.known is None:
         return [None]
-    with jax.ensure_compile_time_eval():
-        zeros, places = jnp.zeros(onto.sets.shape, jnp.float32), jnp.asarray(indices.known)
+    with at_once():
+        zeros, places = np.zeros(onto.sets.shape, np.float32), indices.known
 
         def add(updates: Array) -> Array:
             return lax.scatter_add(zeros, places, updates, params["dimension_numbers"], mode=params["mode"])
 
         like = jax.ShapeDtypeStruct(updates.sets.shape, jnp.float32)
-        positions = jnp.arange(1, onto.sets.size + 1, dtype=jnp.float32).reshape(onto.sets.shape)
-        (target,) = jax.linear_transpose(add, like)(positions)
+        (target,) = jax.linear_transpose(add, like)(_positions(onto))
     sets = np.append(np.array([0], object), np.ravel(onto.sets))
     np.bitwise_or.at(sets, np.ravel(np.asarray(target)).astype(int), np.ravel(updates.sets))
     return [SparseValue(sets[1:].reshape(onto.sets.shape))]

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
@@ -35,6 +36,15 @@ def takes_for_regular() -> bool:
 def is_eager() -> bool:
     """Whether JAX is tracing nothing here and now, not even a function without traced arguments."""
     return get_opaque_trace_state() == _EAGER
+
+
+def at_once():
+    """A context in which what JAX is not tracing is computed, also while it traces something else.
+
+    In `jax.ensure_compile_time_eval` alone, each constant of a program that is traced there is compiled and computed by
+    itself, in thirty milliseconds: where JAX traces nothing, no context is needed.
+    """
+    return nullcontext() if is_eager() else jax.ensure_compile_time_eval()
 
 
 def as_usual(function: Callable) -> Callable:
@@ -74,6 +84,14 @@ def full_products():
 def numpy_of(tree: PyTree):
     """NumPy where the values of `tree` are known, so that nothing is compiled; else `jax.numpy`."""
     return jnp if is_traced(tree) else np
+
+
+def to_jax(x: Any) -> Array:
+    """A copy of a NumPy array as one of JAX's, which stay: `jnp.asarray` without a dtype compiles for each shape."""
+    if isinstance(x, Array):
+        return x
+    x = np.array(x)
+    return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype))
 
 
 def is_traced(tree: PyTree) -> bool:

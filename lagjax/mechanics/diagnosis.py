@@ -126,7 +126,7 @@ def _explain_paradox(found: Examined, s: State):
 
 def describe(tree: PyTree) -> str:
     """A pytree of numbers on one line, six digits each."""
-    values = coordinates.flatten(tree)[0]
+    values = np.asarray(coordinates.vector(tree))
     pairs = [f"{name} = {float(x):.6g}" for name, x in zip(coordinates.names(tree), values)]
     shown = pairs if len(pairs) <= 6 else [*pairs[:6], "..."]
     return "(" + ", ".join(shown) + ")"

@@ -89,7 +89,7 @@ def _beyond(model: Model, start: State, end: State, first: _Eigenvalues) -> _Eig
     way, pace = float(np.max(np.abs(x - x0))), float(np.max(np.abs(u)))
     for part in BEYOND if 0 < way * pace < np.inf else ():
         ahead = np.sign(end.t - start.t) * part * way / pace
-        q = jax.tree.map(lambda q, v: q + ahead * v, end.q, end.v)
+        q = jax.tree.map(lambda q, v: np.asarray(q) + ahead * np.asarray(v), end.q, end.v)
         there = _Eigenvalues(model, end._replace(t=end.t + ahead, q=q))
         if not there.known:
             return None

@@ -27,7 +27,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import printable
-from lagjax.jaxtools import is_eager, is_traced, numpy_of
+from lagjax.jaxtools import is_eager, is_traced, numpy_of, to_jax
 from lagjax.system.warn import warn
 
 SINGLE = np.dtype("float32")
@@ -196,7 +196,7 @@ def as_arrays(tree: PyTree, dtype: DTypeLike):
 
 
 def _as_jax_arrays(tree: PyTree):
-    return jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
+    return jtu.tree_map(lambda x: to_jax(x) if isinstance(x, np.ndarray) else x, tree)
 
 
 def given_params(params: PyTree, dtype: DTypeLike):

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, PyTree
 from scipy.linalg import solve_continuous_are
 
 from lagjax.integrate import ENDED_WELL, Trajectory, is_among
+from lagjax.jaxtools import compiled, to_jax
 from lagjax.numerics import null_space
 from lagjax.system import System, check_system, constraints, coordinates, unchecked
 from lagjax.two_points.linear_quadratic import check_weights, linear
@@ -130,21 +131,20 @@ def lqr(
         )
     given = controlled(system, controls, coordinates.prepared(t, q, v, params), with_control)
     cost = checked_cost(cost, given)
-    x, u = (jnp.asarray(coordinates.vector(y)) for y in (given.state.q, given.state.v))
-    w = jnp.asarray(coordinates.vector(given.controls))
+    x, u, w = (coordinates.vector(y) for y in (given.state.q, given.state.v, given.controls))
     n, names = x.size, coordinates.names(given.state.q)
     names = (*names, *(velocity_name(name) for name in names))
     tangent = np.eye(n)
     if given.form.m:
         model = unchecked(given.system, given.merge(given.state.params, given.controls), given.form)
-        tangent = null_space(np.asarray(constraints.jacobian(model, given.state.t, x, u)))
-    still, (by_q, by_v, by_w), slope, weights = linear(given, cost, x, u, w)
-    size = max(1.0, float(jnp.max(jnp.abs(by_q))))
+        tangent = null_space(np.asarray(compiled(constraints.jacobian)(model, given.state.t, x, u)))
+    still, (by_q, by_v, by_w), slope, weights = jax.tree.map(np.asarray, linear(given, cost, x, u, w))
+    size = max(1.0, float(np.max(np.abs(by_q))))
     worst = int(np.argmax(np.abs(still)))
-    if not abs(still[worst]) <= STEADY_BELOW * size or np.any(np.asarray(u)):
+    if not abs(still[worst]) <= STEADY_BELOW * size or np.any(u):
         raise ValueError(
             f"not an equilibrium: '{names[worst]}' accelerates by {float(still[worst]):.3g} under these controls"
-            f"{', and the velocities are not zero' if np.any(np.asarray(u)) else ''}.\n"
+            f"{', and the velocities are not zero' if np.any(u) else ''}.\n"
             "Usual cause: controls of zero where a force has to hold the system.\n"
             'Fix: controls={"torque": ...} that balance the forces; lj.equilibria finds the state for given controls.'
         )
@@ -170,8 +170,8 @@ def lqr(
     values = np.linalg.eigvals(a - b @ gain)
     if not np.max(values.real) < 0:
         raise ValueError(_unreached(a, b, both, names))
-    at = jnp.concatenate([x, u])
-    return LQR(jnp.asarray(gain @ both.T), jnp.asarray(both @ s @ both.T), values, at, given.controls, names)
+    found = map(to_jax, (gain @ both.T, both @ s @ both.T))
+    return LQR(*found, values, to_jax(np.concatenate([x, u])), given.controls, names)
 
 
 def _along(system, controls, trajectory, cost, params, end_cost, with_control) -> TrackingLQR:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import Trajectory, integrate, reporting, runs_backward
-from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of
+from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of, to_jax
 from lagjax.numerics import EqualSteps
 from lagjax.system import State, System
 
@@ -85,7 +85,7 @@ class TimedProgram:
         start = self._motion.start
         ts = self._motion.ts if ts is None else ts
         given = (np.asarray(tolerance, ts.dtype), ts, start.q if q is None else q, start.v if v is None else v)
-        return [jnp.asarray(x) for x in hashable_partition((*given, start.params))[0]]
+        return [to_jax(x) for x in hashable_partition((*given, start.params))[0]]
 
     def _compile(self, robust: bool):
         motion, given = self._motion, (np.asarray(0.0, self._motion.ts.dtype), self._motion.ts, *self._motion.start[1:])

@@ -13,6 +13,7 @@ import lagjax as lj
 from lagjax.numerics import Quintic
 from tests.behaviour.test_bad_input import refusal
 from tests.by_hand import swing
+from tests.by_numpy import by_numpy
 from tests.systems import pendulum
 
 PARAMS = {"g": 1.0, "l": 1.0}
@@ -40,13 +41,15 @@ def worst(traj):
 def test_order_of_the_polynomial(end_rate, orders):
     """Sixth in q and fifth in v between exact ends; first with a wrong velocity at an end."""
 
+    between = by_numpy(lambda ends, x: Quintic(**ends).at(x))
+
     def error(h):
         worst = np.zeros(2)
         for t0 in (0.0, 0.5, 1.0, 1.5):
             (q0, q1), (v0, v1) = (x.tolist() for x in exact(np.array([t0, t0 + h])))
             ends = dict(t0=t0, t1=t0 + h, y0=(q0, v0), y1=(q1, end_rate * v1), a0=-np.sin(q0), a1=-np.sin(q1))
             t = t0 + h * np.linspace(0.1, 0.9, 9)
-            found = [Quintic(**ends).at(x) for x in t]
+            found = [between(ends, x) for x in t]
             worst = np.maximum(worst, [np.max(np.abs(np.array(x) - y)) for x, y in zip(zip(*found), exact(t))])
         return worst
 

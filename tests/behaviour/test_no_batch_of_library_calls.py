@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.counting import COMPILED_FASTER
 from tests.library_calls import batches_in, calls_in, text_of
 from tests.tiers import exhaustive_but
 
@@ -133,7 +134,8 @@ def programs_of(script, folder, **environment):
     """The text of every program that a script compiles in a process with two cores and a time limit."""
     root = Path(__file__).parents[2]
     # The texts are those that XLA is given; what it makes of them is not looked at.
-    quick = {"OPENBLAS_NUM_THREADS": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    faster = " ".join(f"--{name}={str(value).lower()}" for name, value in COMPILED_FASTER)
+    quick = {"OPENBLAS_NUM_THREADS": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": faster}
     environment = {**os.environ, "JAX_DUMP_IR_TO": str(folder), **quick, **environment}
     subprocess.run([sys.executable, "-c", TWO_CORES + script], cwd=root, env=environment, check=True, timeout=LIMIT)
     return [path.read_text() for path in folder.glob("*.mlir")]

@@ -7,26 +7,32 @@ import pytest
 
 import lagjax as lj
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_space
-from tests.jaxtools.in_numpy import accelerations
+from tests.by_numpy import by_numpy
+from tests.jaxtools.in_numpy import accelerations, along
 
 G = 9.81
 
 
 def angular_acceleration(body, q, a):
     """Ω' in space: of ė e* + ... only 2 vec(ë e*) has a vector part."""
-    return spin_in_space(body.pose(q).quaternion, body.rates(a).quaternion)
+    return by_numpy(spin_in_space)(body.pose(q).quaternion, body.rates(a).quaternion)
 
 
 def test_rotations():
     """R is a rotation about its axis by its angle; a product turns as both; Ω is the axis times the rate."""
-    e, f = about((0.0, 0.0, 2.0), 0.5), about((1.0, 2.0, -1.0), 1.2)
+    axis = np.array([1.0, 2.0, -1.0])
+    e, f = about((0.0, 0.0, 2.0), 0.5), about(axis, 1.2)
+    # Traced, the two that know their numbers are other programs.
+    np.testing.assert_allclose(by_numpy(about)(axis, 1.2), f, atol=1e-15)
+    np.testing.assert_allclose(by_numpy(product)(e, f), product(e, f), atol=1e-15)
+    of, spin = by_numpy(rotation_matrix), by_numpy(spin_in_space)
     expected = [[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]]
-    np.testing.assert_allclose(rotation_matrix(e), expected, atol=1e-15)
-    np.testing.assert_allclose(rotation_matrix(product(e, f)), rotation_matrix(e) @ rotation_matrix(f), atol=1e-15)
-    assert np.abs(rotation_matrix(product(f, e)) - rotation_matrix(e) @ rotation_matrix(f)).max() > 0.1
-    np.testing.assert_allclose(rotation_matrix(conjugate(f)), rotation_matrix(f).T, atol=1e-15)
-    rate = jax.jvp(lambda angle: about((1.0, 2.0, -1.0), angle), (jnp.asarray(1.2),), (jnp.asarray(3.0),))[1]
-    np.testing.assert_allclose(spin_in_space(f, rate), 3.0 * np.array([1.0, 2.0, -1.0]) / np.sqrt(6.0), atol=1e-15)
+    np.testing.assert_allclose(of(e), expected, atol=1e-15)
+    np.testing.assert_allclose(of(product(e, f)), of(e) @ of(f), atol=1e-15)
+    assert np.abs(of(product(f, e)) - of(e) @ of(f)).max() > 0.1
+    np.testing.assert_allclose(of(by_numpy(conjugate)(f)), of(f).T, atol=1e-15)
+    _, rate = by_numpy(along(lambda angle: about(axis, angle)))(1.2, 3.0)
+    np.testing.assert_allclose(spin(f, rate), 3.0 * axis / np.sqrt(6.0), atol=1e-15)
 
 
 def test_poses_and_points():
@@ -35,18 +41,19 @@ def test_poses_and_points():
     pose = lj.Pose.at((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), 0.7).turned((1.0, 0.0, 0.0), 0.4)
     velocity, spin, r = np.array([0.1, 0.2, 0.3]), np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.2])
     q, v = {"b": pose}, {"b": pose.moving(velocity, spin)}
-    np.testing.assert_allclose(body.spin(q, v), spin, atol=1e-15)
-    rotation = np.asarray(rotation_matrix(pose.quaternion))
-    np.testing.assert_allclose(body.spin_in_body(q, v), rotation.T @ spin, atol=1e-15)
-    np.testing.assert_allclose(body.velocity(q, v, r), velocity + np.cross(spin, rotation @ r), atol=1e-15)
-    moved = jax.jvp(lambda q: body.point(q, r), (q,), (v,))[1]
+    np.testing.assert_allclose(by_numpy(body.spin)(q, v), spin, atol=1e-15)
+    rotation = by_numpy(rotation_matrix)(pose.quaternion)
+    np.testing.assert_allclose(by_numpy(body.spin_in_body)(q, v), rotation.T @ spin, atol=1e-15)
+    np.testing.assert_allclose(by_numpy(body.velocity)(q, v, r), velocity + np.cross(spin, rotation @ r), atol=1e-15)
+    _, moved = by_numpy(along(lambda q: body.point(q, r)))(q, v)
     np.testing.assert_allclose(moved, velocity + np.cross(spin, rotation @ r), atol=1e-15)
     inertia = rotation @ np.diag([1.0, 2.0, 2.5]) @ rotation.T
-    np.testing.assert_allclose(body.kinetic(q, v), velocity @ velocity + spin @ inertia @ spin / 2, rtol=1e-14)
-    np.testing.assert_allclose(body.angular_momentum(q, v), inertia @ spin, rtol=1e-14)
+    energy = by_numpy(body.kinetic)(q, v)
+    np.testing.assert_allclose(energy, velocity @ velocity + spin @ inertia @ spin / 2, rtol=1e-14)
+    np.testing.assert_allclose(by_numpy(body.angular_momentum)(q, v), inertia @ spin, rtol=1e-14)
     of_params = lj.Body("b", lambda p: p["m"], lambda p: jnp.diag(p["I"]))
-    params = {"m": 2.0, "I": jnp.array([1.0, 2.0, 2.5])}
-    np.testing.assert_allclose(of_params.kinetic(q, v, params), body.kinetic(q, v), rtol=1e-14)
+    params = {"m": 2.0, "I": np.array([1.0, 2.0, 2.5])}
+    np.testing.assert_allclose(by_numpy(of_params.kinetic)(q, v, params), energy, rtol=1e-14)
 
 
 def hinged(joint):
@@ -267,8 +274,9 @@ def test_a_torsion_spring():
         closer = lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0, lambda p: p["rest"], damping=0.5)
         assert closer.potential is not None and closer.dissipation is not None
         params = {"rest": 0.3}
-        np.testing.assert_allclose(closer.potential(0.0, q, v, params), 2.0 * (angle - 0.3) ** 2, rtol=1e-14)
-        np.testing.assert_allclose(closer.dissipation(0.0, q, v, params), 0.25 * 9.0, rtol=1e-14)
+        stored, lost = by_numpy(closer.potential), by_numpy(closer.dissipation)
+        np.testing.assert_allclose(stored(0.0, q, v, params), 2.0 * (angle - 0.3) ** 2, rtol=1e-14)
+        np.testing.assert_allclose(lost(0.0, q, v, params), 0.25 * 9.0, rtol=1e-14)
     assert lj.torsion(lj.ground.at(axis=axis), flap.at(point, axis), 4.0).dissipation is None
 
 
@@ -301,8 +309,9 @@ def test_numbers_of_other_kinds():
     """Integers, and axes of any length, are taken; a function of params is checked by nobody here."""
     pose = lj.Pose.at((0, 0, 1), axis=(0, 0, 10), angle=1)
     np.testing.assert_allclose(pose.quaternion, [np.cos(0.5), 0.0, 0.0, np.sin(0.5)], atol=1e-15)
-    np.testing.assert_allclose(pose.spin(pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
-    assert a_rod(1, (1, 1, 1)).kinetic({"rod": pose}, {"rod": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5
+    spin, energy = by_numpy(lj.Pose.spin), by_numpy(a_rod(1, (1, 1, 1)).kinetic)
+    np.testing.assert_allclose(spin(pose, pose.moving(spin=(0, 0, 2))), [0.0, 0.0, 2.0], atol=1e-15)
+    assert energy({"rod": pose}, {"rod": pose.moving((1, 0, 0), (0, 0, 2))}) == 2.5
     for size in (1e-200, 1.0, 1e200):
         np.testing.assert_allclose(ROD.at(axis=(0.0, 3 * size, 4 * size)).frame[2], [0.0, 0.6, 0.8], rtol=1e-15)
     lj.rolling(ROD.at(), GROUND, lambda params: params["r"])

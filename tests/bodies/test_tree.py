@@ -9,6 +9,7 @@ import lagjax as lj
 from lagjax.bodies.tree.links import slots_of
 from lagjax.jaxtools import equations
 from lagjax.system.traced_functions import TracedProgram
+from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import in_numpy
 
 Y = (0.0, 1.0, 0.0)
@@ -144,7 +145,7 @@ def test_places_on_a_chain(count):
     relative, faster = rng.normal(size=(2, count))
     angle, rate = np.cumsum(relative), np.cumsum(faster)
 
-    @jax.jit
+    @by_numpy
     def seen(q, v):
         poses, rates = tree.poses(q), tree.rates(q, v)
         bare = [{name: lj.Pose(x.position, x.quaternion) for name, x in of.items()} for of in (poses, rates)]

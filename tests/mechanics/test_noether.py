@@ -8,6 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.scenes import mass_distributions
 from lagjax.system import coordinates
+from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import accelerations, evaluated
 from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_KEPLER, ON_PLANE, RADIUS, central, rolling
 
@@ -29,13 +30,13 @@ def test_charges_in_closed_form():
         "E": lj.Generator.time_translation(),
         "screw": lj.Generator.screw("z", 0.5),
     }
-    found = jax.jit(
+    found = by_numpy(
         jax.vmap(lambda q, v: {name: lj.noether_charge(system, g)(0.0, q, v, params) for name, g in generators.items()})
     )(q, v)
     for name, value in found.items():
         np.testing.assert_allclose(value, exact[name], atol=1e-12)
     assert np.max(np.abs(found["screw"] - found["L_z"])) > 0.1
-    assert np.max(np.abs(np.asarray(found["L_z"]) + exact["L_z"])) > 0.1
+    assert np.max(np.abs(found["L_z"] + exact["L_z"])) > 0.1
 
 
 def test_a_charge_has_derivatives():
@@ -43,8 +44,8 @@ def test_a_charge_has_derivatives():
     q, v = IN_SPACE
     charge = lj.noether_charge(KEPLER, lj.Generator.rotation("z"))
     of_m = lambda m: charge(0.0, q, v, OF_KEPLER | {"m": m})
-    for derivative in (jax.grad(of_m)(1.25), jax.jacfwd(of_m)(1.25)):
-        np.testing.assert_allclose(derivative, np.cross(q, v)[2], rtol=1e-14)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(by_numpy(derivative(of_m))(1.25), np.cross(q, v)[2], rtol=1e-14)
 
 
 @pytest.mark.slow

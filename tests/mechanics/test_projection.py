@@ -15,6 +15,7 @@ from tests.behaviour.test_nonholonomic import (
     touches,
     vertical_disk,
 )
+from tests.by_numpy import by_numpy
 
 
 def test_returning_to_a_velocity_constraint_leaves_positions():
@@ -40,12 +41,13 @@ def test_returning_to_the_plane_rolls():
     state = 0.0, lifted, v
     moved = to_manifold(equations_of(model_of(tilting_disk, *state, COIN)), *state, 1e-12, 1e-12).q
     step = {name: float(moved[name]) - lifted[name] for name in q}
-    slid = np.asarray(contact_at_rest(0.0, lifted, step, COIN))
-    assert abs(float(touches(0.0, moved, COIN))) < ROUND_OFF
+    at_rest = by_numpy(contact_at_rest)
+    slid = at_rest(0.0, lifted, step, COIN)
+    assert abs(by_numpy(touches)(0.0, moved, COIN)) < ROUND_OFF
     assert np.max(np.abs(slid)) < 1e-14
     # The nearest point of the plane alone, by tilting and lowering in place, would have slid.
     row = np.array([-COIN["R"] * np.cos(q["tilt"]), 1.0])
     in_place = row / np.array([COIN["I1"], COIN["m"]])
     in_place = in_place / (row @ in_place)
-    sliding = contact_at_rest(0.0, lifted, {name: 0.0 for name in q} | {"tilt": in_place[0] * -1e-4}, COIN)
-    assert np.max(np.abs(np.asarray(sliding))) > 1e-5
+    sliding = at_rest(0.0, lifted, {name: 0.0 for name in q} | {"tilt": in_place[0] * -1e-4}, COIN)
+    assert np.max(np.abs(sliding)) > 1e-5

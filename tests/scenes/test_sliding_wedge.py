@@ -43,7 +43,7 @@ def solved():
         return equations_of(model_of(wedge.system, *start, params)).accelerations(*start)
 
     params = jax.tree.map(lambda *x: np.array(x), *(PARAMS | change for change in CHANGES.values()))
-    lanes = jax.tree.map(np.asarray, jax.jit(jax.vmap(at_the_start))(params))
+    lanes = by_numpy(jax.vmap(at_the_start))(params)
     return {name: jax.tree.map(lambda x, i=i: x[i], lanes) for i, name in enumerate(CHANGES)}
 
 

@@ -9,6 +9,7 @@ from jax import flatten_util, lax
 
 import lagjax as lj
 from lagjax.steps.rollout import piece_length
+from tests.by_numpy import network
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
 
 cart = lj.System(
@@ -171,7 +172,7 @@ class Driven(eqx.Module):
 
 def test_modules_in_params():
     """A network in `params`, with its functions: the steps are those of `step` with such parameters."""
-    net = eqx.nn.MLP(1, "scalar", 2, 1, activation=jnp.tanh, key=jax.random.key(0))
+    net = network(1, "scalar", 2, 1, activation=jnp.tanh)
     system = lj.System(
         lambda t, q, v, params: 0.5 * v**2 - params.net(q[None]), force=lambda t, q, v, params: params.push
     )

@@ -36,7 +36,8 @@ def same(found, whole):
 def started(store, k=0, n=1, *port):
     """Start a worker process."""
     root = Path(lj.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": str(root)}
+    # What the first process compiles the others read.
+    environment = os.environ | {"PYTHONPATH": str(root), "JAX_COMPILATION_CACHE_DIR": str(store.parent / "compiled")}
     command = [sys.executable, worker.__file__, str(store), str(k), str(n), str(POINTS), *map(str, port)]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
 

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from lagjax.exchange import sympy_itself
@@ -104,13 +103,15 @@ def latex(system, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> Equa
         raise ValueError(
             f"the system has {model.n} coordinates, but equations are written only for up to {COORDINATES}."
         )
-    inputs = s.t, *model.vectors(s.q, s.v), eqx.filter(s.params, eqx.is_array), jnp.zeros(model.m), jnp.zeros(model.n)
+    unknown = np.zeros(model.m + model.n, jax.dtypes.canonicalize_dtype(float))
+    inputs = s.t, *model.vectors(s.q, s.v), eqx.filter(s.params, eqx.is_array), *np.split(unknown, [model.m])
+    numbers = coordinates.vector(inputs)
     # Whole numbers among the parameters stay whole at random states.
-    whole = ravel_pytree(jax.tree.map(lambda x: jnp.full(x.shape, not jnp.issubdtype(x.dtype, jnp.inexact)), inputs))[0]
-    numbers, restore = ravel_pytree(inputs)
+    whole = jax.tree.map(lambda x: np.full(x.shape, not jnp.issubdtype(x.dtype, jnp.inexact)), inputs)
 
     def state(numbers):
-        t, x, u, arrays, multipliers, a = restore(numbers)
+        given = coordinates.like(inputs, numbers)
+        t, x, u, arrays, multipliers, a = jax.tree.map(lambda x, like: x.astype(like.dtype), given, inputs)
         return model.of(eqx.combine(arrays, s.params)), t, x, u, multipliers, a
 
     symbols = _symbols(model, s)
@@ -121,7 +122,7 @@ def latex(system, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> Equa
             "the equations are too long to be read.\n"
             "Usual cause: an L with sums over many parts, or a quadrature.\nFix: print a system with fewer parts."
         ) from None
-    error = _verified(state, np.asarray(numbers), np.asarray(whole), list(symbols), sides)
+    error = _verified(state, numbers, coordinates.vector(whole), list(symbols), sides)
     lines = (" = ".join(typeset(side, symbols) for side in pair) for pair in sides)
     return EquationsOfMotion(tuple(lines), error, STATES)
 
@@ -164,7 +165,7 @@ def written(name: str, accent: str = "") -> str:
     return (f"{accent}{{{first}}}" if accent else first) + (f"_{{{','.join(indices)}}}" if indices else "")
 
 
-def _equations(state: Callable, numbers: Array, symbols: list, model: Model) -> list[tuple]:
+def _equations(state: Callable, numbers: np.ndarray, symbols: list, model: Model) -> list[tuple]:
     """The left and the right side of each equation."""
     n = model.n
 

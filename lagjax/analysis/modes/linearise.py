@@ -327,7 +327,7 @@ def _chosen(kind, model: Model, s, traced) -> tuple[bool, ...]:
             "which ones cannot be determined while JAX is tracing.\n"
             "Fix: leave out the dependent ones; print(lj.explain(system, t, q, v, params)) names them."
         )
-    rest = np.array(constraints.jacobian(model, s.t, *model.vectors(s.q, s.v)))
+    rest = np.array(compiled(constraints.jacobian)(model, s.t, *model.vectors(s.q, s.v)))
     size = np.linalg.norm(rest, axis=1)
     rest /= np.where(size > 0, size, 1.0)[:, None]
     holonomic, chosen = np.array(kind.holonomic, bool), np.zeros(len(size), bool)

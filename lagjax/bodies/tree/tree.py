@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
@@ -35,6 +36,7 @@ from lagjax.bodies.tree.motion import (
 )
 from lagjax.bodies.tree.recursion import accelerated
 from lagjax.display import Drawing, Shape
+from lagjax.jaxtools import to_jax
 from lagjax.system import Holonomic, Nonholonomic, System
 
 
@@ -124,8 +126,8 @@ class Tree:
         """q where all joints are at zero, and free bodies at the origin, unturned."""
         geometry = self._geometry
         count = len(geometry.links_of_quaternions)
-        e = jnp.zeros((count, 4)).at[:, 0].set(1.0)
-        return unflat(geometry, Coordinates(jnp.zeros(len(geometry.links_of_numbers)), e, jnp.zeros((count, 3))))
+        numbers, e = np.zeros(len(geometry.links_of_numbers)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        return jax.tree.map(to_jax, unflat(geometry, Coordinates(numbers, e, np.zeros((count, 3)))))
 
     def poses(self, q: PyTree, params: PyTree = None, t: Any = None) -> dict[str, PoseOnTree]:
         """The poses of all bodies by name, `position`, `quaternion` and the rotation's `matrix`; `params` where places

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.fit.problem.records import Record, Windows, spread
 from lagjax.integrate import integrate
-from lagjax.jaxtools import compiled, is_traced, kinds, numpy_of, once, stop_gradient
+from lagjax.jaxtools import at_once, compiled, is_traced, kinds, numpy_of, once, stop_gradient
 from lagjax.mechanics import departures, equations_of, free_coordinates, listed, with_first_order, within
 from lagjax.numerics import last_step, newton, null_space
 from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system, with_rates
@@ -126,7 +126,7 @@ def _state(t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> State:
     """A state; one made of numbers stays numbers, even while a program is traced."""
     if is_traced((q, v, params)):
         return coordinates.given_state(t, q, v, params)
-    with jax.ensure_compile_time_eval():
+    with at_once():
         s = coordinates.given_state(t, q, v, params)
     return s._replace(q=jax.tree.map(np.asarray, s.q), v=jax.tree.map(np.asarray, s.v))
 
@@ -141,7 +141,7 @@ def _vector(tree: PyTree):
 def unflatten_of(of_kinds: tuple) -> Callable:
     """The function that turns a vector into coordinates of these `kinds`."""
     structure, *arrays = of_kinds
-    with jax.ensure_compile_time_eval():
+    with at_once():
         return coordinates.flatten(jax.tree.unflatten(structure, [np.zeros(*array) for array in arrays]))[1]
 
 
@@ -254,7 +254,7 @@ def _charts(system: System, s: State, free_q: Bool[np.ndarray, " n"], free_v: Bo
     if not system.constraints:
         nothing = np.zeros((len(free_q), 0))
         return Starts(*(Chart(y, np.eye(len(f))[:, f], nothing) for y, f in ((x, free_q), (u, free_v))))
-    with jax.ensure_compile_time_eval():
+    with at_once():
         model = model_of(system, *s)
 
         def charts(x: Array, u: Array, of_q: Array, of_v: Array):

@@ -25,7 +25,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.jaxtools import is_traced, numpy_of
+from lagjax.jaxtools import at_once, is_traced, numpy_of
 from lagjax.mechanics import listed
 from lagjax.system import coordinates
 
@@ -136,7 +136,7 @@ def find(
     `error`: that of a measurement as residuals have it, against which weak priors are set; 0: there are none.
     """
     if not is_traced(params):
-        with jax.ensure_compile_time_eval():
+        with at_once():
             params = coordinates.given_params(params, dtype)
     named = [(leaf_name(path), x) for path, x in jtu.tree_leaves_with_path(params)]
     floating = {name: x for name, x in named if eqx.is_inexact_array(x)}

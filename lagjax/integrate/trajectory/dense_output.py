@@ -25,7 +25,7 @@ from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
-from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of
+from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of, to_jax
 from lagjax.mechanics import accelerations
 from lagjax.system import InModes, System, given_in
 
@@ -79,7 +79,7 @@ def at(trajectory, t: ArrayLike) -> Snapshot:
         if rows.size:
             here = jax.tree.map(lambda x, rows=rows: x[rows], (nodes, given))
             _fill(found, rows, trajectory, phase, *here, times[rows])
-    return jax.tree.map(lambda x: jnp.asarray(x.reshape(t.shape + x.shape[1:])), found)
+    return jax.tree.map(lambda x: to_jax(x.reshape(t.shape + x.shape[1:])), found)
 
 
 def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None, times):
@@ -93,7 +93,9 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
     nodes, given, times = jax.tree.map(lambda x: x[fill], (nodes, given, times))
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
     new, result = _continue_all(*of_system, nodes, given, times, trajectory.static.integrate)
-    new, result = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result))
+    # Padded as well, for the same reason.
+    acting = {} if given is None else of_elements(trajectory, times, *new[1:], given.modes)
+    new, result, acting = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result, acting))
     # Not `ended_well`, which would compile a comparison for each number of times.
     well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
     if not well.all():
@@ -101,12 +103,11 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
     for name, x in found.multipliers.items():
         x[rows] = new.multipliers[name] if name in multipliers else np.nan
     if given is not None:
-        here = jax.tree.map(lambda x: x[: rows.size], (times, given.modes))
-        for name, x in of_elements(trajectory, here[0], new.q, new.v, new.multipliers, here[1]).items():
+        for name, x in acting.items():
             found.multipliers[name][rows] = x
         # Where others hold what would slide, the direction of its friction is known at outputs alone.
         slips = np.char.startswith(np.array(trajectory.switches.kinds, str), "sliding velocity")
-        held = np.any((np.asarray(here[1]) == HELD_BY_OTHERS) & slips, axis=1)
+        held = np.any((np.asarray(given.modes)[: rows.size] == HELD_BY_OTHERS) & slips, axis=1)
         for x in found.multipliers.values():
             x[rows[held]] = np.nan
     for old, x in zip(jax.tree.leaves((found.q, found.v)), jax.tree.leaves((new.q, new.v))):
@@ -116,11 +117,16 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
 def of_elements(trajectory, times, q: PyTree, v: PyTree, multipliers: dict, modes) -> dict[str, Array]:
     """The forces of compliant contacts, and of friction, at these states, by name."""
     laws = trajectory.system.laws
+    known = laws.compliant or laws.tangents
+    return _acting(trajectory.system, trajectory.params, times, q, v, multipliers, modes) if known else {}
 
+
+@compiled
+def _acting(system, params: PyTree, times: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array):
     def forces(t: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array) -> dict[str, Array]:
-        return laws.acting(t, q, v, multipliers, laws.given(trajectory.params, modes))
+        return system.laws.acting(t, q, v, multipliers, system.laws.given(params, modes))
 
-    return jax.vmap(forces)(times, q, v, multipliers, modes) if laws.compliant or laws.tangents else {}
+    return jax.vmap(forces)(times, q, v, multipliers, modes)
 
 
 def _known_of(trajectory) -> Instants:

@@ -4,8 +4,9 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Bool
+
+from lagjax.jaxtools import to_jax
 
 
 # Type checkers take equinox's enumerations for Python's, which cannot have more items than their parent.
@@ -93,4 +94,4 @@ def in_words(code: Any) -> str:
 
 def item(result: Any, value: Any):
     """The result with the number `value`; `result`: any known one."""
-    return eqx.tree_at(lambda r: r._value, result, jnp.asarray(value))
+    return eqx.tree_at(lambda r: r._value, result, to_jax(value))

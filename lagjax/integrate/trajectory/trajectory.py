@@ -21,7 +21,7 @@ from lagjax.integrate.trajectory.parts import Snapshot, SolveOptions, StaticPart
 from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, is_among, item, message
 from lagjax.integrate.trajectory.save import save
 from lagjax.integrate.trajectory.to_xarray import dataset
-from lagjax.jaxtools import compiled, is_traced, jitted
+from lagjax.jaxtools import compiled, is_traced, jitted, numpy_of
 from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
 from lagjax.system import Model, System, UnknownSystem, known_system, model_of
 
@@ -102,7 +102,9 @@ class Trajectory(eqx.Module):
     @property
     def model(self) -> Model:
         """The system prepared for states of this form. Not for batched trajectories."""
-        return model_of(self.system, *jax.tree.map(lambda x: x[0], (self.t, self.q, self.v)), self.params)
+        states = self.t, self.q, self.v
+        xp = numpy_of(states)
+        return model_of(self.system, *jax.tree.map(lambda x: xp.asarray(x)[0], states), self.params)
 
     def jacobi_integral(self) -> Float[Array, " T"]:
         """The Jacobi integral `v·p - L` at every output, (T,), `[L]`. Not for batched trajectories."""

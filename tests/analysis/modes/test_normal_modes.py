@@ -11,6 +11,7 @@ import lagjax as lj
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
 from tests.analysis.steady_systems import DISK, TOP, UPRIGHT, UPRIGHT_DISK, disk, straight_on, top
+from tests.by_numpy import by_numpy
 from tests.systems import DOUBLE_PARAMS, double_pendulum, double_rods, rod_pendulum
 
 BEAD = {"a": 1.25, "g": 9.8125, "omega": 2.0}
@@ -113,11 +114,11 @@ def test_cross_rails():
 
 def check_shapes(modes):
     """Each mode solves M s² + (G + D) s + K + N = 0, and the largest entry of its shape is one; twin: without G."""
-    of, twin = modes.linearisation, []
-    position = np.asarray(of.stiffness) + np.asarray(of.circulatory)
-    for root, shape in zip(modes.roots, np.stack(list(modes.shapes.values()), axis=1)):
+    of, twin = jax.tree.map(np.asarray, modes.linearisation), []
+    position = of.stiffness + of.circulatory
+    for root, shape in zip(np.asarray(modes.roots), np.stack(list(modes.shapes.values()), axis=1)):
         velocity = lambda gyroscopic: (of.mass * root + of.damping + gyroscopic) * root + position
-        w = np.linalg.lstsq(np.asarray(of.positions), shape)[0]
+        w = np.linalg.lstsq(of.positions, shape)[0]
         np.testing.assert_allclose(velocity(of.gyroscopic) @ w, 0.0, atol=1e-10 * np.max(np.abs(position)))
         np.testing.assert_allclose(np.max(np.abs(shape)), 1.0, rtol=1e-12)
         twin.append(np.max(np.abs(velocity(0.0 * of.gyroscopic) @ w)))
@@ -126,7 +127,7 @@ def check_shapes(modes):
 
 def rails_by_hand(omega):
     """Both frequencies of the carriage, ascending, from its characteristic equation."""
-    return jnp.sqrt(jnp.stack(cross_rails.mode_squares(cross_rails.PARAMS | {"omega": omega}))[::-1])
+    return np.sqrt(np.stack(by_numpy(cross_rails.mode_squares)(cross_rails.PARAMS | {"omega": omega}))[::-1])
 
 
 @pytest.mark.exhaustive

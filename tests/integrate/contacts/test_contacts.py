@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from tests.by_numpy import by_numpy
 from tests.integrate.contacts.test_impacts import PARAMS, R, above, flying, on_wire, sliding
 
 
@@ -19,7 +20,7 @@ def after_impact(guard, system, *state):
 def test_what_holds_goes_by_any_name():
     """A bead stays on its wire and halves its speed, whether the constraint's name sorts before the gap's or after."""
 
-    @jax.jit
+    @by_numpy
     def both(q, v, p):
         wires = [on_wire(name) for name in ("a wire", "wire")]
         return jnp.stack([after_impact(wire.switches[0].when, *wire.systems, q, v, p) for wire in wires])

@@ -50,6 +50,7 @@ def test_between_outputs():
     height = u * (0.7 - FALL) - G / 2 * (0.7 - FALL) ** 2
     np.testing.assert_allclose(found.q[:, 1], [1 - G / 2 * 0.3**2, height, 0.0, 0.0], atol=1e-8)
     np.testing.assert_allclose(found.multipliers["floor"], [0.0, 0.0, G, G], rtol=1e-9)
+    np.testing.assert_allclose(found.multipliers["floor friction"], [0.0, 0.0, -MU * G, 0.0], rtol=1e-9, atol=1e-12)
     lost = MU * (1 + E) * G * FALL
     way = THROWN * FALL + sum((THROWN - lost * (1 - E**n) / (1 - E)) * 2 * FALL * E**n for n in range(1, 60))
     np.testing.assert_allclose(traj.q[-1], [way + SPEED**2 / (2 * MU * G), 0.0], atol=1e-5)

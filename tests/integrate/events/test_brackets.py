@@ -8,6 +8,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.events import brackets as sampling
+from tests.by_numpy import by_numpy
 from tests.integrate.events.test_event import oscillator, swing, times
 
 
@@ -50,11 +51,14 @@ def test_velocities_over_a_short_step():
     way = np.polynomial.Polynomial([0.7, 1e-8, -0.3, 0.2, 0.1, -0.4])
     one, two = way.deriv(), way.deriv(2)
 
+    @by_numpy
+    def sampled(*ends):
+        nodes = [sampling.Node(t, ((q,), (v,)), (a,), ()) for t, q, v, a in ends]
+        (((q, v), a),), (((_, by_cubic), _),) = sampling.between(*nodes, nodes[1].t)
+        return jnp.stack([q[0], v[0], a[0]]), by_cubic[0]
+
     def inside(h):
-        t = np.array([0.0, h])
-        nodes = [sampling.Node(x, ((way(x),), (one(x),)), (two(x),), ()) for x in jnp.asarray(t)]
-        (((q, v), a),), (((_, by_cubic), _),) = sampling.between(*nodes, jnp.asarray(h))
-        return np.array([q[0], v[0], a[0]]), by_cubic[0], (way(h) - way(0.0)) / h
+        return *sampled(*((t, way(t), one(t), two(t)) for t in (0.0, h))), (way(h) - way(0.0)) / h
 
     at = sampling.INNER[0]
     long, by_cubic, _ = inside(0.8)

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.integrate.solve.backward_time import backward_trajectory_of, reflect_system
+from tests.by_numpy import by_numpy
 from tests.systems import DRIVEN_PARAMS, HORIZONTAL, PARAMS, driven, pendulum, rod_pendulum
 
 DOWN, SHORT = np.linspace(2.0, 0.0, 9), np.array([2.0, 1.5, 0.25, 0.0])
@@ -71,7 +72,7 @@ def test_each_part_is_reflected():
     parts = lambda s: (s.lagrangian, s.constraints["edge"].residual, s.force, s.dissipation)
     for sign, ours, theirs in zip((1, -1, 1, -1), parts(reflected), parts(sledge)):
         there, here, not_reflected = (
-            np.array(jax.tree.leaves(of(*state, SLEDGE)), float)
+            np.array(jax.tree.leaves(by_numpy(of)(*state, SLEDGE)))
             for of, state in ((ours, (-1.3, q, negative)), (theirs, (1.3, q, v)), (ours, (1.3, q, v)))
         )
         np.testing.assert_allclose(there, sign * here, rtol=1e-15)

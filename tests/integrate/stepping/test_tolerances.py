@@ -19,6 +19,7 @@ from lagjax.integrate.stepping.tolerances import (
     tolerances_at,
 )
 from tests.by_hand import by_hand
+from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, TS, driven, motion, pendulum, rod_pendulum
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
@@ -67,14 +68,15 @@ def test_given_tolerances_stay():
     start = SimpleNamespace(q=np.array([3.0, -4.0]), v=np.array([0.0, 7.0]))
     kept = tolerances_at(start, np.array([0.0, 2.0]), settings)
     assert kept.rtol is settings.rtol and kept.atol is settings.atol
-    by_size = tolerances_at(start, np.array([0.0, 2.0]), SimpleNamespace(by_size=True, rtol=np.full(2, 1e-9)))
-    np.testing.assert_allclose(by_size.atol, [4e-9, 7e-9])
+    settings = SimpleNamespace(by_size=True, rtol=np.full(2, 1e-9))
+    by_size = by_numpy(lambda q, v, ts: tolerances_at(SimpleNamespace(q=q, v=v), ts, settings).atol)
+    np.testing.assert_allclose(by_size(start.q, start.v, np.array([0.0, 2.0])), [4e-9, 7e-9])
 
 
 EVEN = np.ones((2, 2))
 
 
-@jax.jit
+@by_numpy
 def weighed(size, error, mass, sizes_so_far):
     """The weighed error, (2, 2), of one step of length 1 from and to coordinates and velocities of this size."""
     pid, both = diffrax.PIDController(rtol=1e-9, atol=1e-9), jnp.full(2, 1e-9)
@@ -105,7 +107,7 @@ def test_scales_have_units():
     """Scales follow the units of length and time; twin: changing one coordinate's unit does not affect the others."""
     mass, q, v, a = np.array([4.0, 0.25]), np.array([3.0, 0.0]), np.array([0.0, 0.5]), np.array([1.0, 2.0])
 
-    @jax.jit
+    @by_numpy
     def of(mass, q, v, a, span):
         scales = scales_of(mass, q, v, a, span)
         others = shared(scales, scales.first)
@@ -195,12 +197,9 @@ def test_forces_that_cancel():
     """Round-off of accelerations a in a step h leaves 8 ε a h² and 8 ε a h, of the larger a beside a time; a start that
     is no more than that is at rest. Twin: a start a thousand times farther is none."""
     forced, eps = Forced(np.array([0.0, 1.0, 3.0]), np.array([[0.0, 2.0], [4.0, 2.0], [1.0, 0.0]])), np.finfo(float).eps
-    np.testing.assert_array_equal([forced.near(np.array(t)) for t in (0.0, 2.0, 3.0)], [[4.0, 2.0]] * 3)
-    np.testing.assert_allclose(
-        forced.left_over(np.array([4.0, 2.0]), np.array(0.1)), 8 * eps * np.array([[0.04, 0.02], [0.4, 0.2]])
-    )
-    still = [
-        scales_of(np.ones(2), size * np.ones(2), np.zeros(2), np.zeros(2), np.array(3.0), forced=forced).unknown
-        for size in (1e-16, 1e-9)
-    ]
-    assert [bool(x) for x in still] == [True, False]
+    near, left_over = by_numpy(Forced.near), by_numpy(Forced.left_over)
+    np.testing.assert_array_equal([near(forced, t) for t in (0.0, 2.0, 3.0)], [[4.0, 2.0]] * 3)
+    found = left_over(forced, np.array([4.0, 2.0]), 0.1)
+    np.testing.assert_allclose(found, 8 * eps * np.array([[0.04, 0.02], [0.4, 0.2]]))
+    scales = by_numpy(lambda q, forced: scales_of(1.0 + 0.0 * q, q, 0.0 * q, 0.0 * q, 3.0, forced=forced))
+    assert [bool(scales(size * np.ones(2), forced).unknown) for size in (1e-16, 1e-9)] == [True, False]

@@ -1,6 +1,7 @@
 """The error of a motion, judged and in words: its cause, and sizes that are not known."""
 
 import re
+from functools import partial
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate.trajectory.error_report import in_units_of, scaled_error, warning_of
 from tests.by_hand import HOW, by_hand
+from tests.by_numpy import by_numpy
 
 free = lj.System(lambda t, q, v, p: 0.5 * v**2)
 T = np.linspace(0.0, 30.0, 31)
@@ -42,8 +44,8 @@ def test_each_cause_is_told_apart(name):
 
 def test_errors_of_zero_have_no_unit():
     """Where a size is unknown the error is the size, in NumPy and in JAX; twin: an error of zero is none."""
-    for xp in (np, jnp):
-        found = in_units_of(xp, xp.asarray([0.595, 0.595e-6, 0.595e6, 0.0, 2.0]), xp.asarray([0.0, 0, 0, 0, 1]))
+    given = np.array([0.595, 0.595e-6, 0.595e6, 0.0, 2.0]), np.array([0.0, 0, 0, 0, 1])
+    for found in (in_units_of(np, *given), by_numpy(partial(in_units_of, jnp))(*given)):
         np.testing.assert_allclose(found, [2000, 2000, 2000, 0, 2])
 
 

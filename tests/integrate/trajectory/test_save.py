@@ -14,6 +14,7 @@ import lagjax as lj
 from lagjax.integrate.solve.phases import traced_phases
 from lagjax.system import coordinates
 from tests.by_hand import by_hand, with_problem
+from tests.by_numpy import network
 from tests.systems import HORIZONTAL, PARAMS, motion, rod_pendulum
 
 TS = np.linspace(0.0, 1.0, 4)
@@ -125,7 +126,7 @@ def test_a_million_outputs(tmp_path):
 
 def test_parameters(tmp_path):
     """All data in params come back, and networks with functions of JAX; a function of the user's is refused by name."""
-    net = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))
+    net = network(1, 1, 4, 1)
     params = {"f": jnp.cos, "net": net, "half": np.ones(2, jnp.bfloat16), "n": 3, "x": 2.5, "who": "me", "no": None}
     params |= {"many": [True, (1, np.float32(2.0))], "inf": float("inf"), "by number": {7: np.arange(3)}}
     check(of_springs(1.0, {"of": params}), springs, tmp_path / "x.npz")
