@@ -8,7 +8,7 @@ from lagjax.system.coordinates import PrecisionWarning, State, is_traced
 from lagjax.system.elements import CompliantContact, Contact, Elements, Friction, Held, SampledControl, Stop
 from lagjax.system.function_arguments import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, takes_of
 from lagjax.system.hybrid import Hybrid, Switch, replace_fields
-from lagjax.system.model import FirstOrder, Form, InModes, Model, given_in, model_of, unchecked
+from lagjax.system.model import FirstOrder, Form, Given, InModes, Model, given_in, model_of, unchecked
 from lagjax.system.signature import UnknownSystem, differences, known_system, middle_state, signature
 from lagjax.system.states import check_use, depends_on, with_rates
 from lagjax.system.system import System, check_functions, rate_of

@@ -112,6 +112,20 @@ class InModes(NamedTuple):
     slack: Float[Array, " k"]
 
 
+class Given(NamedTuple):
+    """The parameters, and the outcomes of comparisons, `modes` (n,): what functions that are smooth in each take as
+    `params`.
+
+    `slides` (n,): along which of the jumps the motion slides. `free`: whether the comparisons decide themselves, as in
+    the user's own functions.
+    """
+
+    params: PyTree
+    modes: Float[Array, " n"]
+    slides: Bool[Array, " n"]
+    free: Bool[Array, ""]
+
+
 def given_in(row: InModes | None, params: PyTree) -> PyTree:
     """What functions take as parameters in the modes of a row, which has None in their place; without modes, these."""
     return params if row is None else row._replace(params=params)
@@ -148,7 +162,8 @@ class Model(eqx.Module):
     @property
     def off(self) -> Bool[Array, " m"] | None:
         """Which of the stacked constraint equations do not hold in the present mode; None where all always hold."""
-        return self.params.off if isinstance(self.params, InModes) else None
+        params = self.params.params if isinstance(self.params, Given) else self.params
+        return params.off if isinstance(params, InModes) else None
 
     @property
     def phases(self) -> "tuple[Model, ...]":

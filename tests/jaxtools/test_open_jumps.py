@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.integrate.jumps.find import Given
+from lagjax.system import Given
 from tests.integrate.jumps.test_find import JUMPING, jumps_of
 from tests.jaxtools.in_numpy import run
 

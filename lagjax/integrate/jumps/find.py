@@ -20,27 +20,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools import COMPARISONS, JumpOpening, JumpTable, KnownValue, Slot, Timed, has_jumps, outputs_of, run
-from lagjax.system import OF_STATE, Model, State, System, rate_of, takes_of
+from lagjax.system import OF_STATE, Given, Model, State, System, rate_of, takes_of
 
 # More modes than this are not followed: each adds to the program that watches the motion.
 MOST = 24
 NAMES = {"lagrangian": "Lagrangian", "force": "force", "dissipation": "dissipation"}
-
-
-class Given(NamedTuple):
-    """The parameters, and the modes (n,): what the functions of the smooth system take as `params`.
-
-    `slides` (n,): along which of the jumps the motion slides. `free`: whether the comparisons decide themselves, as in
-    the user's own functions.
-    """
-
-    params: PyTree
-    modes: Float[Array, " n"]
-    slides: Bool[Array, " n"]
-    free: Bool[Array, ""]
 
 
 class Smooth(eqx.Module):

@@ -21,12 +21,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.integrate.jumps.find import Given, Jumps, Smooth
+from lagjax.integrate.jumps.find import Jumps, Smooth
 from lagjax.mechanics import applied_force, completed, mass_and_forcing, with_first_order
 from lagjax.numerics import dense
 from lagjax.system import (
     OF_STATE,
     WITH_MULTIPLIERS,
+    Given,
     Model,
     System,
     constraints,

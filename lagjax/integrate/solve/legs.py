@@ -128,9 +128,9 @@ class Place:
         """Whether a mode is one of these."""
         return True
 
-    def given(self, params: PyTree, mode: Any) -> Any:
-        """What functions take as `params` in a mode."""
-        raise NotImplementedError
+    def given(self, params: PyTree, way: Way) -> Any:
+        """What functions take as `params` in the leg that begins here."""
+        return params
 
     def until(self, ahead: Float[Array, " T"], way: Way) -> Float[Array, " T"]:
         """The outputs `ahead`, no further than where the next leg ends in any case."""
@@ -187,7 +187,7 @@ def before_any(
 def _after(place: Place, here: Array, way: Way, params: PyTree, ts: Array, settings: Settings, adjoint: Any) -> Way:
     """The way after one more leg in a place, for the lanes that are `here`."""
     ahead, at = outputs_ahead(ts, way.t)
-    begins, given = here & way.begins, place.given(params, way.mode)
+    begins, given = here & way.begins, place.given(params, way)
     # Lanes elsewhere stand still.
     times = jnp.where(here & ~begins, place.until(ahead, way), way.t)
     found = apart(

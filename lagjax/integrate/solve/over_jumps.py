@@ -15,17 +15,19 @@ Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`in
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.elements.in_modes import WithElements
 from lagjax.integrate.events.event import LONG, EventKind, Guards
-from lagjax.integrate.jumps.find import Given, Jumps, OfParams, Smooth
+from lagjax.integrate.jumps.find import Jumps, OfParams, Smooth
 from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
@@ -47,8 +49,8 @@ from lagjax.integrate.stepping.tolerances import DIED_OUT
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.integrate.trajectory.trajectory import Trajectory
-from lagjax.jaxtools import IN_TIME, apart, stop_gradient
-from lagjax.system import System, model_of, warn
+from lagjax.jaxtools import IN_TIME, apart, stop_gradient, where
+from lagjax.system import WITH_MULTIPLIERS, Given, System, model_of, warn
 
 # The most jumps that are followed in a motion.
 MOST_JUMPS = 1000
@@ -124,38 +126,99 @@ class Piecewise(eqx.Module):
 
 
 def piecewise_of(jumps: Jumps, system: System, small: bool) -> Piecewise:
-    """The smooth system with its guards; motions slide in `small` systems."""
-    smooth, guards, sliding = jumps.smooth(system), jumps.numbers(system, 0), None
-    which = slidable(jumps, system) if small else ()
+    """The smooth system with its guards; motions slide in `small` systems. Forces of elements stay as they are."""
+    bare, beside = without_elements(system)
+    smooth, guards, sliding = jumps.smooth(bare), jumps.numbers(bare, 0), None
+    if beside is not None:
+        smooth = replace(smooth, force=Beside(smooth.force, beside))
+    which = slidable(jumps, smooth) if small else ()
     if which:
-        differences = jumps.numbers(system, 2)
+        differences = jumps.numbers(bare, 2)
         sliding = Sliding(smooth, tuple(differences[i] for i in which), which)
         smooth = replace(smooth, force=Mixed(smooth.force, sliding))
     guards = tuple(ModeGuard(guard, sliding if i in which else None, i) for i, guard in enumerate(guards))
     pauses = sliding is not None or any(IN_TIME in slot.depends for slot in jumps.slots)
-    return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(system, 1)), pauses)
+    return Piecewise(smooth, sliding, guards, tuple(jumps.numbers(bare, 1)), pauses)
+
+
+class Beside(eqx.Module):
+    """The forces of elements beside a smooth one."""
+
+    force: Callable | None
+    elements: WithElements
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: Given):
+        own = self.elements(t, q, v, multipliers, given.params)
+        return own if self.force is None else jax.tree.map(jnp.add, self.force(t, q, v, given), own)
+
+
+def without_elements(system: System) -> tuple[System, WithElements | None]:
+    """A system of `InModes` without the forces of elements, and these; any other system as it is."""
+    if not isinstance(system.force, WithElements):
+        return system, None
+    force = system.force.force
+    bare = replace(system, force=None if force is None else OfParams(force))
+    return bare, replace(system.force, force=None)
 
 
 class Outcomes(NamedTuple):
-    """The mode of a motion over jumps: as in `Given`."""
+    """The outcomes of one system's comparisons, and along which the motion slides: as in `Given`."""
 
     modes: Float[Array, " n"]
     slides: Bool[Array, " n"]
+
+
+class Jumping(NamedTuple):
+    """The mode of a motion over jumps: that of its place, and the outcomes in each place.
+
+    `fresh`: whether outcomes are still to be found, as the comparisons say. `free`: as in `Given`. `count`: of the
+    jumps so far.
+    """
+
+    inner: Any
+    outcomes: tuple[Outcomes | None, ...]
+    fresh: Bool[Array, ""]
     free: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
+class Alone(Place):
+    """A motion of one system, with the guards of the user's events."""
+
+    def __init__(self, system: System, guards: Guards | None):
+        self.system, self.guards = system, guards
+
+    def then(self, leg: Leg) -> Then:
+        no, end, yes = jnp.asarray(False), leg.end, jnp.asarray(True)
+        return Then(no, no, False, end, end.q, end.v, None, None, leg.result, leg.events, leg.rows, yes)
 
 
 class OverJumps(Place):
-    """The modes of a piecewise system, in a motion over `ts`; the first guards are theirs."""
+    """Place `i` of a motion over `ts`, in which jumps are followed, if there are any: their guards come first."""
 
-    def __init__(self, piecewise: Piecewise, guards: Guards, ts: Array, settings: Settings):
-        self.piecewise, self.guards, self.ts, self.settings = piecewise, guards, ts, settings
-        self.system = piecewise.smooth
+    def __init__(self, inner: Place, i: int, jumps: Jumps | None, small: bool, ts: Array, settings: Settings):
+        self.inner, self.i, self.ts, self.settings, self.jumps = inner, i, ts, settings, jumps
+        self.piecewise = None if jumps is None else piecewise_of(jumps, inner.system, small)
+        self.system = inner.system if self.piecewise is None else self.piecewise.smooth
+        self.guards = inner.guards if self.piecewise is None else _together(self.piecewise, inner.guards)
+        self.forced = inner.forced
 
-    def given(self, params: PyTree, mode: Outcomes) -> Given:
-        return Given(params, *mode)
+    def has(self, mode: Jumping) -> Bool[Array, ""] | bool:
+        return self.inner.has(mode.inner)
+
+    def given(self, params: PyTree, way: Way) -> Any:
+        given, mode = self.inner.given(params, _inside(way)), way.mode
+        before = mode.outcomes[self.i]
+        if self.jumps is None or before is None:
+            return given
+        found = self.jumps.modes(without_elements(self.inner.system)[0], way.t, way.q, way.v, given)
+        modes = jnp.where(mode.fresh, stop_gradient(found), before.modes)
+        return Given(given, modes, before.slides & ~mode.fresh, mode.free)
 
     def until(self, ahead: Float[Array, " T"], way: Way) -> Float[Array, " T"]:
-        if not self.piecewise.pauses or self.settings.jump_ts is None:
+        ahead = self.inner.until(ahead, _inside(way))
+        if self.piecewise is None or not self.piecewise.pauses or self.settings.jump_ts is None:
             return ahead
         # A guard that jumps in time may have no zero: the next leg begins there, and ends at once. Not `minimum`, whose
         # derivative is one half for an output at that time.
@@ -163,49 +226,82 @@ class OverJumps(Place):
         return jnp.where(ahead > pause, pause, ahead)
 
     def then(self, leg: Leg) -> Then:
-        """What follows a leg: the mode beyond a comparison; the same, after a pause; or the same leg without modes."""
-        way, given, (modes, slides, free), guards = leg.way, leg.given, leg.way.mode, self.piecewise.guards
-        last, options = self.ts[-1], (resolution(self.ts), self.settings.rtol)
-        when, of_events = times_of(self.guards, leg.events, len(guards), last.dtype)
-        by_jump, first, _, below, end = apart(
-            ending_of, self.guards, len(guards), leg, jnp.stack(when), of_events, False, *options
+        """The mode beyond a comparison; the same, after a pause; the same leg without modes; or what follows in the
+        place alone."""
+        mode, last, here = leg.way.mode, self.ts[-1], leg.here & ~leg.begins
+        given = leg.given if self.piecewise is None else leg.given.params
+        then = self.inner.then(leg._replace(way=_inside(leg.way), given=given))
+        by_jump, again, end, outcomes = jnp.asarray(False), jnp.asarray(False), leg.end, mode.outcomes
+        if self.piecewise is not None:
+            guards, given = self.piecewise.guards, leg.given
+            when, of_events = times_of(self.guards, leg.events, len(guards), last.dtype)
+            found = apart(
+                ending_of, self.guards, len(guards), leg, jnp.stack(when), of_events, False, resolution(self.ts),
+                self.settings.rtol,
+            )  # fmt: skip
+            end, ends_well = found.end, ended_well(leg.result)
+            gives_up = (leg.result == RESULTS.max_steps_reached) | (leg.result == RESULTS.no_progress)
+            # Where a force jumps in time, the side of which a guard is belongs to the next leg.
+            wrong = ends_well & ~found.by_guard & (end.t >= last) & found.below | ~ends_well & ~gives_up
+            by_jump, again = here & found.by_guard, here & ~mode.free & wrong
+            # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
+            beyond = Outcomes(*apart(_beyond, self.piecewise, found.first, leg.end, given))
+            new = where(by_jump, beyond, Outcomes(given.modes, given.slides))
+            outcomes = tuple(new if i == self.i else x for i, x in enumerate(outcomes))
+        mine = by_jump | again
+        onward, count = then.onward & ~mine, mode.count + by_jump
+        paused = here & ~mine & (then.result == RESULTS.successful) & ~then.moves & (then.end.t < last)
+        free = mode.free | again | (by_jump & (count >= MOST_JUMPS))
+        result = RESULTS.where(by_jump, RESULTS.successful, RESULTS.where(again, leg.result, then.result))
+        end = end._replace(multipliers=unknown(then.end.multipliers) | end.multipliers)
+        inner, record, events, end, q, v, rows_q = where(
+            mine,
+            (mode.inner, leg.way.record, {x: leg.events[x] for x in then.events}, end, end.q, end.v, leg.rows["q"]),
+            (then.mode, then.record, then.events, then.end, then.q, then.v, then.rows["q"]),
         )
-        ends_well, whole = ended_well(leg.result), end.t >= last
-        gives_up = (leg.result == RESULTS.max_steps_reached) | (leg.result == RESULTS.no_progress)
-        # Where a force jumps in time, the side of which a guard is belongs to the next leg.
-        again = leg.here & ~free & (ends_well & ~by_jump & whole & below | ~ends_well & ~gives_up)
-        onward, result = leg.here & by_jump, RESULTS.where(by_jump, RESULTS.successful, leg.result)
-        paused = leg.here & (result == RESULTS.successful) & ~onward & ~again & ~whole
-        # Not where a leg began, if it ended at once: what jumps with time has jumped only after that.
-        beyond, along = apart(_beyond, self.piecewise, first, leg.end, given)
-        mode = Outcomes(
-            jnp.where(onward, beyond, modes), jnp.where(onward, along, slides),
-            free | again | (onward & (way.count + 1 >= MOST_JUMPS)),
-        )  # fmt: skip
-        moves, at_first = onward | paused, way.t <= self.ts[0]
-        return Then(onward, moves, again, end, end.q, end.v, mode, None, result, leg.events, leg.rows, at_first)
+        mode = Jumping(inner, outcomes, onward, free, count)
+        moves, before = jnp.where(mine, by_jump, then.moves | paused), then.before & (leg.way.t <= self.ts[0])
+        return Then(onward, moves, again, end, q, v, mode, record, result, events, then.rows | {"q": rows_q}, before)
+
+
+def _inside(way: Way) -> Way:
+    return way._replace(mode=way.mode.inner)
+
+
+def over_jumps(
+    jumps: Sequence[Jumps | None], places: Sequence[Place], first: Way, params: PyTree, ts: Array, of_place: Callable,
+    settings: Settings, adjoint: Any, most: int, turns: int,
+) -> tuple[Way, dict[str, Array]]:  # fmt: skip
+    """The way after all legs (`over_legs`) in places whose jumps are followed, if there are any; and its statistics."""
+    if not any(jumps):
+        way = over_legs(places, first, params, ts, of_place, adjoint, most, turns)
+        return way, way.stats
+    over, outcomes = [], []
+    for i, (place, mine) in enumerate(zip(places, jumps)):
+        model = model_of(place.system, ts[0], first.q, first.v, place.given(params, first))
+        over.append(OverJumps(place, i, mine, model.n + model.m <= 24, ts, settings))
+        none = None if mine is None else Outcomes(jnp.zeros(mine.count, ts.dtype), jnp.zeros(mine.count, bool))
+        outcomes.append(none)
+    no, more = jnp.asarray(False), MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
+    first = first._replace(mode=Jumping(first.mode, tuple(outcomes), ~no, no, jnp.asarray(0)))
+    way = over_legs(over, first, params, ts, lambda place: of_place(place.inner), adjoint, most, turns + more)
+    return way, way.stats | {"num_jumps": way.mode.count, "lost_jumps": way.mode.free}
 
 
 def solved_over_jumps(
-    jumps: Jumps, system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, guards, settings: Settings,
-    adjoint: Any,
+    jumps: Sequence[Jumps | None], system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, guards,
+    settings: Settings, adjoint: Any,
 ):  # fmt: skip
     """Return the fields of the trajectory, like `one_motion.solved`."""
     model = model_of(system, ts[0], q0, v0, params)
-    piecewise = piecewise_of(jumps, system, small=model.n + model.m <= 24)
-    modes = stop_gradient(jumps.modes(system, ts[0], q0, v0, params))
-    mode = Outcomes(modes, jnp.zeros(modes.shape, bool), jnp.asarray(False))
     multipliers, sizes = unknown(model.zero_multipliers()), sizes_of(q0, v0)
     # A motion that rests at zero, held by friction, has round-off alone to tell its size.
     sizes = jnp.where(jnp.any(sizes > 0), sizes, 1 / DIED_OUT)
     start, names = Snapshot(ts[0], q0, v0, multipliers), () if guards is None else [kind.name for kind in guards.kinds]
     rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, ts.shape[0])
     events = nothing(guards, names, q0, v0, multipliers)
-    first = before_any(start, start, mode, sizes, settings, rows, events)
-    turns = MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
-    place = OverJumps(piecewise, _together(piecewise, guards), ts, settings)
-    way = over_legs([place], first, params, ts, lambda place: settings, adjoint, MOST_JUMPS, turns)
-    stats = way.stats | {"num_jumps": way.count, "lost_jumps": way.mode.free}
+    first, places = before_any(start, start, None, sizes, settings, rows, events), [Alone(system, guards)]
+    way, stats = over_jumps(jumps, places, first, params, ts, lambda place: settings, settings, adjoint, 0, 0)
     return way.fields(settings) | {"stats": stats}
 
 

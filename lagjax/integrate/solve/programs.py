@@ -16,6 +16,7 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
@@ -25,12 +26,13 @@ from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.jumps.sliding import slidable
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.assembly import InElements
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
-from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost
+from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.segments import solved_in_phases
 from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.trajectory.parts import SolveInfo, SolveOptions, pack
@@ -170,24 +172,29 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
-    jumps = None if settings.jumps == "ignored" else followed(settings, model, start)
-    in_time = jumps if jumps is not None and jumps.in_time else None
-    jumps = jumps if jumps is not None and jumps.count else None
-    solve = solved_in_phases if system.in_phases else partial(solved_over_jumps, jumps) if jumps else solved
+    jumps = [None for _ in model.phases] if settings.jumps == "ignored" else followed(settings, model, start)
+    in_time = [x if x is not None and x.in_time else None for x in jumps]
+    jumps = [x if x is not None and x.count else None for x in jumps]
+    solve = partial(solved_in_phases, jumps) if system.in_phases else solved
+    if any(jumps) and not system.in_phases:
+        solve = partial(solved_over_jumps, jumps)
 
     def solve_arrays(x, fixed, adjoint: Any, differentiated):
         rest, settings = eqx.combine(fixed, static)
         *motion, jump_ts = eqx.combine(x, rest)
-        too_many = None
-        if in_time is not None:
-            jump_ts, too_many = with_jumps_in_time(in_time, jump_ts, *motion[:5])
-        unroll_up_to = 0 if differentiated or jumps else settings.unroll_up_to
+        too_many = jnp.asarray(False)
+        for mine, phase in zip(in_time, model_of(motion[0], motion[4][0], *motion[1:4]).phases if any(in_time) else ()):
+            if mine is not None:
+                bare, _ = without_elements(phase.system)
+                jump_ts, many = with_jumps_in_time(mine, jump_ts, bare, *motion[1:3], phase.params, motion[4])
+                too_many = too_many | many
+        unroll_up_to = 0 if differentiated or any(jumps) else settings.unroll_up_to
         robust = settings.robust or differentiated and settings.adjoint is None
         settings = replace(
             settings, jump_ts=jump_ts, unroll_up_to=unroll_up_to, robust=robust, differentiated=differentiated
         )
         fields = solve(*motion, settings, adjoint)
-        if too_many is not None:
+        if any(in_time):
             fields["stats"] = with_lost(fields["stats"], too_many)
         return fields, fields.pop("record", None)
 
@@ -204,13 +211,10 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     return of(t=ts, **fields, arrays=arrays, static=described), settled
 
 
-def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
-    """The jumps of a system that a motion follows; None if there are none. Says which are not followed."""
-    starts = [(phase, start._replace(params=phase.params)) for phase in model.phases]
-    found = [jumps for phase, s in starts if (jumps := jumps_found(phase, s)) is not None]
-    if model.system.in_phases:
-        why = "in the phases of a lj.Hybrid"
-    elif isinstance(settings.method, EqualSteps):
+def followed(settings: Settings, model: Model, start: State) -> list[Jumps | None]:
+    """The jumps of each phase that a motion follows; None if there are none. Says which are not followed."""
+    found, missed = [], []
+    if isinstance(settings.method, EqualSteps):
         why = "in steps of equal length, which are less accurate where one goes across"
     elif settings.controller is not None or settings.event is not None:
         why = "with a stepsize_controller, or a condition for diffrax, of your own"
@@ -218,12 +222,22 @@ def followed(settings: Settings, model: Model, start: State) -> Jumps | None:
         why = "with diffrax.BacksolveAdjoint"
     else:
         why = ""
-    missed = [words for jumps in found for words in jumps.missed]
-    if why:
-        missed += [f"{words}, {why}" for jumps in found for words in jumps.in_words()]
+    for phase in model.phases:
+        bare, beside = without_elements(phase.system)
+        state = start._replace(params=phase.params)
+        jumps = jumps_found(model_of(bare, *state), state)
+        found.append(jumps)
+        if jumps is None:
+            continue
+        not_here, missed = why, [*missed, *jumps.missed]
+        if not why and beside is not None and slidable(jumps, bare):
+            not_here = "along which the motion could slide, beside friction or springs among the elements"
+        if not_here:
+            missed += [f"{words}, {not_here}" for words in jumps.in_words()]
+            found[-1] = None
     if missed:
         warn_of_missed(missed)
-    return found[0] if found and not why else None
+    return found
 
 
 def _how(method: diffrax.AbstractSolver, asked, settings: Settings, in_legs):

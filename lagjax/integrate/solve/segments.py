@@ -5,6 +5,7 @@ zero, it is crossed at once, in a leg of no length: this handles two guards at o
 contact that has stopped sliding.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import Guards
+from lagjax.integrate.jumps.find import Jumps
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     Ending,
@@ -27,12 +29,12 @@ from lagjax.integrate.solve.legs import (
     before_any,
     ending_of,
     nothing,
-    over_legs,
     sizes_of,
     times_of,
     unknown,
 )
 from lagjax.integrate.solve.one_motion import resolution
+from lagjax.integrate.solve.over_jumps import over_jumps
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, Switches
 from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
 from lagjax.integrate.trajectory.results import RESULTS
@@ -96,8 +98,8 @@ class InPhase(Place):
     def has(self, mode: Mode) -> Bool[Array, ""]:
         return mode.phase == self.i
 
-    def given(self, params: PyTree, mode: Mode) -> PyTree:
-        return self.phase.given(params, mode.of_elements)
+    def given(self, params: PyTree, way: Way) -> PyTree:
+        return self.phase.given(params, way.mode.of_elements)
 
     def next_instant(self, mode: Mode) -> Float[Array, ""]:
         """That of sampled controls; infinite without."""
@@ -129,7 +131,7 @@ class InPhase(Place):
             acting = jax.vmap(partial(phase.meeting.laws.acting, given=given))(*every)
             rows = rows | {"multipliers": rows["multipliers"] | {name: x[:-1] for name, x in acting.items()}}
             end = end._replace(multipliers=end.multipliers | {name: x[-1] for name, x in acting.items()})
-        instant = here & ~leg.begins & jnp.isfinite(until) & (result == RESULTS.successful)
+        instant = here & ~leg.begins & (leg.times[-1] == until) & (result == RESULTS.successful)
         if phase.guards is not None and phase.switches or phase.meeting is not None:
             count = len(phase.switches)
             when, of_events = times_of(phase.guards, events, count, ts.dtype)
@@ -182,23 +184,27 @@ class InPhase(Place):
 
 
 def solved_in_phases(
-    hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases, settings: Settings, adjoint: Any
-):
-    """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches."""
+    jumps: Sequence[Jumps | None], hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phases,
+    settings: Settings, adjoint: Any,
+):  # fmt: skip
+    """Return the fields of the trajectory, like `one_motion.solved`, with the phase of each output and the switches.
+
+    `jumps`: those of each phase's forces.
+    """
     phases = [phase.in_motion(settings.rtol[0], ts, q0, v0, params) for phase in phases]
     first = _first(hybrid, q0, v0, params, ts, phases[0], settings)
     places = [InPhase(hybrid, i, phase, params, ts, settings) for i, phase in enumerate(phases)]
 
-    def of_place(place: InPhase) -> Settings:
+    def of_place(place: Place) -> Settings:
         return settings if place.system.constraints else replace(settings, drift="none")
 
     # Each turn takes every lane at least one leg further.
     most = hybrid.most_switches
     turns = most + 1 + any(phase.meeting is not None for phase in phases)
-    way = over_legs(places, first, params, ts, of_place, adjoint, most, turns)
+    way, stats = over_jumps(jumps, places, first, params, ts, of_place, settings, adjoint, most, turns)
     found, switches = way.fields(settings), way.record
     events = found["events"] | ({SWITCHES: switches.as_crossings()} if switches.ways else {})
-    return found | {"events": events, "switches": switches}
+    return found | {"events": events, "switches": switches, "stats": stats}
 
 
 def _first(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, phase: Phase, settings: Settings) -> Way:
