@@ -19,6 +19,7 @@ THEMES = {
     "system/hybrid": "Phases, contacts and impacts",
     "integrate/contacts": "Phases, contacts and impacts",
     "integrate/solve/phases": "Phases, contacts and impacts",
+    "integrate/solve/legs": "Phases, contacts and impacts",
     "integrate/solve/segments": "Phases, contacts and impacts",
     "analysis/phase_graph": "Phases, contacts and impacts",
     "integrate/events": "Events and sections",

@@ -46,7 +46,7 @@ class SolvedPath(NamedTuple):
     amplification: Float[Array, ""]
     aim: shoot.Aim
     response: Float[Array, "n+b N+b"]
-    course: shoot.Course
+    course: shoot.ShotCourse
 
 
 @compiled
@@ -58,7 +58,7 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
     response = shoot.response_of(model, ends, found)
     scale = extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
-    course = shoot.Course(found.path, scale, jnp.max(last.errors))
+    course = shoot.ShotCourse(found.path, scale, jnp.max(last.errors))
     return SolvedPath(
         found, last.part, at_nodes, last.errors, _action(model, ends, found), jnp.max(sizes),
         shoot.start_of(model, ends, found), response, course,

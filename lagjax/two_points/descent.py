@@ -35,7 +35,7 @@ RADIUS, OFF_SADDLE, SHORTEST, FAR = 0.3, 0.2, 1e-6, 1e2
 STEPS, GAIN, MOST = 60, 1e-5, 800
 
 
-class _Place(NamedTuple):
+class _Nodes(NamedTuple):
     """Nodes (K, s, n) on the constraints, their action, and its derivatives in displacements that these allow."""
 
     x: np.ndarray
@@ -80,7 +80,7 @@ def down_from(model: Model, ends: Ends, x: np.ndarray, parts: np.ndarray, sizes:
     return None if place is None else ground.descended(place)
 
 
-def _moved(place: _Place, step: np.ndarray) -> np.ndarray:
+def _moved(place: _Nodes, step: np.ndarray) -> np.ndarray:
     free = step if place.allowed is None else place.allowed @ step
     shape = place.x.shape
     return place.x + np.append(free, np.zeros(shape[2])).reshape(shape)
@@ -97,7 +97,7 @@ class _Ground:
         wave = (np.sin(np.pi * shares.ravel()[:-1])[:, None] * sizes.sizes[None]).ravel()
         self.unit = float(np.sqrt(wave @ self.kinetic @ wave))
 
-    def at(self, x: np.ndarray, multipliers: np.ndarray | None) -> _Place | None:
+    def at(self, x: np.ndarray, multipliers: np.ndarray | None) -> _Nodes | None:
         """The place of these nodes; None where the action is not finite."""
         model, (count, s, n) = self.model, x.shape
         m = int(model.holonomic.sum())
@@ -112,7 +112,7 @@ class _Ground:
             if not (np.isfinite(action) and np.all(np.isfinite(slope)) and np.all(np.isfinite(matrix))):
                 return None
             if not m:
-                return _Place(np.asarray(x, float), float(action), slope, matrix, self.kinetic, None, known)
+                return _Nodes(np.asarray(x, float), float(action), slope, matrix, self.kinetic, None, known)
             of_x = np.tile(np.arange(n + m) < n, count * s - 1)
             rows = matrix[~of_x][:, of_x]
             # What is left of the slope along the constraints' rows is taken up by their multipliers.
@@ -124,9 +124,9 @@ class _Ground:
             again = False
         q = np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :]
         curvature, metric = q.T @ matrix[of_x][:, of_x] @ q, q.T @ self.kinetic @ q
-        return _Place(np.asarray(x, float), float(action), q.T @ slope[of_x], curvature, metric, q, known)
+        return _Nodes(np.asarray(x, float), float(action), q.T @ slope[of_x], curvature, metric, q, known)
 
-    def descended(self, place: _Place) -> np.ndarray | None:
+    def descended(self, place: _Nodes) -> np.ndarray | None:
         """The nodes at which the action is least nearby; None where it falls without limit."""
         radius, start = RADIUS * self.unit, place.x
         size = np.max(np.abs(start), axis=(0, 1)) + self.sizes.sizes

@@ -167,7 +167,7 @@ def launches_of(model: Model, ends: Ends, count: int, rtol) -> list[PathGuess]:
     return found
 
 
-class Course(NamedTuple):
+class ShotCourse(NamedTuple):
     """A path as motions are compared with it: with the sizes of its coordinates, and the largest error of its
     elements."""
 
@@ -195,7 +195,7 @@ class Shot(NamedTuple):
     trajectory: Trajectory
 
 
-def shot(model: Model, ends: Ends, course: Course, aim: Aim, response: Array, outputs: int, rtol) -> Shot | str:
+def shot(model: Model, ends: Ends, course: ShotCourse, aim: Aim, response: Array, outputs: int, rtol) -> Shot | str:
     """Correct until the motion meets the end; in words, why it cannot be followed there."""
     dtype = np.asarray(aim.u).dtype
     eps, met, nearest = float(np.finfo(dtype).eps), MET.get(dtype, 1e-3), np.inf
@@ -280,7 +280,7 @@ def _row_sizes(model: Model, ends: Ends, aim: Aim, sizes: Array, q, v) -> Float[
     return jnp.where(found > 0, found, 1.0)
 
 
-def _grows(model: Model, ends: Ends, course: Course, response: Array) -> str:
+def _grows(model: Model, ends: Ends, course: ShotCourse, response: Array) -> str:
     """By how much an error of the start velocity grows up to the end."""
     n, scale = model.n, np.asarray(course.sizes)
     by_end = np.asarray(response)[:n, :n] * scale[None] / scale[:, None] * float(ends.duration)
@@ -303,7 +303,9 @@ class _Shots(NamedTuple):
     going: Array
 
 
-def shot_inside(model: Model, ends: Ends, course: Course, aim: Aim, response: Array, outputs: int, rtol: Array) -> Shot:
+def shot_inside(
+    model: Model, ends: Ends, course: ShotCourse, aim: Aim, response: Array, outputs: int, rtol: Array
+) -> Shot:
     """The same in a program; a motion that leaves the path misses by infinity."""
     run = partial(motion, model, ends, outputs=outputs, rtol=rtol, throw=False, estimate_error=False)
     blank = eqx.filter_eval_shape(run, aim)

@@ -111,7 +111,7 @@ class Element(NamedTuple):
     point_multipliers: Array
 
 
-class Ends(NamedTuple):
+class PlanEnds(NamedTuple):
     """What the conditions at both ends see; the controls are those of the first and of the last element.
 
     `impulse`: along the velocity constraints, at the end.
@@ -151,7 +151,7 @@ def of_element(plant: Plant, z: Element) -> tuple[Array, Array]:
     return h * jnp.sum(rule.weights * cost), jnp.concatenate([jnp.ravel(x) for x in rows])
 
 
-def of_ends(plant: Plant, z: Ends) -> tuple[Array, Array]:
+def of_ends(plant: Plant, z: PlanEnds) -> tuple[Array, Array]:
     """The cost of the end, and the equations there: momenta, constraints at the start and at the end, conditions."""
     ts, at = (plant.t_a, z.end[0]), through(plant.control_nodes, np.array([0.0, 1.0]))
     rows, of_constraints = [], []

@@ -60,7 +60,7 @@ class BranchPoint:
 
 
 @dataclass
-class Path:
+class BranchPath:
     """The points of a branch in order, and why it ends."""
 
     points: list[BranchPoint] = field(default_factory=list)
@@ -151,13 +151,13 @@ class Tracer(abc.ABC):
             return LOST
         return self.described(z, jacobian, self.tangent(jacobian, along))
 
-    def trace(self, start: BranchPoint, most: int, on_step: Callable, first: float = FIRST) -> Path:
+    def trace(self, start: BranchPoint, most: int, on_step: Callable, first: float = FIRST) -> BranchPath:
         """Follow a branch until it leaves the range of the parameter, ends or closes.
 
         `on_step(before, after, path)` finds critical points between two points. It may return why the path ends, or
         `AGAIN` to request a shorter step.
         """
-        path, point, step = Path([start]), start, first
+        path, point, step = BranchPath([start]), start, first
         while len(path.points) < most:
             tried = step
             after, step, why = self.next_point(point, tried)
@@ -265,7 +265,7 @@ class Tracer(abc.ABC):
         candidate = self.point(z, a.tangent) if z is not None else None
         return candidate if isinstance(candidate, BranchPoint) else None
 
-    def closes(self, path: Path, step: float) -> bool:
+    def closes(self, path: BranchPath, step: float) -> bool:
         """Whether a path has returned to its start."""
         if len(path.points) < 10:
             return False

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from lagjax.analysis.continuation.arclength import AGAIN, FIRST, BranchPoint, Path
+from lagjax.analysis.continuation.arclength import AGAIN, FIRST, BranchPath, BranchPoint
 from lagjax.analysis.continuation.bifurcations import CriticalPoint, between, escape
 from lagjax.analysis.continuation.equilibrium_equations import (
     Frame,
@@ -226,7 +226,7 @@ class _Run:
 
     def __init__(self, tracer: SteadyTracer, most: int, crossings: bool):
         self.tracer, self.most, self.crossings = tracer, most, crossings
-        self.paths: list[Path] = []
+        self.paths: list[BranchPath] = []
         self.found: list[CriticalPoint] = []
         self.branches_at: list[set[int]] = []
         self.waiting: list[_Launch] = []
@@ -255,13 +255,13 @@ class _Run:
         self._describe_infinity(path)
         self.paths.append(path)
 
-    def _from(self, launch: _Launch, sign: float) -> Path:
+    def _from(self, launch: _Launch, sign: float) -> BranchPath:
         """Trace one half of a branch that crosses another."""
         critical = self.found[launch.critical]
         jacobian = self.tracer.at(critical.z)[1]
         point = self.tracer.point(critical.z, sign * launch.direction)
         if isinstance(point, str):
-            return Path([], point)
+            return BranchPath([], point)
         begin = BranchPoint(
             critical.z, jacobian, sign * launch.direction, 0.0, point.outputs, None, point.negative, launch.critical
         )
@@ -281,7 +281,7 @@ class _Run:
             self.found.append(found)
             self.branches_at.append({len(self.paths)})
 
-    def _step(self, before: BranchPoint, after: BranchPoint, path: Path) -> str | None:
+    def _step(self, before: BranchPoint, after: BranchPoint, path: BranchPath) -> str | None:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
         points = path.points
         if len(points) >= LINE and points[0].critical is not None:
@@ -379,17 +379,17 @@ def _cosine(tracer, a, b):
     return inner(a, b) / np.sqrt(inner(a, a) * inner(b, b))
 
 
-def _joined(halves: list[Path]) -> Path:
+def _joined(halves: list[BranchPath]) -> BranchPath:
     """Join both halves of a branch, from one end through the critical point to the other end."""
     first, second = halves
     points = [*second.points[:0:-1], *first.points]
     status = first.status if not second.points[1:] else f"{second.status}, and {first.status}"
     if first.status == second.status:
         status = first.status
-    return Path(points, status)
+    return BranchPath(points, status)
 
 
-def _branch(path: Path, tracer: SteadyTracer) -> Branch:
+def _branch(path: BranchPath, tracer: SteadyTracer) -> Branch:
     outputs = [p.outputs for p in path.points]
     parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *outputs)
     stable = np.array([p.growing for p in path.points], object)

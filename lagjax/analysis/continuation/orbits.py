@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.analysis.continuation.arclength import BranchPoint, Path
+from lagjax.analysis.continuation.arclength import BranchPath, BranchPoint
 from lagjax.analysis.continuation.orbit_equations import (
     ENERGY,
     ENTRY,
@@ -298,7 +298,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     return frame, z
 
 
-def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, Path, list[FoundOrbit]]:
+def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, BranchPath, list[FoundOrbit]]:
     """Trace the branch from its start."""
     size = frame.scale.size
     guide = Guide(z[:size], np.zeros(size, z.dtype))
@@ -356,7 +356,7 @@ class _Follower:
     def __init__(self, tracer: OrbitTracer):
         self.tracer, self.found = tracer, []
 
-    def step(self, before: BranchPoint, after: BranchPoint, path: Path) -> str | None:
+    def step(self, before: BranchPoint, after: BranchPoint, path: BranchPath) -> str | None:
         """Put the critical points between two points into the path; return why the branch ends, or None."""
         tracer, name = self.tracer, self.tracer.frame.along.name
         if tracer.frame.asked.moves:

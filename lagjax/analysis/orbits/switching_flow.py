@@ -94,12 +94,12 @@ class SwitchingFlow(eqx.Module):
         assert isinstance(motion, HybridTrajectory)
         return motion
 
-    def end(self, t0, z, span, phase=None) -> "tuple[Float[Array, ' 2n'], Course]":
+    def end(self, t0, z, span, phase=None) -> "tuple[Float[Array, ' 2n'], SwitchingCourse]":
         """The state after a time, and how the motion came there."""
         motion = self.motion(jnp.stack([t0, t0 + span]), z, phase)
         q, v = jax.tree.map(lambda x: x[-1], (motion.q, motion.v))
         ended = ended_well(motion.result)
-        return self.vector(q, v), Course(motion.stats["num_steps"], ended, motion.switches, motion.phase[-1])
+        return self.vector(q, v), SwitchingCourse(motion.stats["num_steps"], ended, motion.switches, motion.phase[-1])
 
     def passage(
         self, t0, z, span, frame, scale, volume=False, differentiable=False, changes: Changes | None = None, phase=None
@@ -131,7 +131,7 @@ class SwitchingFlow(eqx.Module):
         return times[order], jnp.concatenate(states)[order]
 
 
-class Course(NamedTuple):
+class SwitchingCourse(NamedTuple):
     """How a motion went: its steps, whether it came to its end, its switches, and the phase in which it ends."""
 
     steps: Int[Array, ""]
@@ -143,7 +143,7 @@ class Course(NamedTuple):
 @compiled
 def _pushed(
     flow: SwitchingFlow, t0, z, span, frame, scale, changes: Changes | None, phase
-) -> "tuple[Array, Float[Array, '2n k+1'], Course]":
+) -> "tuple[Array, Float[Array, '2n k+1'], SwitchingCourse]":
     """The state after a time, the changes with each column of a frame and with the time, and how the motion went."""
     floats, rest = eqx.partition(flow.model.params, eqx.is_inexact_array)
 

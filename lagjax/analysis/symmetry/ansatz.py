@@ -22,7 +22,7 @@ EACH_POINT_UP_TO, EACH_UP_TO, PRODUCTS_UP_TO = 8, 24, 6
 TIME = "Jacobi integral"
 
 
-class Element(NamedTuple):
+class BasisMotion(NamedTuple):
     """One motion of the basis; `kind` is "space", "time", "boost" or "scaling"."""
 
     name: str
@@ -94,7 +94,7 @@ def _element(name: str, kind, n, shift=None, matrix=None, drift=None, clock=0.0,
     zero = np.zeros(n)
     matrix = np.zeros((n, n)) if matrix is None else matrix
     shift, drift = (zero if x is None else x for x in (shift, drift))
-    return Element(name, kind, shift, matrix, drift, clock, clock_rate)
+    return BasisMotion(name, kind, shift, matrix, drift, clock, clock_rate)
 
 
 def _ones_at(places, n):

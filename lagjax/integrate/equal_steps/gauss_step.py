@@ -52,7 +52,7 @@ class Unknown(NamedTuple):
     multipliers: Float[Array, "s m"]
 
 
-class Way(NamedTuple):
+class GaussState(NamedTuple):
     """The state between two steps.
 
     `x_rest`, `p_rest`: what is to be added to x and p; `velocities`, `multipliers`: at the nodes of the last two steps,
@@ -80,16 +80,16 @@ class GaussStep(NamedTuple):
     newton: bool
     differentiated: bool
 
-    def first(self, t: Array, x: Array, u: Array) -> Way:
+    def first(self, t: Array, x: Array, u: Array) -> GaussState:
         """The state at the start."""
         s, none = len(self.tableau.nodes), jnp.zeros_like(x)
         multipliers = jnp.zeros((s, self.model.m), x.dtype)
         p = self._momentum(t, x, u)
         h, alike = jnp.zeros_like(t), jnp.asarray(0)
         kept = independent_rows(constraints.jacobian(self.model, t, x, u))
-        return Way(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, kept, h, alike, jnp.asarray(False))
+        return GaussState(x, none, p, none, jnp.tile(u, (2 * s, 1)), multipliers, kept, h, alike, jnp.asarray(False))
 
-    def advanced(self, way: Way, t: Array, h: Array) -> Way:
+    def advanced(self, way: GaussState, t: Array, h: Array) -> GaussState:
         """The state after a step from t to t + h."""
         s, dtype = len(self.tableau.nodes), h.dtype
         alike = jnp.where(jnp.abs(h - way.h) <= SAME_LENGTH * h, way.alike, 0)
@@ -105,9 +105,9 @@ class GaussStep(NamedTuple):
         p, p_rest = added(way.p, dp)
         velocities = jnp.concatenate([way.velocities[s:], found.velocities])
         alike = jnp.minimum(alike + 1, 2)
-        return Way(x, x_rest, p, p_rest, velocities, found.multipliers, kept, h, alike, way.unsolved | ~solved)
+        return GaussState(x, x_rest, p, p_rest, velocities, found.multipliers, kept, h, alike, way.unsolved | ~solved)
 
-    def _guess(self, way: Way, alike: Array, dtype) -> Float[Array, "s n"]:
+    def _guess(self, way: GaussState, alike: Array, dtype) -> Float[Array, "s n"]:
         """Velocities at the nodes, by the polynomial through those of the steps of this length."""
         tab, s = self.tableau, len(self.tableau.nodes)
         last = way.velocities[s:]
@@ -118,7 +118,7 @@ class GaussStep(NamedTuple):
         of_one, of_two = tab.ahead.astype(dtype) @ last, tab.ahead_of_two.astype(dtype) @ way.velocities
         return jnp.where(alike == 0, same, jnp.where(alike == 1, of_one, of_two))
 
-    def velocity(self, way: Way, t: Array) -> Float[Array, " n"]:
+    def velocity(self, way: GaussState, t: Array) -> Float[Array, " n"]:
         """The velocity that belongs to the momentum."""
         u = self.tableau.at_end.astype(t.dtype) @ way.velocities[len(self.tableau.nodes) :]
         return self._at_end(t, way.x, way.p, way.p_rest, u)[0]
@@ -166,7 +166,7 @@ class GaussStep(NamedTuple):
         matrix = jnp.block([[mass, -rows.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0).astype(x.dtype))]])
         return dense.inverse(matrix), round_off
 
-    def _at_nodes(self, way: Way, t: Array, h: Array, z: Unknown) -> "AtNodes":
+    def _at_nodes(self, way: GaussState, t: Array, h: Array, z: Unknown) -> "AtNodes":
         """What the path of these unknowns lacks."""
         tab, model, dtype = self.tableau, self.model, h.dtype
         times, parts, mixed = (
@@ -205,7 +205,7 @@ class GaussStep(NamedTuple):
             lacks = jnp.where(way.independent, lacks, z.multipliers)
         return AtNodes(momenta, moves, kicks, impulses, short, lacks)
 
-    def _solved(self, way: Way, t: Array, h: Array, guess: Unknown) -> tuple[Unknown, Bool[Array, ""]]:
+    def _solved(self, way: GaussState, t: Array, h: Array, guess: Unknown) -> tuple[Unknown, Bool[Array, ""]]:
         """The unknowns, by iteration, and whether that came to an end."""
         step = self._replace(model=stop_gradient(self.model))
         small = jnp.finfo(h.dtype).eps
@@ -285,16 +285,16 @@ class GaussStep(NamedTuple):
         of_velocities = _inverted(tab.inner, h.dtype) @ impulses / h
         return jnp.where(holonomic[None], of_positions, of_velocities)
 
-    def _whole_inverse(self, way: Way, t: Array, h: Array, found: Unknown) -> Array:
+    def _whole_inverse(self, way: GaussState, t: Array, h: Array, found: Unknown) -> Array:
         """The inverse of the derivative of all that is lacking by all unknowns."""
         flat, unflatten = ravel_pytree(found)
         return dense.inverse(jax.jacfwd(lambda flat: self._lacks(way, t, h, unflatten(flat)))(flat))
 
-    def _lacks(self, way: Way, t: Array, h: Array, z: Unknown) -> Array:
+    def _lacks(self, way: GaussState, t: Array, h: Array, z: Unknown) -> Array:
         at = self._at_nodes(way, t, h, z)
         return jnp.concatenate([at.short.ravel(), at.lacks.ravel()])
 
-    def _with_derivatives(self, way: Way, t: Array, h: Array, found: Unknown) -> Unknown:
+    def _with_derivatives(self, way: GaussState, t: Array, h: Array, found: Unknown) -> Unknown:
         """The same unknowns as a function of the state and the parameters: by Newton's method, which moves them by
         round-off, and makes one more derivative right in each correction."""
         still = self._replace(model=stop_gradient(self.model))

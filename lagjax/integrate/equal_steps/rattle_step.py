@@ -29,7 +29,7 @@ from lagjax.numerics import dense, independent_rows, lengths
 from lagjax.system import Model, constraints
 
 
-class Moved(NamedTuple):
+class Advance(NamedTuple):
     """What steps after each other add to the state at their start.
 
     `pull`: M⁻¹ F; `rows`: A, of the kept constraints; `multipliers`: those of the last step.
@@ -48,7 +48,7 @@ class RattleWay(NamedTuple):
 
     x: Float[Array, " n"]
     u: Float[Array, " n"]
-    moved: Moved
+    moved: Advance
     kept: Bool[Array, " m"]
     unsolved: Bool[Array, ""]
 
@@ -75,7 +75,7 @@ class RattleStep(NamedTuple):
         """The state at the start."""
         none, rows = jnp.zeros_like(x), self._rows(t, x)
         kept, solved = independent_rows(rows), jnp.asarray(False)
-        moved = Moved(none, none, self._pull(t, x), rows, jnp.zeros(self.model.m, x.dtype), solved)
+        moved = Advance(none, none, self._pull(t, x), rows, jnp.zeros(self.model.m, x.dtype), solved)
         return RattleWay(x, u, moved, kept, solved)
 
     def advanced(self, way: RattleWay, t: Array, h: Array) -> RattleWay:
@@ -83,7 +83,7 @@ class RattleStep(NamedTuple):
         parts = lengths(self.order).astype(h.dtype)
         ends = parts.cumsum()
 
-        def one(moved: Moved, part: tuple[Array, Array, Array]):
+        def one(moved: Advance, part: tuple[Array, Array, Array]):
             start, share, end = part
             return self._rattle(way, moved, (t + start * h, share * h, t + end * h)), None
 
@@ -97,7 +97,7 @@ class RattleStep(NamedTuple):
         """The velocity."""
         return way.u
 
-    def _rattle(self, way: RattleWay, moved: Moved, times: tuple[Array, Array, Array]) -> Moved:
+    def _rattle(self, way: RattleWay, moved: Advance, times: tuple[Array, Array, Array]) -> Advance:
         """A step of order 2."""
         _, h, t1 = times
         half = moved.du + h / 2 * moved.pull
@@ -114,7 +114,7 @@ class RattleStep(NamedTuple):
         du, by_impulse = half + h / 2 * pull, self._by_impulse(rows, way.kept)
         slopes = constraints.velocity_residual(self.model, t1, x, way.u + du)
         du = du - by_impulse @ (self._inverse_of(rows, by_impulse, way.kept) @ jnp.where(way.kept, slopes, 0.0))
-        return Moved(dx, du, pull, rows, 2 * impulses / h, moved.unsolved | ~solved)
+        return Advance(dx, du, pull, rows, 2 * impulses / h, moved.unsolved | ~solved)
 
     def _solved(self, problem: tuple, impulses: Array) -> tuple[Array, Bool[Array, ""]]:
         """κ, by iteration, and whether that came to an end."""

@@ -2,10 +2,10 @@
 
 What moves in legs is an *automaton*: a mode, guards that end a leg, times at which one ends in any case, and what
 happens at an end. Phases of a hybrid, modes of elements (`segments.py`) and outcomes of comparisons (`over_jumps.py`)
-are the three that there are; each is a `Place`, or several, and this is the loop that they share. Which leg comes next
-is known at run time, so that all places are in one loop; in a batch each place is solved for all lanes that are in it,
-while the others stand still. The legs are what is differentiated: the time and the state at a crossing carry their
-derivatives (`event_times.py`) into the start of the next leg, which is the saltation matrix.
+are the three that there are; each is a `Location`, or several, and this is the loop that they share. Which leg comes
+next is known at run time, so that all locations are in one loop; in a batch each location is solved for all lanes that
+are in it, while the others stand still. The legs are what is differentiated: the time and the state at a crossing carry
+their derivatives (`event_times.py`) into the start of the next leg, which is the saltation matrix.
 
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
@@ -117,7 +117,7 @@ class Then(NamedTuple):
     before: Bool[Array, ""]
 
 
-class Place:
+class Location:
     """The modes of an automaton in which one `system` moves, with its `guards`."""
 
     system: System
@@ -142,20 +142,20 @@ class Place:
 
 
 def over_legs(
-    places: Sequence[Place], first: Way, params: PyTree, ts: Float[Array, " T"], settings: Callable, adjoint: Any,
+    locations: Sequence[Location], first: Way, params: PyTree, ts: Float[Array, " T"], settings: Callable, adjoint: Any,
     most: int, turns: int,
 ) -> Way:  # fmt: skip
     """The way after all legs, of `most` changes of mode: while it continues, or in as many `turns`, for reverse mode.
 
-    `settings(place)`: those of its legs.
+    `settings(location)`: those of its legs.
     """
 
     def next_legs(way: Way) -> Way:
-        for place in places:
-            here = way.continues & place.has(way.mode)
-            leg = partial(_after, place, here, params=params, ts=ts, settings=settings(place), adjoint=adjoint)
-            # The loop asks already whether any lane is in the only place.
-            way = leg(way) if len(places) == 1 else lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
+        for location in locations:
+            here = way.continues & location.has(way.mode)
+            leg = partial(_after, location, here, params=params, ts=ts, settings=settings(location), adjoint=adjoint)
+            # The loop asks already whether any lane is in the only location.
+            way = leg(way) if len(locations) == 1 else lax.cond(eqxi.unvmap_any(here), leg, lambda way: way, way)
         return way
 
     if isinstance(adjoint, diffrax.ForwardMode):
@@ -184,18 +184,20 @@ def before_any(
     )  # fmt: skip
 
 
-def _after(place: Place, here: Array, way: Way, params: PyTree, ts: Array, settings: Settings, adjoint: Any) -> Way:
-    """The way after one more leg in a place, for the lanes that are `here`."""
+def _after(
+    location: Location, here: Array, way: Way, params: PyTree, ts: Array, settings: Settings, adjoint: Any
+) -> Way:
+    """The way after one more leg in a location, for the lanes that are `here`."""
     ahead, at = outputs_ahead(ts, way.t)
-    begins, given = here & way.begins, place.given(params, way)
+    begins, given = here & way.begins, location.given(params, way)
     # Lanes elsewhere stand still.
-    times = jnp.where(here & ~begins, place.until(ahead, way), way.t)
+    times = jnp.where(here & ~begins, location.until(ahead, way), way.t)
     found = apart(
-        solved, place.system, way.q, way.v, given, times, place.guards, settings, adjoint, way.sizes_so_far,
-        place.forced,
+        solved, location.system, way.q, way.v, given, times, location.guards, settings, adjoint, way.sizes_so_far,
+        location.forced,
     )  # fmt: skip
     rows = {name: found[name] for name in ROWS}
-    then = place.then(Leg(here, begins, way, given, times, found["end"], found["result"], found["events"], rows))
+    then = location.then(Leg(here, begins, way, given, times, found["end"], found["result"], found["events"], rows))
     again = jnp.asarray(then.again)
     counts, end, result = here & ~again & ~begins, then.end, then.result
     known = ((ts > way.t) & (ts <= end.t) | then.before & (ts <= way.t)) & counts

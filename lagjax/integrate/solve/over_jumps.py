@@ -33,7 +33,7 @@ from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     AT_ONCE,
     Leg,
-    Place,
+    Location,
     Then,
     Way,
     before_any,
@@ -170,7 +170,7 @@ class Outcomes(NamedTuple):
 
 
 class Jumping(NamedTuple):
-    """The mode of a motion over jumps: that of its place, and the outcomes in each place.
+    """The mode of a motion over jumps: that of its location, and the outcomes in each location.
 
     `fresh`: whether outcomes are still to be found, as the comparisons say. `free`: as in `Given`. `count`: of the
     jumps so far.
@@ -183,7 +183,7 @@ class Jumping(NamedTuple):
     count: Int[Array, ""]
 
 
-class Alone(Place):
+class Alone(Location):
     """A motion of one system, with the guards of the user's events."""
 
     def __init__(self, system: System, guards: Guards | None):
@@ -194,10 +194,10 @@ class Alone(Place):
         return Then(no, no, False, end, end.q, end.v, None, None, leg.result, leg.events, leg.rows, yes)
 
 
-class OverJumps(Place):
-    """Place `i` of a motion over `ts`, in which jumps are followed, if there are any: their guards come first."""
+class OverJumps(Location):
+    """Location `i` of a motion over `ts`, in which jumps are followed, if there are any: their guards come first."""
 
-    def __init__(self, inner: Place, i: int, jumps: Jumps | None, small: bool, ts: Array, settings: Settings):
+    def __init__(self, inner: Location, i: int, jumps: Jumps | None, small: bool, ts: Array, settings: Settings):
         self.inner, self.i, self.ts, self.settings, self.jumps = inner, i, ts, settings, jumps
         self.piecewise = None if jumps is None else piecewise_of(jumps, inner.system, small)
         self.system = inner.system if self.piecewise is None else self.piecewise.smooth
@@ -227,7 +227,7 @@ class OverJumps(Place):
 
     def then(self, leg: Leg) -> Then:
         """The mode beyond a comparison; the same, after a pause; the same leg without modes; or what follows in the
-        place alone."""
+        location alone."""
         mode, last, here = leg.way.mode, self.ts[-1], leg.here & ~leg.begins
         given = leg.given if self.piecewise is None else leg.given.params
         then = self.inner.then(leg._replace(way=_inside(leg.way), given=given))
@@ -269,22 +269,22 @@ def _inside(way: Way) -> Way:
 
 
 def over_jumps(
-    jumps: Sequence[Jumps | None], places: Sequence[Place], first: Way, params: PyTree, ts: Array, of_place: Callable,
-    settings: Settings, adjoint: Any, most: int, turns: int,
+    jumps: Sequence[Jumps | None], locations: Sequence[Location], first: Way, params: PyTree, ts: Array,
+    of_location: Callable, settings: Settings, adjoint: Any, most: int, turns: int,
 ) -> tuple[Way, dict[str, Array]]:  # fmt: skip
-    """The way after all legs (`over_legs`) in places whose jumps are followed, if there are any; and its statistics."""
+    """The way after all legs (`over_legs`), with the `jumps` of each location followed; and its statistics."""
     if not any(jumps):
-        way = over_legs(places, first, params, ts, of_place, adjoint, most, turns)
+        way = over_legs(locations, first, params, ts, of_location, adjoint, most, turns)
         return way, way.stats
     over, outcomes = [], []
-    for i, (place, mine) in enumerate(zip(places, jumps)):
-        model = model_of(place.system, ts[0], first.q, first.v, place.given(params, first))
-        over.append(OverJumps(place, i, mine, model.n + model.m <= 24, ts, settings))
+    for i, (location, mine) in enumerate(zip(locations, jumps)):
+        model = model_of(location.system, ts[0], first.q, first.v, location.given(params, first))
+        over.append(OverJumps(location, i, mine, model.n + model.m <= 24, ts, settings))
         none = None if mine is None else Outcomes(jnp.zeros(mine.count, ts.dtype), jnp.zeros(mine.count, bool))
         outcomes.append(none)
     no, more = jnp.asarray(False), MOST_JUMPS + 2 + (0 if settings.jump_ts is None else settings.jump_ts.size)
     first = first._replace(mode=Jumping(first.mode, tuple(outcomes), ~no, no, jnp.asarray(0)))
-    way = over_legs(over, first, params, ts, lambda place: of_place(place.inner), adjoint, most, turns + more)
+    way = over_legs(over, first, params, ts, lambda location: of_location(location.inner), adjoint, most, turns + more)
     return way, way.stats | {"num_jumps": way.mode.count, "lost_jumps": way.mode.free}
 
 
@@ -300,8 +300,8 @@ def solved_over_jumps(
     start, names = Snapshot(ts[0], q0, v0, multipliers), () if guards is None else [kind.name for kind in guards.kinds]
     rows = unknown({"q": q0, "v": v0, "multipliers": multipliers}, ts.shape[0])
     events = nothing(guards, names, q0, v0, multipliers)
-    first, places = before_any(start, start, None, sizes, settings, rows, events), [Alone(system, guards)]
-    way, stats = over_jumps(jumps, places, first, params, ts, lambda place: settings, settings, adjoint, 0, 0)
+    first, locations = before_any(start, start, None, sizes, settings, rows, events), [Alone(system, guards)]
+    way, stats = over_jumps(jumps, locations, first, params, ts, lambda location: settings, settings, adjoint, 0, 0)
     return way.fields(settings) | {"stats": stats}
 
 

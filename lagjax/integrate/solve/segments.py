@@ -1,4 +1,4 @@
-"""Phases of a hybrid, and the modes of elements, as places of an automaton (`legs.py`).
+"""Phases of a hybrid, and the modes of elements, as locations of an automaton (`legs.py`).
 
 A guard is assumed to be above zero where its phase begins. If it is zero there and falls, however slowly, or is below
 zero, it is crossed at once, in a leg of no length: this handles two guards at one time, and friction that cannot hold a
@@ -23,7 +23,7 @@ from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     Ending,
     Leg,
-    Place,
+    Location,
     Then,
     Way,
     before_any,
@@ -73,7 +73,7 @@ class Phase(NamedTuple):
         return params if modes is None else self.meeting.laws.given(params, *modes)
 
 
-class Mode(NamedTuple):
+class PhaseMode(NamedTuple):
     """The phase, and the modes of elements, if there are any."""
 
     phase: Int[Array, ""]
@@ -87,7 +87,7 @@ class Modes(NamedTuple):
     slack: Float[Array, " k"]
 
 
-class InPhase(Place):
+class InPhase(Location):
     """Phase number `i` of a hybrid, with what ends it, in a motion over `ts`."""
 
     def __init__(self, hybrid: Hybrid, i: int, phase: Phase, params: PyTree, ts: Array, settings: Settings):
@@ -95,13 +95,13 @@ class InPhase(Place):
         self.system, self.guards = hybrid.systems[i], phase.guards
         self.forced = None if phase.meeting is None else phase.meeting.forced
 
-    def has(self, mode: Mode) -> Bool[Array, ""]:
+    def has(self, mode: PhaseMode) -> Bool[Array, ""]:
         return mode.phase == self.i
 
     def given(self, params: PyTree, way: Way) -> PyTree:
         return self.phase.given(params, way.mode.of_elements)
 
-    def next_instant(self, mode: Mode) -> Float[Array, ""]:
+    def next_instant(self, mode: PhaseMode) -> Float[Array, ""]:
         """That of sampled controls; infinite without."""
         if mode.of_elements is None:
             return jnp.asarray(jnp.inf, self.ts.dtype)
@@ -177,7 +177,7 @@ class InPhase(Place):
                 modes = jnp.where(phase.meeting.laws.is_sampled[None] & new[:, None], after.modes.modes[None], modes)
                 rows["q"] = jax.tree.map(lambda x, y: jnp.where(like(new, x), y[None], x), rows["q"], after.q)
             rows["modes"] = modes
-        mode = where(onward, Mode(target, after.modes), way.mode)
+        mode = where(onward, PhaseMode(target, after.modes), way.mode)
         end = end._replace(multipliers=unknown(way.end.multipliers) | end.multipliers)
         at_first = way.count == 0
         return Then(onward, onward, False, end, after.q, after.v, mode, record, result, events, rows, at_first)
@@ -193,15 +193,15 @@ def solved_in_phases(
     """
     phases = [phase.in_motion(settings.rtol[0], ts, q0, v0, params) for phase in phases]
     first = _first(hybrid, q0, v0, params, ts, phases[0], settings)
-    places = [InPhase(hybrid, i, phase, params, ts, settings) for i, phase in enumerate(phases)]
+    locations = [InPhase(hybrid, i, phase, params, ts, settings) for i, phase in enumerate(phases)]
 
-    def of_place(place: Place) -> Settings:
-        return settings if place.system.constraints else replace(settings, drift="none")
+    def of_location(location: Location) -> Settings:
+        return settings if location.system.constraints else replace(settings, drift="none")
 
     # Each turn takes every lane at least one leg further.
     most = hybrid.most_switches
     turns = most + 1 + any(phase.meeting is not None for phase in phases)
-    way, stats = over_jumps(jumps, places, first, params, ts, of_place, settings, adjoint, most, turns)
+    way, stats = over_jumps(jumps, locations, first, params, ts, of_location, settings, adjoint, most, turns)
     found, switches = way.fields(settings), way.record
     events = found["events"] | ({SWITCHES: switches.as_crossings()} if switches.ways else {})
     return found | {"events": events, "switches": switches, "stats": stats}
@@ -231,7 +231,7 @@ def _first(hybrid: Hybrid, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, ph
     start, end = (Snapshot(ts[0], *y, unknown(multipliers)) for y in ((q0, v0), known))
     events = nothing(phase.guards, phase.events, q0, v0, start.multipliers)
     switches = switches_before_any(hybrid, q0, v0, None if meeting is None else meeting.laws)
-    mode = Mode(jnp.clip(first, 0, phases - 1), modes)
+    mode = PhaseMode(jnp.clip(first, 0, phases - 1), modes)
     way = before_any(start, end, mode, sizes_of(q0, v0), settings, rows, events, switches, begins=meeting is not None)
     error = jnp.where(exists, way.scaled_error, jnp.inf)
     return way._replace(continues=exists, scaled_error=error, result=RESULTS.where(exists, RESULTS.successful, refused))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.continuation.arclength import Path, Tracer
+from lagjax.analysis.continuation.arclength import BranchPath, Tracer
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (  # fmt: skip  # fmt: skip
     BUCKLING,
@@ -226,7 +226,7 @@ def test_a_path_that_comes_back_is_closed():
         along = [np.array([-np.sin(a), np.cos(a)]) for a in angles]
         along[-1] = turned * along[-1]
         points = [SimpleNamespace(z=5.0 + np.array([np.cos(a), np.sin(a)]), tangent=v) for a, v in zip(angles, along)]
-        return Tracer.closes(tracer, Path(points), step)
+        return Tracer.closes(tracer, BranchPath(points), step)
 
     assert closes(circle) and closes(circle[:-1], step=0.16)
     assert not (closes(circle, -1.0) or closes(circle[:-1], step=0.15) or closes(circle[::8]))
