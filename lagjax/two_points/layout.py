@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from lagjax.two_points import transcription
-from lagjax.two_points.transcription import Element, Ends, Plant
+from lagjax.two_points.transcription import Element, PlanEnds, Plant
 
 # Elements that are differentiated together: a program serves any number of elements.
 TOGETHER = 16
@@ -97,8 +97,8 @@ class Layout:
             at["node_multipliers"][self.of_nodes],
             at["point_multipliers"][self.of_points],
         )
-        ends = Ends(at["end"], at["q"][[0, -1]], at["v"], at["controls"][self.of_controls[[0, -1]]], at["impulse"])
-        ends = Ends(*(x[None] for x in ends))
+        ends = PlanEnds(at["end"], at["q"][[0, -1]], at["v"], at["controls"][self.of_controls[[0, -1]]], at["impulse"])
+        ends = PlanEnds(*(x[None] for x in ends))
         of_elements = rows["motion"][self.of_nodes], rows["positions"], rows["velocities"], rows["bounded"]
         of_ends = rows["motion"][[0, -1]], rows["start"], rows["stop"], rows["end"]
         return (
@@ -116,7 +116,7 @@ def _numbered(shapes: dict[str, tuple[int, ...]]):
     return start, found
 
 
-def _form(seen: Element | Ends):
+def _form(seen: Element | PlanEnds):
     return type(seen), tuple(x.shape[1:] for x in seen)
 
 

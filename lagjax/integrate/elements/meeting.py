@@ -250,8 +250,7 @@ class Meeting(eqx.Module):
         at = self._at(t, q, v, given)
         rows = self._rows(at)
         forced, span = (jnp.zeros_like(at.x), jnp.zeros_like(t)) if self.forced is None else self.forced.around(t)
-        *sizes, moved = rows.sizes(sizes, forced, span)
-        sizes = jnp.stack(sizes)
+        sizes, moved = (known := rows.sizes(sizes, forced, span))[:2], known[2]
         contacts = stop_gradient(self._as_found(at, fired, rows.jacobian, sizes, moved))
         allowed = jnp.asarray(True)
         if impacts is not False and self.laws.normals:
