@@ -27,6 +27,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
 from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
@@ -191,7 +192,9 @@ def _of_equal_steps(trajectory: Trajectory, settings: Settings):
     others = "; or method=lj.Gauss(2, newton=True)" if isinstance(settings.method, Gauss) else "; or method=lj.Gauss(3)"
     for part in (2, 4, 8, 16, 32):
         shorter = replace(settings, dt0=settings.dt0 / part, repeated_up_to=np.zeros((), np.int32))
-        found = trajectory.static.integrate(trajectory.system, end.q, end.v, trajectory.params, ts, None, shorter)
+        found = trajectory.static.integrate(
+            Problem(trajectory.system, end.q, end.v, trajectory.params, ts, None, shorter)
+        )
         if is_among(found.result, ENDED_WELL):
             return f"dt0={longest / part:.3g}, with which a step is solved there{others}"
     return f"look at the motion near its end: there even a step of dt0 / 32 = {longest / 32:.3g} is not solved{others}"

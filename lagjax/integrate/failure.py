@@ -17,6 +17,7 @@ from lagjax.integrate import arguments
 from lagjax.integrate.diagnose_contacts import of_elements
 from lagjax.integrate.diagnose_guard import of_guards
 from lagjax.integrate.diagnose_stop import stopped_early
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
 from lagjax.integrate.stepping.tolerances import tolerances_at
@@ -184,7 +185,7 @@ def _not_seen(trajectory, settings: Settings):
     """The guards that are below zero at the end of the last phase, which is integrated without them."""
     hybrid, end, i = trajectory.system, trajectory.end, trajectory.last_phase()
     ts = np.array([end.t, trajectory.t[-1]], np.asarray(trajectory.t).dtype)
-    alone = trajectory.static.integrate(hybrid.systems[i], end.q, end.v, trajectory.params, ts, None, settings)
+    alone = trajectory.static.integrate(Problem(hybrid.systems[i], end.q, end.v, trajectory.params, ts, None, settings))
     values = {}
     for switch in (hybrid.switches[k] for k in hybrid.leaving(i)):
 

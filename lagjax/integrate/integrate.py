@@ -1,6 +1,6 @@
 """The main entry: a trajectory from a system and an initial state.
 
-    check the arguments  ->  one compiled solve by diffrax  ->  say what went wrong, if anything did
+    refuse what cannot be, prepare the problem  ->  run it, in one compiled solve by diffrax  ->  say what went wrong
 
 Values are examined only outside the compiled program (`integrate/solve/programs.py`), so that it can be cached,
 batched and differentiated.
@@ -21,20 +21,20 @@ from lagjax.integrate.equal_steps.pace import with_traced_pace
 from lagjax.integrate.events.event import Crossing, crossings_of, guards_of, left_to_diffrax
 from lagjax.integrate.failure import raise_at_run_time, raise_failure
 from lagjax.integrate.input_warnings import warn_of_odd_dissipation
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings, is_recorded, patient
-from lagjax.integrate.solve.backward_time import backward_trajectory_of, runs_backward
+from lagjax.integrate.solve.backward_time import run
 from lagjax.integrate.solve.error_estimate import steps_to_repeat
 from lagjax.integrate.solve.harvest import report
 from lagjax.integrate.solve.over_jumps import warn_of_lost
 from lagjax.integrate.solve.phases import phases_in, refuse_beside_switches, traced_phases
-from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
 from lagjax.mechanics import has_networks
 from lagjax.numerics import EqualSteps
-from lagjax.system import Hybrid, State, System, by_name, check_system, coordinates, with_rates
+from lagjax.system import Hybrid, System, by_name, check_system, coordinates, with_rates
 
 # The steps that a motion may take unless `max_steps` says otherwise.
 MANY_STEPS = 2**20
@@ -169,6 +169,38 @@ def integrate(
 
     Source: Hairer & Wanner, *Solving ODEs II*, §VII.2 (projection); Kidger, arXiv:2202.02435 (diffrax).
     """
+    problem = prepare(
+        system, q0, v0, params, ts=ts, rtol=rtol, atol=atol, method=method, stepsize_controller=stepsize_controller,
+        dt0=dt0, max_step=max_step, jump_ts=jump_ts, jumps=jumps, events=events, event=event, adjoint=adjoint,
+        max_steps=max_steps, progress=progress, drift=drift, estimate_error=estimate_error, start=start,
+        outputs=outputs,
+    )  # fmt: skip
+    trajectory = report(run(problem))
+    return _raise_or_warn(trajectory, problem) if throw else trajectory
+
+
+def _raise_or_warn(trajectory: Trajectory, problem: Problem):
+    """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
+    if is_traced(trajectory):
+        # A caller that watches learns the result from the report.
+        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
+    result = trajectory.result
+    if not is_among(result, ENDED_WELL):
+        raise_failure(trajectory, problem.start, problem.settings, problem.guards)
+    if not warn_of_missed_end(trajectory, problem.guards):
+        arguments.warn_of_inaccuracy(trajectory)
+    warn_of_events(trajectory, problem.guards)
+    warn_of_lost(trajectory)
+    return trajectory
+
+
+def prepare(
+    system: System | Hybrid, q0: PyTree, v0: PyTree, params: PyTree, *, ts: Any, rtol: Any, atol: Any, method: Any,
+    stepsize_controller: Any, dt0: Any, max_step: Any, jump_ts: Any, jumps: str, events: Any, event: Any, adjoint: Any,
+    max_steps: int | None, progress: bool | None, drift: str | None, estimate_error: bool | None, start: Any,
+    outputs: str | None,
+) -> Problem:  # fmt: skip
+    """The motion that `integrate` is asked for, with its arguments checked and the user's functions traced."""
     check_system(system, q0, v0, params, phases=True, elements=True)
     arguments.check_method(method)
     if isinstance(method, EqualSteps):
@@ -227,24 +259,4 @@ def integrate(
         shares=np.array(WHOLE_STEPS, dtype),
         repeated_up_to=steps_to_repeat(estimate_error, stepsize_controller, progress),
     )
-    ts = arguments.times(ts, dtype)
-    solve = backward_trajectory_of if runs_backward(ts) else trajectory_of
-    trajectory = report(solve(system, state.q, state.v, state.params, ts, guards, settings))
-    if throw:
-        trajectory = _raise_or_warn(trajectory, state._replace(t=ts[0]), settings, guards)
-    return trajectory
-
-
-def _raise_or_warn(trajectory: Trajectory, start: State, settings: Settings, guards: Any):
-    """Raise or warn in the user's words; while tracing, at run time with the result's own message."""
-    if is_traced(trajectory):
-        # A caller that watches learns the result from the report.
-        return trajectory if WATCHED.value or SILENT.value else raise_at_run_time(trajectory)
-    result = trajectory.result
-    if not is_among(result, ENDED_WELL):
-        raise_failure(trajectory, start, settings, guards)
-    if not warn_of_missed_end(trajectory, guards):
-        arguments.warn_of_inaccuracy(trajectory)
-    warn_of_events(trajectory, guards)
-    warn_of_lost(trajectory)
-    return trajectory
+    return Problem(system, state.q, state.v, state.params, arguments.times(ts, dtype), guards, settings)

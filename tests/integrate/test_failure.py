@@ -20,8 +20,8 @@ def test_failure_under_jit_is_not_silent(monkeypatch):
     """Inside jit a failed integration raises at run time; with throw=False it carries its result."""
     done = motion("pendulum")
     coded = lambda code: eqx.tree_at(lambda result: result._value, done.result, code)
-    solved = lambda *problem: replace(done, result=coded(problem[1].astype(int)))
-    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "trajectory_of", solved)
+    solved = lambda problem: replace(done, result=coded(problem.q.astype(int)))
+    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "run", solved)
     # In place of a solve, with the start as the number of its result.
     run = jax.jit(
         lambda q0, throw: lj.integrate(pendulum, q0, 0.0, PARAMS, ts=TS, throw=throw).result._value, static_argnums=1

@@ -54,8 +54,8 @@ def test_integrate_tells_and_goes_on(monkeypatch):
     def drag(t, q, v, params):
         return -0.5 * v
 
-    done, solved = motion("pendulum"), lambda *problem: done
-    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "trajectory_of", solved)
+    done, solved = motion("pendulum"), lambda problem: done
+    monkeypatch.setattr(importlib.import_module("lagjax.integrate.integrate"), "run", solved)
     dragged = lj.System(pendulum.lagrangian, dissipation=drag)
     run = lambda q0: lj.integrate(dragged, q0, 1.0, PARAMS, ts=TS, throw=False)
     with pytest.warns(UserWarning, match="Fix: force=drag"):

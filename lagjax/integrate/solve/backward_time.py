@@ -24,9 +24,9 @@ import diffrax
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
-from lagjax.integrate.events.event import Guards
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.parts import Snapshot, pack
@@ -64,17 +64,19 @@ class ReflectedCondition(eqx.Module):
         return self.condition(-t, (q, _negative(v)), args, **kwargs)
 
 
-def backward_trajectory_of(
-    system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Float[Array, " T"], guards: Guards | None,
-    settings: Settings,
-) -> Trajectory:  # fmt: skip
+def run(problem: Problem) -> Trajectory:
+    """The trajectory of a motion in either direction of time; a failure is recorded in its result."""
+    return (backward_trajectory_of if runs_backward(problem.ts) else trajectory_of)(problem)
+
+
+def backward_trajectory_of(problem: Problem) -> Trajectory:
     """What `trajectory_of` is for increasing times, for decreasing ones."""
+    system, q0, v0, params, ts, guards, settings = problem
     if guards is not None:
         # Directions of crossings stay: they are meant along the run of the motion, as in SciPy.
         guards = replace(guards, functions=tuple(map(Reflected, guards.functions)))
-    reflected = trajectory_of(
-        reflect_system(system), q0, _negative(v0), params, -ts, guards, _reflect_settings(settings)
-    )
+    start = reflect_system(system), q0, _negative(v0), params
+    reflected = trajectory_of(Problem(*start, -ts, guards, _reflect_settings(settings)))
     asked = reflected.asked._replace(stepsize_controller=settings.controller, jump_ts=settings.jump_ts)
     if isinstance(settings.method, EqualSteps):
         asked = asked._replace(method=settings.method)

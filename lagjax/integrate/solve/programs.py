@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
 
 from lagjax.display import waiting
 from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
@@ -27,6 +26,7 @@ from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
 from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.integrate.jumps.sliding import slidable
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.assembly import InElements
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
@@ -52,14 +52,14 @@ from lagjax.jaxtools import (
 )
 from lagjax.mechanics import has_networks, is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
-from lagjax.system import Model, State, System, model_of
+from lagjax.system import Model, State, model_of
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
 
 
-def trajectory_of(*problem) -> Trajectory:
-    """Return the trajectory of (system, q0, v0, params, ts, guards, settings); a failure is recorded in its result.
+def trajectory_of(problem: Problem) -> Trajectory:
+    """Return the trajectory of a motion forward in time; a failure is recorded in its result.
 
     If nothing is traced, the equations are first assumed regular, which compiles in two thirds of the time and is
     enough for most systems; if that fails, the robust solve is compiled too and used from then on. Where contacts may
@@ -67,44 +67,44 @@ def trajectory_of(*problem) -> Trajectory:
     takes longer than a short motion, so it runs only if a check in the program fails: its message is better.
     """
     if not is_eager():
-        return _inside(*problem)
-    *motion, ts, guards, settings = problem
+        return _inside(problem)
+    ts, shown = problem.ts, problem.settings.progress
     # Whether compiling is announced does not change the program.
-    shown, settings = settings.progress, replace(settings, progress=bool(settings.progress))
+    settings = replace(problem.settings, progress=bool(shown))
     # Padded with the last time.
-    many = np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1]))
+    padded = problem._replace(ts=np.append(ts, np.full(filled_up(len(ts)) - len(ts), ts[-1])))
 
     def of(settings: Settings):
-        return hashable_partition((*motion, many, guards, settings))
+        return hashable_partition(padded._replace(settings=settings))
 
     arrays, static = of(settings)
-    programs = program_of((_Programs, static), lambda: _Programs(static, len(ts), not _may_hold_too_much(*motion[:2])))
+    programs = program_of((_Programs, static), lambda: _Programs(static, len(ts), not _may_hold_too_much(problem)))
     try:
         found = programs.run(arrays, len(ts), shown)
         if not settings.repeated_up_to:
             return found
         return with_errors(lambda s: programs.run(of(s)[0], len(ts), shown, settled=True), found, settings, ts)
     except jax.errors.JaxRuntimeError:
-        return _trajectory_of(*problem)[0]
+        return _trajectory_of(problem)[0]
 
 
-def _inside(*problem):
+def _inside(problem: Problem) -> Trajectory:
     """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
-    *motion, settings = problem
+    settings = problem.settings
     # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
-    regular = takes_for_regular() and settings.adjoint is None and not _may_hold_too_much(*motion[:2])
-    settings = replace(settings, robust=not regular)
-    found, settled = _trajectory_of(*motion, settings)
+    regular = takes_for_regular() and settings.adjoint is None and not _may_hold_too_much(problem)
+    problem = problem._replace(settings=(settings := replace(settings, robust=not regular)))
+    found, settled = _trajectory_of(problem)
     if settings.repeated_up_to:
-        still = stop_gradient(motion)
-        found = with_errors_inside(lambda s: _trajectory_of(*still, s)[0], found, settings, motion[4])
+        still = stop_gradient(problem[:-1])
+        found = with_errors_inside(lambda s: _trajectory_of(Problem(*still, s))[0], found, settings, problem.ts)
     return report_settled(found, settled) if regular else found
 
 
-def _may_hold_too_much(system: System, q0: PyTree) -> bool:
+def _may_hold_too_much(problem: Problem) -> bool:
     """Whether contacts and constraints may be more than coordinates, and so depend on each other."""
-    laws = system.laws if isinstance(system, InElements) else None
-    return laws is not None and laws.equations > sum(map(np.size, jtu.tree_leaves(q0)))
+    laws = problem.system.laws if isinstance(problem.system, InElements) else None
+    return laws is not None and laws.equations > sum(map(np.size, jtu.tree_leaves(problem.q)))
 
 
 class _Programs:
@@ -141,24 +141,24 @@ class _Programs:
 
 def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
     """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
-    *motion, settings = static.combine(arrays)
+    problem = Problem(*static.combine(arrays))
     # With guards to be watched a program is long anyway, and compiles a third faster without copies.
-    unroll_up_to = 0 if motion[0].in_phases else UNROLL_AT_ONCE_UP_TO
-    settings = replace(settings, robust=robust, unroll_up_to=unroll_up_to)
-    found, settled = one_by_one(_trajectory)(*motion, settings)
+    unroll_up_to = 0 if problem.system.in_phases else UNROLL_AT_ONCE_UP_TO
+    settings = replace(problem.settings, robust=robust, unroll_up_to=unroll_up_to)
+    found, settled = one_by_one(_trajectory)(problem._replace(settings=settings))
     rows = found.rows()
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
 
 @jitted
-def _trajectory_of(*problem):
-    return _trajectory(*problem)
+def _trajectory_of(problem: Problem):
+    return _trajectory(problem)
 
 
-def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Array, guards, settings: Settings):
+def _trajectory(problem: Problem):
     """The trajectory, and whether it is settled: the robust solve would give the same."""
-    start = State(ts[0], q0, v0, params)
-    model = model_of(system, *start)
+    system, *motion, settings = problem
+    start, model = problem.start, model_of(system, *problem.start)
     s, method = settings, method_of(settings, model)
     # What the tolerance chose is no longer known where the motion is continued.
     by_tolerance = s.method is None and isinstance(method, Tsit5)
@@ -169,7 +169,7 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
-    x, rest = eqx.partition((system, q0, v0, params, ts, guards, settings.jump_ts), eqx.is_inexact_array)
+    x, rest = eqx.partition((system, *motion, settings.jump_ts), eqx.is_inexact_array)
     fixed, static = eqx.partition((rest, settings), eqx.is_array)
 
     jumps = [None for _ in model.phases] if settings.jumps == "ignored" else followed(settings, model, start)
@@ -205,10 +205,10 @@ def _trajectory(system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Arra
         )
     else:
         fields, _ = solve_arrays(x, fixed, settings.adjoint, True)
-    arrays, described = pack((system, params, asked), how, trajectory_of)
+    arrays, described = pack((system, problem.params, asked), how, trajectory_of)
     settled = fields.pop("settled")
     of = HybridTrajectory if system.in_phases else Trajectory
-    return of(t=ts, **fields, arrays=arrays, static=described), settled
+    return of(t=problem.ts, **fields, arrays=arrays, static=described), settled
 
 
 def followed(settings: Settings, model: Model, start: State) -> list[Jumps | None]:

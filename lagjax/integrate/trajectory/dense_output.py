@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
+from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions
@@ -250,7 +251,7 @@ def _solved_from(
         jumps=asked.jumps,
     )
     ts = jnp.append(node.t, ts)
-    found = integrate(system, node.q, node.v, params, ts, None, settings)
+    found = integrate(Problem(system, node.q, node.v, params, ts, None, settings))
     return Snapshot(ts, found.q, found.v, found.multipliers), found.result
 
 

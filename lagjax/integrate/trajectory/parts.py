@@ -72,7 +72,7 @@ class SolveOptions(NamedTuple):
 class StaticPart(NamedTuple):
     """The parts of a trajectory that are not arrays; they must be hashable, so that JAX can carry them along.
 
-    `integrate`: what continues the motion, (system, q0, v0, params, ts, guards, settings) -> trajectory.
+    `integrate`: what continues the motion, `Problem` -> trajectory.
     """
 
     rest: HashablePart

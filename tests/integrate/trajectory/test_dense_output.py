@@ -57,8 +57,9 @@ def test_times_of_any_shape():
     assert not again and of_another
 
 
-def straight_on(system, q, v, params, ts, guards, settings):
+def straight_on(problem):
     """In place of an integration: on along a line; the multiplier is the time of the output from which it goes on."""
+    system, q, v, _, ts, _, settings = problem
     line = jax.tree.map(lambda q, v: q + v * (ts - ts[0]), q, v)
     rows = jax.tree.map(lambda v: v + 0.0 * ts, v)
     if system.constraints:
