@@ -234,8 +234,8 @@ class Laws(eqx.Module):
         """Each of these modes in a word."""
         return [mode_in_words(kind, int(mode)) for kind, mode in zip(self.kinds, modes)]
 
-    def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " kNT"]:
-        """Which of the normals and tangents are constraints in these modes."""
+    def holds(self, modes: Int[Array, " k"]) -> Any:
+        """Which of the normals and tangents are constraints in these modes, (..., k); in NumPy where they are known."""
         of_rows = modes[..., : len(self.rows)]
         return numpy_of(modes).where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
 
