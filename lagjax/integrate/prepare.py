@@ -1,4 +1,4 @@
-"""What `integrate` does before a motion runs: arguments are checked, functions traced, and all stands in a `Problem`."""
+"""What `integrate` does before a motion runs: arguments are checked, functions traced, and a `Problem` made."""
 
 from typing import Any
 

@@ -20,9 +20,8 @@ def fixed(law, params: PyTree) -> Array:
 
 def coefficient(law, of: Array, params: PyTree) -> Array:
     """The coefficient for each of the speeds, or depths, `of`."""
-    if callable(law):
-        law = law(params) if len(takes_of_coefficient(law)) == 1 else jax.vmap(lambda x: law(x, params))(of)
-    return jnp.broadcast_to(jnp.asarray(law, of.dtype), of.shape)
+    found = fixed(law, params) if is_fixed(law) else jax.vmap(lambda x: law(x, params))(of)
+    return jnp.broadcast_to(jnp.asarray(found, of.dtype), of.shape)
 
 
 def takes_of_coefficient(law: Callable, of: str = "speed") -> tuple[str, ...]:

@@ -10,6 +10,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import dtypes
 from jaxtyping import Array, PyTree
 
 from lagjax.integrate.elements.compliant import Compliant
@@ -111,7 +113,8 @@ def in_modes(system: System, start: State) -> tuple[System, Laws]:
     guarded += [law.side[1] for law in tangents if law.side]
     count = max(guarded, default=0) + len(sampled)
     # The order of the stacked equations is known only with their shapes.
-    given = InModes(start.params, jnp.zeros(count, int), jnp.zeros(0, bool), jnp.zeros(count))
+    none = np.zeros(count, dtypes.canonicalize_dtype(int)), np.zeros(0, bool), np.zeros(count, start.t.dtype)
+    given = InModes(start.params, *none)
     form = model_of(masked, *start[:3], given).form
     places, first = {}, 0
     for residual in form.residuals:

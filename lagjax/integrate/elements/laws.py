@@ -28,6 +28,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.elements.coefficients import coefficient, fixed, is_fixed
@@ -35,7 +36,7 @@ from lagjax.integrate.elements.complementarity import directions, lengths
 from lagjax.integrate.elements.compliant import PRESSED, Compliant
 from lagjax.integrate.elements.sampled import Sampled
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, mode_in_words
-from lagjax.jaxtools import is_traced, stop_gradient
+from lagjax.jaxtools import is_traced, numpy_of, stop_gradient
 from lagjax.system import InModes, State
 
 OPEN, CLOSED = 0, 1
@@ -233,10 +234,10 @@ class Laws(eqx.Module):
         """Each of these modes in a word."""
         return [mode_in_words(kind, int(mode)) for kind, mode in zip(self.kinds, modes)]
 
-    def holds(self, modes: Int[Array, " k"]) -> Bool[Array, " kNT"]:
-        """Which of the normals and tangents are constraints in these modes."""
+    def holds(self, modes: Int[Array, " k"]) -> Any:
+        """Which of the normals and tangents are constraints in these modes, (..., k); in NumPy where they are known."""
         of_rows = modes[..., : len(self.rows)]
-        return jnp.where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
+        return numpy_of(modes).where(np.arange(len(self.rows)) < self.count[0], of_rows == CLOSED, of_rows == STICKS)
 
     def rubs(self, modes: Int[Array, " k"]) -> Bool[Array, " kT"]:
         """Which sliding velocities are not free for that the spring that presses them is apart."""
@@ -255,9 +256,12 @@ class Laws(eqx.Module):
 
     def given(self, params: PyTree, modes: Int[Array, " k"], slack: Float[Array, " k"] | None = None) -> InModes:
         """The parameters in these modes; rows of modes, (..., k), give rows of the rest."""
-        off = jnp.zeros((*modes.shape[:-1], self.equations), bool)
-        off = off.at[..., np.array(self.rows, int)].set(~self.holds(modes))
-        return InModes(params, modes, off, jnp.zeros(modes.shape) if slack is None else slack)
+        of_rows, mine = np.array(self.rows, int), np.zeros(self.equations, bool)
+        mine[of_rows], place = True, np.zeros(self.equations, int)
+        place[of_rows] = np.arange(of_rows.size)
+        off = ~self.holds(modes)[..., place] & mine if of_rows.size else np.zeros((*modes.shape[:-1], mine.size), bool)
+        none = np.zeros(modes.shape, dtypes.canonicalize_dtype(float))
+        return InModes(params, modes, off, none if slack is None else slack)
 
     def in_rows(self, given: InModes, modes: Int[Array, " kNT"], sides: Int[Array, " ks"] | None = None) -> InModes:
         """The same with these modes of normals and tangents; and, if given, from these sides."""

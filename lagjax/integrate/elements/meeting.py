@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.integrate.elements.complementarity import ContactProblem, Forces, directions, lengths, pseudo_inverse
 from lagjax.integrate.elements.impact_law import Struck
 from lagjax.integrate.elements.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
-from lagjax.integrate.elements.redundant import AtBound, HeldRows, within_laws
+from lagjax.integrate.elements.redundant import AtBound, HeldByForces, HeldRows, within_laws
 from lagjax.integrate.stepping.tolerances import FROM_NOTHING, Forced, rounding
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.jaxtools import stop_gradient
@@ -467,11 +467,11 @@ class Meeting(eqx.Module):
             a = problem.matrix @ forces.forces + problem.free
             return ContactForces(problem, bound, forces.forces, a, no_force, least / problem.step, forces.found)
 
-        def holds(bound: AtBound, forces: Forces) -> tuple[Array, Array, Array, Array]:
+        def holds(bound: AtBound, forces: Forces) -> HeldByForces:
             found = solution(bound, forces)
             closes = bound.lifted & (found.a < -found.no_acceleration)[: bound.lifted.size]
             begins = jnp.where(problem.given, 0.0, found.sides())
-            return self.laws.holds(self._modes(at, found)), found.no_force, closes, begins
+            return HeldByForces(self.laws.holds(self._modes(at, found)), found.no_force, closes, begins)
 
         return solution(*within_laws(problem, held, holds))
 

@@ -72,6 +72,16 @@ class HeldRows(NamedTuple):
         return forces, jnp.where(on & (jnp.diag(null)[:k] > small), beyond, 0.0)
 
 
+class HeldByForces(NamedTuple):
+    """What forces hold: which rows (k,), and below which size each force is zero; which gaps without a force close; and
+    to which side, or direction, what is not held begins to slide."""
+
+    rows: Bool[Array, " k"]
+    no_force: Float[Array, " k"]
+    closes: Bool[Array, " kN"]
+    begins: Float[Array, " kT"]
+
+
 class BoundsTried(NamedTuple):
     """The forces with what is at its bound, the next such choice, and whether that is to be tried."""
 
@@ -82,11 +92,12 @@ class BoundsTried(NamedTuple):
     count: Int[Array, ""]
 
 
-def within_laws(problem: ContactProblem, held: HeldRows, holds: Callable) -> tuple[AtBound, Forces]:
+def within_laws(
+    problem: ContactProblem, held: HeldRows, holds: Callable[[AtBound, Forces], HeldByForces]
+) -> tuple[AtBound, Forces]:
     """The forces of contacts, and what has the bound of its law since the shortest forces would break that.
 
-    `holds(bound, solution)`: which rows are held then, and below which size each force is zero; which of the gaps
-    without a force close, and to which side, or direction, what is not held begins to slide.
+    `holds(bound, solution)`: what they hold.
     """
     gaps = problem.may_push.size
     none = AtBound(jnp.zeros(gaps, bool), jnp.zeros_like(problem.slides))

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jax import dtypes
 from jaxtyping import Array, PyTree
 
 from lagjax.integrate.elements.in_modes import OneGuard, in_modes
@@ -34,7 +34,8 @@ class InElements(Hybrid):
         """The parameters in these modes, or in rows of modes; without any, with all gaps open."""
         if isinstance(params, InModes):
             return params
-        return self.laws.given(params, jnp.zeros(self.laws.size, int) if modes is None else modes)
+        open_ones = np.zeros(self.laws.size, dtypes.canonicalize_dtype(int))
+        return self.laws.given(params, open_ones if modes is None else modes)
 
     @property
     def first_phase(self) -> System:

@@ -8,6 +8,7 @@ from scipy import integrate, optimize, special
 
 import lagjax as lj
 from lagjax.analysis.continuation.arclength import BranchPoint
+from lagjax.analysis.continuation.orbit_equations import extent
 from lagjax.analysis.continuation.orbit_result import CriticalOrbit
 from lagjax.analysis.continuation.orbits import _zero
 from tests.analysis import closed_forms as known
@@ -36,6 +37,18 @@ def shot(rate, period, z):
 
 
 # Families of a conservative system.
+
+
+def test_how_far_a_path_goes():
+    """x = t³ - t turns at -2/√27 between points at which it is known; what rests, and times that are not there, say
+    nothing more. Twin: the points alone see less."""
+    t = np.array([-0.4, 0.2, 1.1, np.nan])
+    cubic, still = t**3 - t, 0 * t + 0.3
+    states = np.stack([cubic, still, 3 * t**2 - 1, 0 * t], axis=1)
+    low, high = extent(t, states)
+    np.testing.assert_allclose([low[0], high[0]], [-2 / np.sqrt(27), 0.4 - 0.4**3], rtol=1e-14)
+    np.testing.assert_array_equal([low[1], high[1]], 0.3)
+    assert np.nanmin(cubic) > low[0] + 0.1
 
 
 @pytest.mark.exhaustive
