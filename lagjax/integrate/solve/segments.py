@@ -88,10 +88,15 @@ class Modes(NamedTuple):
 
 
 class InPhase(Location):
-    """Phase number `i` of a hybrid, with what ends it, in a motion over `ts`."""
+    """Phase number `i` of a hybrid, with what ends it, in a motion over `ts`.
 
-    def __init__(self, hybrid: Hybrid, i: int, phase: Phase, params: PyTree, ts: Array, settings: Settings):
-        self.hybrid, self.i, self.phase, self.params, self.ts, self.settings = hybrid, i, phase, params, ts, settings
+    `in_step`: whether all lanes of a batch that go on have the same number of switches.
+    """
+
+    def __init__(
+        self, hybrid: Hybrid, i: int, phase: Phase, params: PyTree, ts: Array, settings: Settings, in_step: bool
+    ):
+        self.i, self.phase, self.params, self.ts, self.settings, self.in_step = i, phase, params, ts, settings, in_step
         self.system, self.guards = hybrid.systems[i], phase.guards
         self.forced = None if phase.meeting is None else phase.meeting.forced
 
@@ -114,16 +119,9 @@ class InPhase(Location):
         """What follows a leg: a switch, of phases or of the modes of elements; or the motion's end."""
         phase, way, here, given, ts = self.phase, leg.way, leg.here, leg.given, self.ts
         end, rows, until = leg.end, leg.rows, self.next_instant(way.mode)
-        result, events, onward = (
-            RESULTS.where(leg.begins, RESULTS.successful, leg.result),
-            leg.events,
-            jnp.asarray(False),
-        )
-        after, target, record = (
-            After(way.q, way.v, jnp.asarray(False), way.mode.of_elements),
-            way.mode.phase,
-            way.record,
-        )
+        result, events = RESULTS.where(leg.begins, RESULTS.successful, leg.result), leg.events
+        no, target, record = jnp.asarray(False), way.mode.phase, way.record
+        onward, after = no, After(way.q, way.v, no, way.mode.of_elements)
         if phase.meeting is not None:
             every = jax.tree.map(
                 lambda x, last: jnp.concatenate([x, last[None]]), (leg.times, *rows.values()), tuple(end)
@@ -153,8 +151,7 @@ class InPhase(Location):
             after, target, new = apart(
                 _switched, self.system, ending, given, phase, way.sizes_so_far, instant, leg.begins
             )
-            together = len(self.hybrid.systems) == 1
-            record = _recorded(way.record, way.count, onward & ~leg.begins, new, together)
+            record = _recorded(way.record, way.count, onward & ~leg.begins, new, self.in_step)
             record = eqx.tree_at(lambda s: s.uncertain, record, record.uncertain | uncertain)
             # A motion in the wrong phase is wrong from that phase's start on, its first output included.
             invalid = here & ((result == RESULTS.guard_not_seen) | (result == RESULTS.guard_below_zero))
@@ -193,7 +190,9 @@ def solved_in_phases(
     """
     phases = [phase.in_motion(settings.rtol[0], ts, q0, v0, params) for phase in phases]
     first = _first(hybrid, q0, v0, params, ts, phases[0], settings)
-    locations = [InPhase(hybrid, i, phase, params, ts, settings) for i, phase in enumerate(phases)]
+    # A lane may have a jump while another has a switch.
+    in_step = len(phases) == 1 and not any(jumps)
+    locations = [InPhase(hybrid, i, phase, params, ts, settings, in_step) for i, phase in enumerate(phases)]
 
     def of_location(location: Location) -> Settings:
         return settings if location.system.constraints else replace(settings, drift="none")
@@ -292,10 +291,10 @@ def _switched(
     return after, to, new
 
 
-def _recorded(switches: Switches, count: Array, onward: Array, new: dict[str, Any], together: bool) -> Switches:
+def _recorded(switches: Switches, count: Array, onward: Array, new: dict[str, Any], in_step: bool) -> Switches:
     """The record with a switch more, where the motion goes `onward`.
 
-    In a batch lanes that go on have the same number of switches, if they are `together`: then one row is written.
+    Where all lanes of a batch that go on are `in_step`, with the same number of switches, one row is written.
     """
     room = switches.t.shape[0]
     last = eqxi.unvmap_max(jnp.where(onward, count, 0))
@@ -303,7 +302,7 @@ def _recorded(switches: Switches, count: Array, onward: Array, new: dict[str, An
 
     def put(all, new):
         new = new.astype(all.dtype)
-        if together:
+        if in_step:
             return all.at[last].set(jnp.where(onward, new, all[last]))
         return jnp.where(like(place, all), new[None], all)
 

@@ -64,6 +64,22 @@ def test_derivatives_of_both(system, mode):
     np.testing.assert_allclose(found, bounced(lanes, 0.5, 2.0), rtol=1e-12)
 
 
+@pytest.mark.parametrize("system", [in_elements, in_a_phase], ids=["contact", "phase"])
+def test_lanes_that_are_not_in_step(system):
+    """One lane has a jump and then a bounce, while the other bounces twice: each has its own switches."""
+    p, ts = {"H": np.array(0.5), "a": np.array(2.0)}, np.array([0.0, 0.7])
+    run = jax.vmap(lambda h: lj.integrate(system, h, 0.0, p, ts=ts, estimate_error=False, throw=False))
+    found = run(np.array([1.0, 0.45]))
+    v1 = np.sqrt(2 * (G + 2.0) * 0.5)
+    v2 = np.sqrt([v1**2 + 2 * G * 0.5, 2 * G * 0.45])
+    first, second = v1 / (G + 2.0) + (v2[0] - v1) / G, v2[1] / G
+    np.testing.assert_array_equal(found.switches.count, [1, 2])
+    np.testing.assert_array_equal(found.stats["num_jumps"], [1, 0])
+    np.testing.assert_allclose(found.switches.t[:, :2], [[first, np.nan], [second, 2 * second]], rtol=1e-12)
+    s, up = np.array([0.7 - first, 0.7 - 2 * second]), [E * v2[0], E**2 * v2[1]]
+    np.testing.assert_allclose(found.q[:, -1], up * s - G / 2 * s**2, rtol=1e-11)
+
+
 @pytest.mark.exhaustive
 def test_friction_over_a_jump():
     """A block is braked by friction 2, and from 0.3 on pushed by 1: it stops after 0.3 + 2.8/2. Twin: a push of 1.1."""
