@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax.scenes.woodpecker import PARAMS, TURN, beak, lap, motion
+from lagjax.scenes.woodpecker import PARAMS, TURN, beak, edges, lap, motion
 
 TS = np.linspace(0.0, 0.18, 19)
 # t, y, sleeve, bird, and the rates of y and bird after each change, by a computation that shared nothing with lagjax:
@@ -22,6 +22,15 @@ CHANGES = np.array([
     (0.1347928187, -0.01944537928, -0.1034482759, -0.4686515939, 0.0, -10.50379929),  # stops
     (0.1743862257, -0.01944537928, -0.1034482759, -0.2051353492, 0.0, 17.57466621),  # slides
 ])  # fmt: skip
+
+
+def test_where_it_touches():
+    """Edges and beak are at the pole where that computation has their contacts. Twin: elsewhere they are not."""
+    y, sleeve, bird = CHANGES.T[1:4]
+    at = lambda i: {"y": y[i], "sleeve": sleeve[i], "bird": bird[i]}
+    of_edges = [edges(0.0, at(i), PARAMS) for i in (0, 2, 4, 6)]
+    np.testing.assert_allclose([*of_edges, beak(0.0, at(3), PARAMS)], 0.0, atol=1e-12)
+    assert edges(0.0, at(3), PARAMS) > 1e-5 and beak(0.0, at(4), PARAMS) > 1e-5
 
 
 @pytest.mark.exhaustive

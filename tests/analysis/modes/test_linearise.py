@@ -8,14 +8,23 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.modes.linearise import _changed, _singular
-from lagjax.analysis.modes.reduced_matrices import Raw
+from lagjax.analysis.modes.reduced_matrices import Raw, _least_squares
 from lagjax.scenes import cross_rails
 from lagjax.system import coordinates
 from tests.analysis import small_systems as small
 from tests.analysis.modes.test_normal_modes import EQUAL
+from tests.by_numpy import by_numpy
 from tests.systems import rod_pendulum
 
 FREE = lj.System(lambda t, q, v, params: 0.5 * v**2)
+
+
+def test_forces_that_balance():
+    """Multipliers by least squares, as NumPy's; a row that exerts no force has none. Twin: it would be NaN."""
+    columns, target = np.array([[1.0, 0.0, 2.0], [2.0, 0.0, -1.0], [0.5, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0])
+    found = by_numpy(_least_squares)(columns, target)
+    np.testing.assert_allclose(found, np.linalg.lstsq(columns, target, rcond=None)[0], rtol=1e-12, atol=1e-14)
+    assert np.linalg.matrix_rank(columns.T @ columns) < 3
 
 
 @pytest.mark.slow
