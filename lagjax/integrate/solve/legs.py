@@ -96,8 +96,8 @@ class Leg(NamedTuple):
 
 
 class Then(NamedTuple):
-    """What follows a leg: whether the motion goes `onward` in another mode, or only `moves` on in the same one; or
-    whether the leg is to be done `again`, and does not count.
+    """What follows a leg: whether the motion goes `onward`, by a change that counts and is recorded; whether it `moves`
+    on from where the leg ended, by that, a jump or a pause; or whether the leg is done `again`, and does not count.
 
     `end`: of the leg; `q`, `v`: after it; `mode`: after it, also where it is done again; `record`: with this change;
     `rows`: of the leg, with those of its mode; `before`: which of the outputs up to its start are its own.
