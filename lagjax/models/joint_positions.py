@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix
-from lagjax.models.parts import Placement, RobotJoint
+from lagjax.models.links_and_joints import Placement, RobotJoint
 
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 # Axes that are meant to be parallel, at right angles, or to meet.

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lagjax.display import Faces, triangles
-from lagjax.models.parts import is_file
+from lagjax.models.links_and_joints import is_file
 
 CORNER = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
-from lagjax.models.parts import (
+from lagjax.models.links_and_joints import (
     BEFORE_TEXT,
     LinkShape,
     Loop,

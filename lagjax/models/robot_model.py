@@ -44,8 +44,7 @@ from lagjax.models.joint_positions import (
     quaternion_of,
     rate_squared,
 )
-from lagjax.models.looks import looks_of, not_drawn
-from lagjax.models.parts import (
+from lagjax.models.links_and_joints import (
     LinkShape,
     Loop,
     MergedLinks,
@@ -56,6 +55,7 @@ from lagjax.models.parts import (
     made_up,
     unmoved,
 )
+from lagjax.models.shapes import looks_of, not_drawn
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import unit_vector
-from lagjax.models.meshes import mesh_of
-from lagjax.models.parts import (
+from lagjax.models.links_and_joints import (
     BEFORE_TEXT,
     LinkShape,
     NotTaken,
@@ -27,6 +26,7 @@ from lagjax.models.parts import (
     merged,
     unmoved,
 )
+from lagjax.models.meshes import mesh_of
 from lagjax.models.robot_model import RobotModel
 
 # What stands in a file beside links and joints without being mechanics, and parts of joints that the model leaves out.

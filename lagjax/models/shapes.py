@@ -6,7 +6,7 @@ import numpy as np
 
 from lagjax.bodies import Body, usual_shapes
 from lagjax.display import CUBE, CYLINDER, SPHERE, Anchor, Shape
-from lagjax.models.parts import LinkShape
+from lagjax.models.links_and_joints import LinkShape
 
 
 def looks_of(shapes: Iterable[LinkShape], bodies: Collection[Body]) -> tuple[Shape, ...]:

@@ -6,8 +6,8 @@ import pytest
 import lagjax as lj
 from lagjax.display import CUBE, CYLINDER, SPHERE, InSpace
 from lagjax.integrate.trajectory.subject import subject_of
-from lagjax.models.looks import looks_of
-from lagjax.models.parts import LinkShape
+from lagjax.models.links_and_joints import LinkShape
+from lagjax.models.shapes import looks_of
 
 ARM = """<robot name="arm">
   <link name="base"><visual><geometry><box size="0.4 0.4 0.1"/></geometry></visual></link>
