@@ -12,19 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
 from lagjax.models.links_and_joints import (
-    BEFORE_TEXT,
-    LinkShape,
     Loop,
     MergedLinks,
-    NotTaken,
     Placement,
     RobotJoint,
     RobotLink,
-    file_of,
     made_up,
     merged,
 )
-from lagjax.models.robot_model import RobotModel
+from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
+from lagjax.models.shapes import LinkShape
 
 KIND = {"mjJNT_HINGE": "revolute", "mjJNT_SLIDE": "prismatic", "mjJNT_BALL": "spherical", "mjJNT_FREE": "floating"}
 # What is listed as not taken, by the names of MuJoCo's lists.

@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,27 +36,23 @@ from lagjax.bodies import (
 )
 from lagjax.display import Drawing, Shape, Still
 from lagjax.integrate import still, subject_of
-from lagjax.models.joint_positions import (
-    BodyJoint,
-    all_positions,
-    connected,
-    drawn,
-    moved,
-    quaternion_of,
-    rate_squared,
-)
 from lagjax.models.links_and_joints import (
-    LinkShape,
+    BodyJoint,
     Loop,
     MergedLinks,
-    NotTaken,
     Placement,
     RobotJoint,
     RobotLink,
+    all_positions,
+    connected,
+    drawn,
     made_up,
+    moved,
+    quaternion_of,
+    rate_squared,
     unmoved,
 )
-from lagjax.models.shapes import looks_of, not_drawn
+from lagjax.models.shapes import LinkShape, is_file, looks_of, not_drawn
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
@@ -65,6 +62,17 @@ EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherica
 UPWARD = (0.0, 0.0, 1.0)
 # How many of a kind `print` lists.
 LISTED = 6
+# What may stand before the text of a file: white space and a byte-order mark.
+BEFORE_TEXT = " \t\r\n\ufeff"
+LONGEST_SHOWN = 200
+
+
+class NotTaken(NamedTuple):
+    """What a file says and the model leaves out: what it is, whose, and its line."""
+
+    what: str
+    name: str
+    line: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -444,3 +452,19 @@ def _on_body(shape: LinkShape, merged: MergedLinks) -> LinkShape:
     frame = frame.then(Placement(shape.origin, shape.axes))
     centre = np.zeros(3) if head is None else merged.links[head].centre
     return shape._replace(body="ground" if head is None else head, origin=frame.origin - centre, axes=frame.axes)
+
+
+def file_of(source: str | Path, user: str) -> Path | None:
+    """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
+    if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):
+        return None
+    if not isinstance(source, (str, Path)):
+        raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
+    path = Path(source).expanduser()
+    if not is_file(path):
+        shown = str(source) if len(str(source)) <= LONGEST_SHOWN else str(source)[:LONGEST_SHOWN] + "..."
+        raise FileNotFoundError(
+            f"there is no file '{shown}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
+            f'package:// name, which ROS alone knows.\nFix: {user}("/path/to/the/file"), or the text itself.'
+        )
+    return path

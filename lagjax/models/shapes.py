@@ -1,12 +1,41 @@
-"""What the shapes of a file look like, for `traj.animate` and `traj.draw`."""
+"""Shapes on the links of a file, the meshes that it names, and what they look like in `traj.animate` and `traj.draw`.
 
+Meshes are read for pictures alone: STL, in bytes or as text, and OBJ.
+"""
+
+import re
 from collections.abc import Collection, Iterable
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from lagjax.bodies import Body, usual_shapes
-from lagjax.display import CUBE, CYLINDER, SPHERE, Anchor, Shape
-from lagjax.models.links_and_joints import LinkShape
+from lagjax.display import CUBE, CYLINDER, SPHERE, Anchor, Faces, Shape, triangles
+
+CORNER = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
+
+
+class LinkShape(NamedTuple):
+    """A shape on a body, for pictures and contacts written by hand.
+
+    - `body`: the body's name, "ground" for what does not move; `link`: the link of the file.
+    - `kind` and `size`: "box" (three edges), "cylinder" and "capsule" (radius, length without caps), "sphere" (radius),
+      "ellipsoid" (three radii), "mesh" (scale along its axes), "plane" and others as in the file.
+    - `origin` and `axes`: its frame, from the body's centre of mass along the body's axes.
+    - `mesh`: the name of the mesh's file, as it stands there (in MJCF, of the mesh); `role`: "visual", "collision" or
+      "both". `faces`: the mesh itself, where it was read, in its frame.
+    """
+
+    body: str
+    link: str
+    kind: str
+    size: tuple[float, ...]
+    origin: np.ndarray
+    axes: np.ndarray
+    mesh: str
+    role: str
+    faces: Faces | None = None
 
 
 def looks_of(shapes: Iterable[LinkShape], bodies: Collection[Body]) -> tuple[Shape, ...]:
@@ -53,3 +82,65 @@ def _parts(x: LinkShape) -> tuple[Shape, ...]:
     side = solid(CYLINDER, (radius, radius, length))
     caps = [solid(SPHERE, (radius,) * 3, end * length / 2) for end in (-1, 1)] if x.kind == "capsule" else []
     return side, *caps
+
+
+def mesh_of(name: str, folder: Path | None) -> Faces | None:
+    """The mesh of this name, seen from the folder of the file that names it; None if it is not there or is no mesh.
+
+    `package://arm/hand.stl` is looked for as `arm/hand.stl` and as `hand.stl` in this folder and in those above it.
+    """
+    path = _found(name, folder)
+    read = None if path is None else READERS.get(path.suffix.lower())
+    if path is None or read is None:
+        return None
+    try:
+        vertices, faces = read(path.read_bytes())
+        if not np.all(np.isfinite(vertices)) or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+            return None
+        return triangles(vertices, faces)
+    # Numbers that are none, too few, too many digits; a file that may not be read.
+    except (ValueError, IndexError, OverflowError, OSError):
+        return None
+
+
+def _found(name: str, folder: Path | None) -> Path | None:
+    scheme, _, rest = name.rpartition("://")
+    if scheme == "package":
+        places = (
+            [above / x for above in (folder, *folder.parents) for x in (rest, rest.partition("/")[2])] if folder else []
+        )
+    else:
+        places = [Path(rest) if folder is None else folder / rest]
+    return next((place for place in places if is_file(place)), None)
+
+
+def _stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    # Files in bytes may begin with "solid", too: their length decides.
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + 50 * count:
+        facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        corners = np.frombuffer(data, facet, offset=84)["corners"].astype(float).reshape(-1, 3)
+    else:
+        corners = np.array(CORNER.findall(data), float).reshape(-1, 3)
+    vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    return vertices, index.reshape(-1, 3)
+
+
+def _obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    rows = [row.split() for row in data.decode("utf-8", "replace").splitlines()]
+    vertices = np.array([row[1:4] for row in rows if row[:1] == ["v"]], float)
+    faces = [[int(x.partition("/")[0]) for x in row[1:]] for row in rows if row[:1] == ["f"]]
+    # A polygon becomes a fan; indices begin at one.
+    fans = [(face[0], *pair) for face in faces for pair in zip(face[1:], face[2:])]
+    return vertices, np.array(fans, int).reshape(-1, 3) - 1
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; a name that is too long for the system is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+READERS = {".stl": _stl, ".obj": _obj}

@@ -14,20 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import unit_vector
-from lagjax.models.links_and_joints import (
-    BEFORE_TEXT,
-    LinkShape,
-    NotTaken,
-    Placement,
-    RobotJoint,
-    RobotLink,
-    fault_of_inertia,
-    file_of,
-    merged,
-    unmoved,
-)
-from lagjax.models.meshes import mesh_of
-from lagjax.models.robot_model import RobotModel
+from lagjax.models.links_and_joints import Placement, RobotJoint, RobotLink, fault_of_inertia, merged, unmoved
+from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
+from lagjax.models.shapes import LinkShape, mesh_of
 
 # What stands in a file beside links and joints without being mechanics, and parts of joints that the model leaves out.
 BESIDE = {"gazebo", "transmission", "material", "sensor", "ros2_control", "mujoco", "plugin", "force_torque"}
