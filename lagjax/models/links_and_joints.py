@@ -44,7 +44,9 @@ class Placement(NamedTuple):
 
     def point(self, r) -> np.ndarray:
         """A point of the inner frame, in the outer one."""
-        return self.origin + self.axes @ np.asarray(r, float)
+        # The largest numbers overflow; `RobotModel.of` looks for that.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.origin + self.axes @ np.asarray(r, float)
 
     def then(self, inner: "Placement") -> "Placement":
         """A frame inside this one, in the outer one."""
@@ -65,10 +67,10 @@ class RobotLink(NamedTuple):
     inertia: np.ndarray
     line: str
 
-    @property
-    def massless(self) -> bool:
-        """Whether it is a frame and no body."""
-        return self.mass == 0 and not self.inertia.any()
+    @classmethod
+    def frame(cls, name: str, line: str) -> "RobotLink":
+        """One that has no mass."""
+        return cls(name, 0.0, np.zeros(3), np.zeros((3, 3)), line)
 
 
 class RobotJoint(NamedTuple):
@@ -101,6 +103,7 @@ class Loop(NamedTuple):
     name: str
     kind: str
     places: tuple[tuple[str | None, Placement], tuple[str | None, Placement]]
+    line: str
 
 
 class MergedLinks(NamedTuple):
@@ -141,19 +144,23 @@ def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> Merg
 def _sum(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink:
     if len(parts) == 1:
         return head
+    # The largest numbers overflow.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _summed(head, parts)
+        mass = sum(link.mass for link, _ in parts)
+        moment = sum(link.mass * frame.point(link.centre) for link, frame in parts)
+        centre = moment / mass if mass else np.zeros(3)
+        inertia = np.zeros((3, 3))
+        for link, frame in parts:
+            d = frame.point(link.centre) - centre
+            inertia += inertia_along(frame.axes, link.inertia) + link.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return head._replace(mass=mass, centre=centre, inertia=inertia)
 
 
-def _summed(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink:
-    mass = sum(link.mass for link, _ in parts)
-    moment = sum(link.mass * frame.point(link.centre) for link, frame in parts)
-    centre = moment / mass if mass else np.zeros(3)
-    inertia = np.zeros((3, 3))
-    for link, frame in parts:
-        d = frame.point(link.centre) - centre
-        inertia += frame.axes @ link.inertia @ frame.axes.T + link.mass * (d @ d * np.eye(3) - np.outer(d, d))
-    return head._replace(mass=mass, centre=centre, inertia=inertia / 2 + inertia.T / 2)
+def inertia_along(axes: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """An inertia along the axes of a frame, along those in which the frame's axes are the columns."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = axes @ inertia @ axes.T
+    return found / 2 + found.T / 2
 
 
 def fault_of_inertia(link: RobotLink) -> str:

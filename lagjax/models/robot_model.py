@@ -128,13 +128,17 @@ class RobotModel:
                 f"{empty[0].line}: '{empty[0].name}' has moments of inertia and no mass.\n"
                 "Fix: its mass; or all of them zero, if it is a frame."
             )
-        for link in merged.links.values():
-            if not np.isfinite([link.mass, *link.centre, *link.inertia.flat]).all():
+        loops = tuple(loops)
+        told = [(link.line, link.name, (link.mass, *link.centre, *link.inertia.flat)) for link in merged.links.values()]
+        told += [(joint.line, joint.name, joint.placement.origin) for joint in merged.joints.values()]
+        told += [(loop.line, loop.name, np.concatenate([x.origin for _, x in loop.places])) for loop in loops]
+        for where, whose, numbers in told:
+            if not np.isfinite(numbers).all():
                 raise ValueError(
-                    f"{link.line}: mass, centre or inertia of '{link.name}', with what is fixed to it, are beyond the "
-                    "largest number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
+                    f"{where}: mass, inertia or place of '{whose}', with what is fixed to it, are beyond the largest "
+                    "number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
                 )
-        return cls(name, *merged, placed, tuple(loops), tuple(field.tolist()), tuple(not_taken))
+        return cls(name, *merged, placed, loops, tuple(field.tolist()), tuple(not_taken))
 
     def __reduce__(self):
         # Without what is kept, which has compiled programs.
@@ -457,6 +461,15 @@ def _on_body(shape: LinkShape, merged: MergedLinks) -> LinkShape:
 def file_of(source: str | Path, user: str) -> Path | None:
     """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
     if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):
+        try:
+            source.encode()
+        except UnicodeEncodeError as error:
+            line = source.count("\n", 0, error.start) + 1
+            raise ValueError(
+                f"line {line} of the text has the character {source[error.start]!r}, which no file can have.\n"
+                "Usual cause: a file that was decoded with errors='surrogateescape'.\n"
+                f"Fix: {user}(path), and the file in UTF-8."
+            ) from error
         return None
     if not isinstance(source, (str, Path)):
         raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")

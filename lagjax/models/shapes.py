@@ -136,10 +136,10 @@ def _obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that is too long for the system is none."""
+    """Whether there is such a file; a name that the system cannot have is none."""
     try:
         return path.is_file()
-    except OSError:
+    except (OSError, ValueError):
         return False
 
 
