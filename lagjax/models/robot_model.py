@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,27 +36,23 @@ from lagjax.bodies import (
 )
 from lagjax.display import Drawing, Shape, Still
 from lagjax.integrate import still, subject_of
-from lagjax.models.joint_positions import (
+from lagjax.models.links_and_joints import (
     BodyJoint,
-    all_positions,
-    connected,
-    drawn,
-    moved,
-    quaternion_of,
-    rate_squared,
-)
-from lagjax.models.looks import looks_of, not_drawn
-from lagjax.models.parts import (
-    LinkShape,
     Loop,
     MergedLinks,
-    NotTaken,
     Placement,
     RobotJoint,
     RobotLink,
+    all_positions,
+    connected,
+    drawn,
     made_up,
+    moved,
+    quaternion_of,
+    rate_squared,
     unmoved,
 )
+from lagjax.models.shapes import LinkShape, is_file, looks_of, not_drawn
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
@@ -65,6 +62,17 @@ EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherica
 UPWARD = (0.0, 0.0, 1.0)
 # How many of a kind `print` lists.
 LISTED = 6
+# What may stand before the text of a file: white space and a byte-order mark.
+BEFORE_TEXT = " \t\r\n\ufeff"
+LONGEST_SHOWN = 200
+
+
+class NotTaken(NamedTuple):
+    """What a file says and the model leaves out: what it is, whose, and its line."""
+
+    what: str
+    name: str
+    line: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,13 +128,17 @@ class RobotModel:
                 f"{empty[0].line}: '{empty[0].name}' has moments of inertia and no mass.\n"
                 "Fix: its mass; or all of them zero, if it is a frame."
             )
-        for link in merged.links.values():
-            if not np.isfinite([link.mass, *link.centre, *link.inertia.flat]).all():
+        loops = tuple(loops)
+        told = [(link.line, link.name, (link.mass, *link.centre, *link.inertia.flat)) for link in merged.links.values()]
+        told += [(joint.line, joint.name, joint.placement.origin) for joint in merged.joints.values()]
+        told += [(loop.line, loop.name, np.concatenate([x.origin for _, x in loop.places])) for loop in loops]
+        for where, whose, numbers in told:
+            if not np.isfinite(numbers).all():
                 raise ValueError(
-                    f"{link.line}: mass, centre or inertia of '{link.name}', with what is fixed to it, are beyond the "
-                    "largest number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
+                    f"{where}: mass, inertia or place of '{whose}', with what is fixed to it, are beyond the largest "
+                    "number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
                 )
-        return cls(name, *merged, placed, tuple(loops), tuple(field.tolist()), tuple(not_taken))
+        return cls(name, *merged, placed, loops, tuple(field.tolist()), tuple(not_taken))
 
     def __reduce__(self):
         # Without what is kept, which has compiled programs.
@@ -444,3 +456,28 @@ def _on_body(shape: LinkShape, merged: MergedLinks) -> LinkShape:
     frame = frame.then(Placement(shape.origin, shape.axes))
     centre = np.zeros(3) if head is None else merged.links[head].centre
     return shape._replace(body="ground" if head is None else head, origin=frame.origin - centre, axes=frame.axes)
+
+
+def file_of(source: str | Path, user: str) -> Path | None:
+    """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
+    if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):
+        try:
+            source.encode()
+        except UnicodeEncodeError as error:
+            line = source.count("\n", 0, error.start) + 1
+            raise ValueError(
+                f"line {line} of the text has the character {source[error.start]!r}, which no file can have.\n"
+                "Usual cause: a file that was decoded with errors='surrogateescape'.\n"
+                f"Fix: {user}(path), and the file in UTF-8."
+            ) from error
+        return None
+    if not isinstance(source, (str, Path)):
+        raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
+    path = Path(source).expanduser()
+    if not is_file(path):
+        shown = str(source) if len(str(source)) <= LONGEST_SHOWN else str(source)[:LONGEST_SHOWN] + "..."
+        raise FileNotFoundError(
+            f"there is no file '{shown}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
+            f'package:// name, which ROS alone knows.\nFix: {user}("/path/to/the/file"), or the text itself.'
+        )
+    return path

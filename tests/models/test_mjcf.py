@@ -183,6 +183,12 @@ def test_files(tmp_path):
         lj.read_mjcf("nowhere.xml")
 
 
+def test_a_loop_that_is_nowhere():
+    """An anchor that is no finite number is refused by line and name."""
+    with pytest.raises(ValueError, match="line 10: .* place of 'pin', .* are beyond the largest number"):
+        lj.read_mjcf(LOOP.format("").replace('anchor="2 0 0"', 'anchor="inf 0 0"'))
+
+
 def welded_beside(name):
     """A body with another of mass 5 welded to it, which has no name, and a second body of this name."""
     return f"""<mujoco><worldbody><body name="a"><joint name="h" axis="0 1 0"/><geom size=".1" mass="1"/>
