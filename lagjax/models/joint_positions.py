@@ -5,7 +5,7 @@
     planar       two lengths along the first two vectors of the joint's frame and the angle about its axis
     spherical    the unit quaternion of the child's axes in the joint's
 
-The position of a floating joint is the `lj.Pose` of its body in space, as in q.
+The position of a floating joint is the `lj.bodies.Pose` of its body in space, as in q.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ def moved(joint: RobotJoint, s: PyTree, centre: np.ndarray) -> Placement:
 
 
 def frame_of(axis: np.ndarray) -> np.ndarray:
-    """Three unit vectors as rows, the last of which is the axis: those of `lj.Marker`."""
+    """Three unit vectors as rows, the last of which is the axis: those of `lj.bodies.Marker`."""
     return np.array(Marker.on(Ground(), (0.0, 0.0, 0.0), axis if axis.any() else (0.0, 0.0, 1.0)).frame)
 
 

@@ -20,7 +20,7 @@ from lagjax.display import Faces
 # What may stand before the text of a file: white space and a byte-order mark.
 BEFORE_TEXT = " \t\r\n\ufeff"
 LONGEST_SHOWN = 200
-# By how much of their sum principal moments may miss the triangle inequality, as in `lj.Body`.
+# By how much of their sum principal moments may miss the triangle inequality, as in `lj.bodies.Body`.
 ROUNDED = 1e-9
 
 

@@ -126,7 +126,8 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
         if takes_of(crossing.guard) != OF_STATE:
             raise ValueError(
                 f"event '{name}' takes multipliers, which differ from phase to phase.\n"
-                "Fix: lj.Switch(..., when=lj.releases(name)) if a contact lets go; or traj.multipliers at outputs."
+                "Fix: lj.Switch(..., when=lj.guards.releases(name)) if a contact lets go; or traj.multipliers at "
+                "outputs."
             )
     if SWITCHES in events:
         raise ValueError(
@@ -162,7 +163,7 @@ def _reset(switch: Switch, hybrid: Hybrid, system: System) -> Reset:
     if takes_of(switch.when) != OF_STATE:
         raise ValueError(
             f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
-            "fast it opens.\nFix: rest= only with lj.touches(gap)."
+            "fast it opens.\nFix: rest= only with lj.guards.touches(gap)."
         )
     settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
     return Reset(function, takes, settle, switch.when, switch.slower_than)
