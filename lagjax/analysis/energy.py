@@ -237,7 +237,9 @@ def _ledger(motion: Motion) -> EnergyLedger:
         impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
         closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,
         elements={name: works[words] for name in motion.elements() if (words := element_in_words(name)) in works},
-        element_impacts={str(name): summed(np.where(by == name, jumps, 0.0)) for name in sorted(set(by[jumped_there]))},
+        element_impacts={
+            str(name): summed(np.where(by == name, jumps, 0.0)) for name in sorted(set(by[jumped_there]) - {""})
+        },
     )  # fmt: skip
 
 

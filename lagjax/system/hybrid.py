@@ -193,18 +193,28 @@ class Hybrid(eqx.Module):
         self.first = np.zeros((), np.int32)
 
     in_phases: ClassVar[bool] = True
-    elements: ClassVar[Elements | None] = None
 
     @property
     def phases(self) -> tuple[System, ...]:
         """The systems of all phases."""
         return self.systems
 
-    def given(self, params: PyTree, modes: Array | None = None) -> PyTree:
-        """What the functions of the phases take as `params`; `modes`: those of elements, of which there are none."""
+    @property
+    def elements(self) -> Elements | None:
+        """The elements of all phases; None without any."""
+        found = [system.elements for system in self.systems if system.elements is not None]
+        return Elements(dict(item for elements in found for item in elements.items())) if found else None
+
+    @property
+    def modes(self) -> list[tuple[str, str]]:
+        """The name and the kind of each mode of elements."""
+        return []
+
+    def given(self, params: PyTree, modes: Array | None = None, phase: int = 0) -> PyTree:
+        """What the functions of a phase take as `params`; `modes`: those of elements, of which there are none."""
         return params
 
-    def cases(self, params: PyTree) -> dict[str, PyTree]:
+    def cases(self, params: PyTree, phase: int = 0) -> dict[str, PyTree]:
         """The parameters in as many cases, by what is said of them, as it takes to see what every function returns."""
         return {"": params}
 
@@ -215,7 +225,7 @@ class Hybrid(eqx.Module):
     @property
     def first_phase(self) -> System:
         """The system of the phase in which motions start. Not while JAX is tracing."""
-        return self.systems[int(self.first)]
+        return self.systems[int(self.first)].first_phase
 
     def starting(self, start: str | ArrayLike | None, argument: str = "start") -> "Hybrid":
         """The same hybrid with motions that start in this phase, a name or a number; None keeps the present one.

@@ -171,7 +171,8 @@ class Model(eqx.Module):
         if not self.system.in_phases:
             return (self,)
         return tuple(
-            model_of(phase, *self.form.example, self.system.given(self.params)) for phase in self.system.phases
+            model_of(phase, *self.form.example, self.system.given(self.params, phase=i))
+            for i, phase in enumerate(self.system.phases)
         )
 
     def tree(self, x: Array):

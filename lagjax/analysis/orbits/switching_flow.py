@@ -24,7 +24,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.analysis.orbits.flow import Changes, Flow, Passage, flow_of
-from lagjax.integrate import HybridTrajectory, InElements, Switches, ended_well, integrate, switches_before_any
+from lagjax.integrate import HybridTrajectory, Switches, ended_well, integrate, switches_before_any
 from lagjax.jaxtools import WATCHED, compiled
 from lagjax.system import Hybrid, Model, State, System, model_of
 
@@ -175,4 +175,4 @@ def no_switches(system: System | Hybrid, s: State) -> Switches | None:
     """The switches of a motion before any; None for a system without phases."""
     if not system.in_phases:
         return None
-    return switches_before_any(system, s.q, s.v, system.laws if isinstance(system, InElements) else None)
+    return switches_before_any(system, s.q, s.v)
