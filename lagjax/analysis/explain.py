@@ -59,7 +59,7 @@ class HybridExplanation:
 
     >>> import lagjax as lj
     >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
-    >>> bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, restitution=0.5))
+    >>> bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, params: q, restitution=0.5))
     >>> found = lj.explain(lj.Hybrid({"flying": ball}, [bounce]), 0.0, 5.0, 0.0)
     >>> print(list(found.phases), found.final)
     ['flying'] ()

@@ -182,7 +182,7 @@ def _no_state_after(trajectory):
         return said + (
             "Usual cause: a contact that jams. The gap and the constraints fix how it slides, whatever friction does, "
             "and friction exceeds the force that pushes the contact together: no impulse satisfies both.\n"
-            "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.touches(gap)."
+            "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.guards.touches(gap)."
         )
     return said + (
         "Usual cause: a reset that divides by something that is zero there, or takes its root; or constraints of the "

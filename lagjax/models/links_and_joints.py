@@ -13,7 +13,7 @@ Joint positions are counted from the file's drawing, and are read off the marker
     planar       two lengths along the first two vectors of the joint's frame and the angle about its axis
     spherical    the unit quaternion of the child's axes in the joint's
 
-The position of a floating joint is the `lj.Pose` of its body in space, as in q.
+The position of a floating joint is the `lj.bodies.Pose` of its body in space, as in q.
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms* (2008), §2.13 and Ch. 4.
 """
@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix
 
-# By how much of their sum principal moments may miss the triangle inequality, as in `lj.Body`.
+# By how much of their sum principal moments may miss the triangle inequality, as in `lj.bodies.Body`.
 ROUNDED = 1e-9
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 # Axes that are meant to be parallel, at right angles, or to meet.
@@ -209,7 +209,7 @@ def moved(joint: RobotJoint, s: PyTree, centre: np.ndarray) -> Placement:
 
 
 def frame_of(axis: np.ndarray) -> np.ndarray:
-    """Three unit vectors as rows, the last of which is the axis: those of `lj.Marker`."""
+    """Three unit vectors as rows, the last of which is the axis: those of `lj.bodies.Marker`."""
     return np.array(Marker.on(Ground(), (0.0, 0.0, 0.0), axis if axis.any() else (0.0, 0.0, 1.0)).frame)
 
 

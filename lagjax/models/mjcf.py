@@ -62,9 +62,9 @@ def read_mjcf(source: str | Path) -> RobotModel:
     left out, and listed in `model.not_taken`.
 
     Positions of joints count from the file's drawing: MuJoCo's `qpos` minus its `qpos0`. That of a free joint is the
-    `lj.Pose` of its body, and goes by the body's name.
+    `lj.bodies.Pose` of its body, and goes by the body's name.
 
-    **Returns:** a `lj.RobotModel`.
+    **Returns:** a `RobotModel`.
 
     **Raises:** `ImportError` without MuJoCo; `FileNotFoundError`; `ValueError` for what MuJoCo refuses, in its words,
     and for equalities that are not supported.

@@ -20,11 +20,9 @@ from lagjax.bodies import (
     Marker,
     Pose,
     Tree,
-    axis,
     cylindrical,
     fixed,
     ground,
-    line,
     multibody,
     planar,
     prismatic,
@@ -53,6 +51,7 @@ from lagjax.models.links_and_joints import (
     unmoved,
 )
 from lagjax.models.shapes import LinkShape, is_file, looks_of, not_drawn
+from lagjax.shapes import axis, line
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
@@ -87,15 +86,15 @@ class RobotModel:
     >>> print(q["cart"].position, model.joint_positions(q)["s"], model.joint_rates(q, v)["s"])
     [0.5 0.  0. ] 0.5 3.0
 
-    - `name`: as in the file; `bodies`: `lj.Body`s by the names of their links, with the links' axes; `shapes`: the
-      shapes on them; `gravity`: (3,).
+    - `name`: as in the file; `bodies`: `lj.bodies.Body`s by the names of their links, with the links' axes; `shapes`:
+      the shapes on them; `gravity`: (3,).
     - `links`, `joints`: what moves, as plain numbers, parents first; `frames`: by each link of the file, the link that
       it is part of (None: the ground) and where its frame is in that; `loops`: what is held together besides.
     - `not_taken`: what the file says and the model leaves out, each with its line; `print(model)` lists it.
 
     Positions of joints, by name, count from the file's drawing, `[length]` or radians: a number for revolute and
     prismatic joints, (3,) for planar ones (two lengths, an angle), a unit quaternion for spherical ones; for floating
-    ones, which go by the name of their body, its `lj.Pose` in space.
+    ones, which go by the name of their body, its `lj.bodies.Pose` in space.
     """
 
     name: str
@@ -171,14 +170,14 @@ class RobotModel:
         return self._of_bodies(q, v)[1]
 
     def at(self, link: str, point: ArrayLike = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> Marker:
-        """A place on a link of the file, in its frame there, for loads and further joints: a `lj.Marker`."""
+        """A place on a link of the file, in its frame there, for loads and further joints: a `lj.bodies.Marker`."""
         if link not in self.frames:
             raise ValueError(f"there is no link '{link}'.\nFix: one of {', '.join(self.frames)}.")
         head, frame = self.frames[link]
         return self._marker(head, Placement(frame.point(point), frame.axes), axis)
 
     def markers(self, joint: str) -> tuple[Marker, Marker]:
-        """The two places that a joint joins: `lj.motor(*model.markers("elbow"), torque)`."""
+        """The two places that a joint joins: `lj.bodies.motor(*model.markers("elbow"), torque)`."""
         for x in self._between.values():
             if [y.name for y in x.joints] == [joint]:
                 return x.a, x.b
@@ -187,10 +186,10 @@ class RobotModel:
         raise ValueError(f"there is no joint '{joint}'.\nFix: one of {', '.join(self.joints)}.")
 
     def system(self, loads: Iterable[Load] = (), joints: Mapping | None = None, **others) -> System:
-        """Return the system of its bodies: q and v are dicts of `lj.Pose` by body, joints are constraints.
+        """Return the system of its bodies: q and v are dicts of `lj.bodies.Pose` by body, joints are constraints.
 
         Weight, dampers, springs and rotors of joints are in it, and loops; `loads`, `joints` and `others` are further
-        ones of `lj.multibody`. A spring's angle counts from -π to π.
+        ones of `lj.bodies.multibody`. A spring's angle counts from -π to π.
 
         **Raises:** `ValueError` for a massless link that no joint of `lj` stands for, by its line.
         """
@@ -215,8 +214,8 @@ class RobotModel:
 
         It is that of `tree()`, solved at O(n). Springs of joints count whole turns.
 
-        `loads` are those of `lj.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and the
-        position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
+        `loads` are those of `lj.bodies.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and
+        the position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
         `states` and `elements` of `lj.System`, in joint coordinates.
         """
         dissipation, joints = others.pop("dissipation", None), self.joints.values()
@@ -249,7 +248,7 @@ class RobotModel:
         return still(subject_of(Drawing(self._looks), None, None), 0.0, poses, frames, view)
 
     def tree(self) -> Tree:
-        """Return the `lj.Tree` of its links, with the rotors of joints; without what else acts, and without loops.
+        """Return the `lj.bodies.Tree` of its links, with the rotors of joints; without what else acts, and loops.
 
         **Raises:** `ValueError` for a link without mass that moves and carries none, by its line.
         """

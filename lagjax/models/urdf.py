@@ -161,7 +161,7 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
     known, `<mimic>`, a loop) is refused, by its line; limits, friction, transmissions, contacts, sensors, plugins are
     left out, and listed in `model.not_taken`.
 
-    **Returns:** a `lj.RobotModel`.
+    **Returns:** a `RobotModel`.
 
     **Raises:** `FileNotFoundError`; `ValueError` for what is not URDF or not supported, for inertias that no body has,
     for links with two parents, in a circle or without a way to the root: with the line of each.
@@ -320,7 +320,8 @@ def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: 
         if before is not joint:
             raise ValueError(
                 f"{joint.line}: '{joint.child}' is the child of '{joint.name}' and of '{before.name}' ({before.line}), "
-                "and URDF has trees only.\nFix: one of the joints as lj.revolute(*...) in model.system(joints={...})."
+                "and URDF has trees only.\n"
+                "Fix: one of the joints as lj.bodies.revolute(*...) in model.system(joints={...})."
             )
     roots = [name for name in links if name not in above]
     if len(roots) != 1:

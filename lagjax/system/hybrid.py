@@ -41,7 +41,7 @@ class Switch(eqx.Module):
       multipliers by constraint name; a number of any unit, above zero as long as the phase lasts. Values that it
       closes over are differentiated too.
     - `reset`: the jump, or None: `reset(t, q, v, params)` -> velocities like `v`, or a pair (q, v) for the whole state;
-      it may take multipliers, as `when`. Guards such as `lj.touches` have a reset of their own.
+      it may take multipliers, as `when`. Guards such as `lj.guards.touches` have a reset of their own.
 
     - `rest`: the name of the phase to enter instead of `to` where the guard, after the reset, opens more slowly than
       `slower_than` per unit of time: this ends infinitely many impacts in finite time. The velocities become the
@@ -86,7 +86,7 @@ class Switch(eqx.Module):
                 )
         self.phase, self.to, self.when, self.rest = phase, to, when, rest
         self.slower_than = slower_than if isinstance(slower_than, jax.Array) else np.asarray(slower_than, float)
-        # A guard such as `lj.touches` has its impact as `reset`.
+        # A guard such as `lj.guards.touches` has its impact as `reset`.
         self.reset = getattr(when, "reset", None) if reset is None else reset
 
     def __repr__(self):

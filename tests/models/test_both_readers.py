@@ -297,6 +297,6 @@ def test_what_mujoco_has_not():
     assert [shape.mesh for shape in lj.read_urdf(MESH).shapes] == ["hand.stl"]
     flat = spec_of(MOVING).compile()
     assert [flat.joint(k).name for k in range(flat.njnt)] == ["r", "p", "f_TX", "f_TY", "f_RZ"]
-    # Its slides are along other axes of the plane than the first two vectors of a `lj.Marker`'s frame.
-    ours = lj.ground.at(axis=(0.6, 0.8, 0.0)).frame
+    # Its slides are along other axes of the plane than the first two vectors of a `lj.bodies.Marker`'s frame.
+    ours = lj.bodies.ground.at(axis=(0.6, 0.8, 0.0)).frame
     assert np.abs(np.array(ours[:2]) - flat.jnt_axis[2:4]).max() > 0.1

@@ -31,8 +31,10 @@ ARM = """<robot name="arm">
 
 def drawn(system, q):
     """What is drawn of a system at one state."""
-    lanes = {name: lj.Pose(*(np.asarray(x)[None] for x in value)) if isinstance(value, tuple) else np.array([value])
-             for name, value in q.items()}  # fmt: skip
+    lanes = {
+        name: lj.bodies.Pose(*(np.asarray(x)[None] for x in value)) if isinstance(value, tuple) else np.array([value])
+        for name, value in q.items()
+    }
     found = subject_of(None, system, None).frames(np.zeros(1), lanes)
     assert isinstance(found, InSpace)
     return found
@@ -100,7 +102,7 @@ def test_positions_of_joints_are_drawn():
     Twin: at other positions it does not.
     """
     positions = {"r": 0.7, "p": -0.4, "f": np.array([0.3, -0.2, 0.5])}
-    positions["base"] = lj.Pose.at((1.0, 2.0, 3.0), axis=(1.0, 2.0, 2.0), angle=0.8)
+    positions["base"] = lj.bodies.Pose.at((1.0, 2.0, 3.0), axis=(1.0, 2.0, 2.0), angle=0.8)
     model = lj.read_urdf(MOVING, base="free")
     known, _ = model.state(positions)
     here, elsewhere = (drawn_poses(model, x) for x in (positions, positions | {"r": 0.6}))

@@ -322,7 +322,7 @@ def test_a_free_base():
     text = two_links().replace('<link name="post"/>', f'<link name="post">{BODY}</link>')
     model = lj.read_urdf(text, base="free")
     assert model.joints["post"].kind == "floating" and list(model.bodies) == ["post", "rod"]
-    pose = lj.Pose.at((1.0, 2.0, 3.0), (0.0, 0.0, 1.0), np.pi / 2)
+    pose = lj.bodies.Pose.at((1.0, 2.0, 3.0), (0.0, 0.0, 1.0), np.pi / 2)
     q, v = model.state({"post": pose}, {"post": pose.moving((1.0, 0.0, 0.0))})
     np.testing.assert_allclose(q["rod"].position, [1.0, 2.0, 3.0], atol=1e-15)
     np.testing.assert_allclose(v["rod"].position, [1.0, 0.0, 0.0], atol=1e-15)

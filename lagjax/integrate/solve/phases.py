@@ -135,7 +135,8 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
         if takes_of(crossing.guard) != OF_STATE:
             raise ValueError(
                 f"event '{name}' takes multipliers, which differ from phase to phase.\n"
-                "Fix: lj.Switch(..., when=lj.releases(name)) if a contact lets go; or traj.multipliers at outputs."
+                "Fix: lj.Switch(..., when=lj.guards.releases(name)) if a contact lets go; or traj.multipliers at "
+                "outputs."
             )
     if SWITCHES in events:
         raise ValueError(
@@ -185,7 +186,7 @@ def _reset(switch: Switch, hybrid: Hybrid, i: int, start: State) -> Reset:
     if takes_of(switch.when) != OF_STATE:
         raise ValueError(
             f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
-            "fast it opens.\nFix: rest= only with lj.touches(gap)."
+            "fast it opens.\nFix: rest= only with lj.guards.touches(gap)."
         )
     settle = Plastic().between(before, system_alone(hybrid, hybrid.names.index(switch.rest), start))
     return Reset(function, takes, settle, switch.when, switch.slower_than)

@@ -13,7 +13,7 @@ from lagjax.system import coordinates
 
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q, {"floor": lj.Holonomic(lambda t, q, p: q)})
-bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))
+bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, p: q, restitution=0.5))
 hybrid = lj.Hybrid({"flying": ball, "lying": lying}, [bounce])
 TS = np.array([0.0, 0.5])
 
