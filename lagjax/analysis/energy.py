@@ -103,7 +103,10 @@ class EnergyLedger(eqx.Module):
         """The jumps until each output, by what they are called."""
         if self.element_impacts:
             words = {name: "impacts" if name in self.elements else "steps" for name in self.element_impacts}
-            return {f"{words[name]} of '{name}'": jumps for name, jumps in self.element_impacts.items()}
+            found = {f"{words[name]} of '{name}'": jumps for name, jumps in self.element_impacts.items()}
+            others = self.impact_total - sum(self.element_impacts.values())
+            noise = self.allowed * self.scale
+            return found | ({"switches of phases": others} if np.max(np.abs(others)) > noise else {})
         return {_count(len(self.impacts), "switch"): self.impact_total} if len(self.impacts) else {}
 
     def plot(self):

@@ -87,7 +87,10 @@ def _in_doubt(trajectory, guards, name: str) -> tuple[str, str, str]:
     """The guard of an event, or that of a switch, that cannot be followed; why, with a number, or ""; and the fix."""
     shifted = "shift the level of the guard a little; or make the motion take shorter steps, max_step="
     if trajectory.system.elements is not None:
-        return (f"the modes {listed(trajectory.switches.ways)}" if name == SWITCHES else f"event '{name}'"), "", shifted
+        switches = trajectory.switches
+        modes = ("a switch of phases, or " if switches.of_phases else "") + "the modes "
+        modes += listed([mode for mode, _ in switches.of_modes])
+        return (modes if name == SWITCHES else f"event '{name}'"), "", shifted
     instants, step = _instants(trajectory), _step(trajectory)
     candidates = [
         (i, kind.name.partition(", number ")[0] if name == SWITCHES else name, guard, kind.takes_multipliers)

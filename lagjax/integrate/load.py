@@ -15,7 +15,7 @@ from lagjax.integrate.solve.backward_time import backward_trajectory_of
 from lagjax.integrate.solve.phases import traced_phases
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.error_report import Errors
-from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
+from lagjax.integrate.trajectory.hybrid_trajectory import OF_PHASES, HybridTrajectory, Switches
 from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.trajectory.results import RESULTS, item
 from lagjax.integrate.trajectory.save import PLAIN
@@ -143,7 +143,8 @@ def check_shapes(found: dict[str, Any]) -> None:
         check("switches", [switches["count"]], batch, "iu", exactly=True)
         check("switches", [switches["uncertain"]], batch, "b", exactly=True)
         if (modes := found.get("modes")) is not None:
-            many = len(switches["ways"])
+            # Files older than elements in phases have no kinds of switches.
+            many = len(switches["ways"]) - list(switches.get("kinds", ())).count(OF_PHASES)
             check("modes", [modes], (*outputs, many), "iu", exactly=True)
             check("switches", [switches["modes"]], (*rows, many), "iu", exactly=True)
         if not all(isinstance(x, str) for x in (*switches["names"], *switches["ways"])):

@@ -182,7 +182,7 @@ class InPhase(Location):
         if mode.of_elements is not None:
             assert after.modes is not None
             modes = jnp.broadcast_to(mode.of_elements.modes[None], (ts.size, mode.of_elements.modes.size))
-            if phase.has_instants:
+            if phase.meeting is not None and phase.has_instants:
                 # Outputs at instants have the new values.
                 new, sampled = instant & onward & (leg.times == until), np.zeros(modes.shape[1], bool)
                 sampled[slice(*phase.places)] = phase.meeting.laws.is_sampled
@@ -224,7 +224,7 @@ def solved_in_phases(
     in_step = len(phases) == 1 and not any(jumps)
     locations = [InPhase(hybrid, i, phases, params, ts, settings, in_step) for i in range(len(phases))]
 
-    def of_location(location: Location) -> Settings:
+    def of_location(location: Any) -> Settings:
         drift = settings.drift if location.system.constraints else "none"
         meeting = location.phase.meeting
         return replace(settings, drift=drift, forced=None if meeting is None else meeting.forced)

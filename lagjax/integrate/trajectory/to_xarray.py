@@ -64,7 +64,7 @@ def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
         flags = {"flag_values": np.arange(len(names)), "flag_meanings": " ".join(map(_one_word, names))}
         found[f"{under}phase"].attrs = flags
     if f"{under}modes" in found:
-        found = found.assign_coords({"mode": list(trajectory.switches.ways)})
+        found = found.assign_coords({"mode": [name for name, _ in trajectory.switches.of_modes]})
         found[f"{under}modes"].attrs = MODES
     return found
 
