@@ -10,8 +10,8 @@ NAMES = """
     analysis.orbits.periodic_orbit.periodic_orbit analysis.poincare.poincare analysis.poincare.turning_points
     exchange.standalone_programs.export fit.fit.fit fit.identifiability.identifiability fit.load.load_fit
     fit.loss.fit_loss fit.loss.fit_residuals integrate.adjoint.replay.Replay integrate.contacts.contacts.touches
-    integrate.events.event.Crossing numerics.methods.gauss.Gauss numerics.methods.nystrom.Nystrom8
-    numerics.methods.radau.Radau5 numerics.methods.splitting.Splitting sweep.sweep.sweep
+    integrate.events.event.Crossing numerics.symplectic.Gauss numerics.runge_kutta.Nystrom8
+    numerics.radau.Radau5 numerics.symplectic.Splitting sweep.sweep.sweep
     system.elements.CompliantContact system.elements.Contact system.elements.SampledControl system.hybrid.Hybrid
     two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
     two_points.optimal_control.steer two_points.steering.Steering two_points.tracking.TrackingLQR

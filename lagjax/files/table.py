@@ -24,17 +24,17 @@ from lagjax.numerics import tolerance_of_the_controller
 
 # A module, and the classes that are found there: their fields.
 CLASSES = """
-lagjax.numerics.methods.runge_kutta
+lagjax.numerics.runge_kutta
   Dopri8 Tsit5 RK4: in_a_loop
-lagjax.numerics.methods.nystrom
+lagjax.numerics.runge_kutta
   Nystrom8 Nystrom12: in_a_loop
-lagjax.numerics.methods.gauss
+lagjax.numerics.symplectic
   Gauss: stages newton pace
-lagjax.numerics.methods.splitting
+lagjax.numerics.symplectic
   Splitting: order pace
-lagjax.numerics.methods.radau
+lagjax.numerics.radau
   Radau5: root_finder root_find_max_steps step_powers
-lagjax.numerics.methods.radau
+lagjax.numerics.radau
   SimplifiedNewton: rtol atol norm kappa slow
 diffrax
   Euler SemiImplicitEuler LeapfrogMidpoint ReversibleHeun ConstantStepSize DirectAdjoint ForwardMode:

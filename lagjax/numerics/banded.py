@@ -27,7 +27,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.numerics.linalg import dense
+from lagjax.numerics import dense
 
 
 class Order(NamedTuple):

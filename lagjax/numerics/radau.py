@@ -51,8 +51,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.numerics.linalg import dense
-from lagjax.numerics.methods.runge_kutta import Interpolation
+from lagjax.numerics import dense
+from lagjax.numerics.runge_kutta import Interpolation
 
 # If two corrections in a row are below this part of the tolerance, the rest is round-off.
 NOISE = 0.1

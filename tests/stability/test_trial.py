@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax.numerics.methods.runge_kutta import Dopri8
+from lagjax.numerics.runge_kutta import Dopri8
 from lagjax.stability import oscillator
 from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG, Trial
 from tests.test_stability import OUTCOME

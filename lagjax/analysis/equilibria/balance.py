@@ -244,7 +244,7 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives: bool):
     """All roots s of departures e^(st), (2n,), with NaN in place of the roots that constraints remove.
 
     Departures along the symmetry are left out: they lead to the same motion. All roots are NaN where the equations of
-    motion are singular. Derivatives are those of `numerics/linalg/eigenvalues.py`. `lj.normal_modes` reports more about
+    motion are singular. Derivatives are those of `numerics/lapack.py`. `lj.normal_modes` reports more about
     one state; this function serves many states inside compiled programs, and any symmetry.
     """
     d, n = departures(s, y, jacobian), s.n

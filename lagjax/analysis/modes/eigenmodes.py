@@ -9,7 +9,7 @@ where m, M_c, g are the blocks of M and G of the eliminated coordinates. A conse
 if K_e is singular. A mode that oscillates with ω contributes to the quadratic energy E₂ = ½ ξ̇ᵀ M ξ̇ + ½ ξᵀ K ξ with
 the sign of xᴴ (ω² M + K) x; if this is negative, damping makes the mode grow.
 
-The roots are those of `K x = s M x` at rest, and of `A x = λ E x` otherwise (`numerics/linalg/eigenvalues.py`).
+The roots are those of `K x = s M x` at rest, and of `A x = λ E x` otherwise (`numerics/lapack.py`).
 
 Source: Goldstein, *Classical Mechanics*, §8.3 (Routh); Krein's signature and Kelvin-Tait-Chetaev's theorem: Kirillov,
 *Nonconservative Stability Problems of Modern Physics*, ch. 3 and 5; Merkin, *Introduction to the Theory of Stability*,
