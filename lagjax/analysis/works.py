@@ -26,14 +26,7 @@ from lagjax.integrate import (
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import of_states, sees_time
 from lagjax.numerics import quadrature
-from lagjax.system import (
-    InModes,
-    Model,
-    System,
-    constraints,
-    given_in,
-    model_of,
-)
+from lagjax.system import InModes, Model, System, constraints, given_in, model_of
 
 FORCE, DISSIPATION, STATES, TIME = "force", "dissipation", "states", "explicit time"
 # How often inaccurate intervals are halved, and the most intervals.

@@ -1,31 +1,236 @@
-"""The first call of the user's functions: on shapes alone, before anything is computed or compiled.
+"""What every door asks of its arguments, in the user's words: a system, a start, and functions that can be called.
 
-Each is checked, and becomes its jaxpr (`traced_functions.py`). `user_errors.py` explains the errors that occur inside
-them.
+The user's functions are called first on shapes alone, before anything is computed or compiled. Each is checked, and
+becomes its jaxpr (`traced.py`). `user_errors.py` explains the errors that occur inside them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
-from typing import Any
+from functools import partial, wraps
+from inspect import Parameter, signature
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import is_linear, kinds, length, once, remembered, without_repeats
+from lagjax.jaxtools import depends, is_linear, kinds, length, numpy_of, once, remembered, varies, without_repeats
 from lagjax.system import coordinates
-from lagjax.system.argument_checks import check_system
+from lagjax.system.constraints import Held, Holonomic, Nonholonomic
 from lagjax.system.coordinates import State
-from lagjax.system.function_arguments import OF_STATE, WITH_FORCE, takes_of
-from lagjax.system.model import Model, model_of
-from lagjax.system.states import check_rate, check_starts, check_use, with_rates
+from lagjax.system.hybrid import Hybrid
+from lagjax.system.model import Model, known_system, model_of
 from lagjax.system.system import System, unchecked
-from lagjax.system.traced_functions import Traced, TracedProgram, traced
-from lagjax.system.user_errors import Call, check_arguments, in_words
-from lagjax.system.warn import warn
+from lagjax.system.traced import OF_STATE, WITH_FORCE, Traced, TracedProgram, takes_of, traced
+from lagjax.system.user_errors import Call, check_arguments, in_words, warn
+
+P = ParamSpec("P")
+R = TypeVar("R")
+CONSTRAINTS = (Holonomic, Nonholonomic)
+SYSTEMS = (System, Hybrid)
+
+
+def check_system(system: Any, *others: Any, phases: bool = False, states: bool = True, elements: bool = False) -> None:
+    """Raise if the first argument of a function is not a `System`, or with `phases` a `Hybrid`.
+
+    `others`: the following arguments, among which the system may be. `states`, `elements`: whether it may have them.
+    """
+    if not states and isinstance(system, System) and system.states:
+        raise ValueError(
+            f"this is not done for systems with states, as '{next(iter(system.states))}' here: only coordinates obey "
+            "Lagrange's equations.\nFix: lj.integrate for their motions; here the system without them."
+        )
+    if type(system) is System or isinstance(system, SYSTEMS if phases else System):
+        if not elements and getattr(system, "elements", None) is not None:
+            raise TypeError(
+                f"this takes a system with one form of equations, and the elements of this one "
+                f"({', '.join(map(repr, system.elements))}) change them.\n"
+                "Fix: lj.System(...) without elements=, with a lj.Holonomic for a contact that is closed; "
+                "lj.integrate takes elements."
+            )
+        return
+    known_system(system)
+    if isinstance(system, Hybrid):
+        raise TypeError(
+            "this takes one system, and a lj.Hybrid has one for each of its phases.\n"
+            f"Fix: hybrid.systems[{len(system.names) - 1}] for '{system.names[-1]}'; print(hybrid) shows how "
+            "the phases follow each other."
+        )
+    raise TypeError(f"the first argument must be a lj.System, not {_describe(system)}.\n{_remedy(system, others)}")
+
+
+def _describe(thing):
+    if isinstance(thing, type):
+        return f"the class {thing.__name__}"
+    if callable(thing) and hasattr(thing, "__name__"):
+        return "a function" if thing.__name__ == "<lambda>" else f"the function '{thing.__name__}'"
+    return "None" if thing is None else f"a {type(thing).__name__}"
+
+
+def _remedy(system, others):
+    places = [i for i, x in enumerate(others, 2) if isinstance(x, SYSTEMS)]
+    if places:
+        return (
+            f"Usual cause: arguments in another order; the system is argument {places[0]} here.\n"
+            "Fix: lj.integrate(system, q0, v0, params, ts=ts); and (system, t, q, v, params) at one state."
+        )
+    if system is System:
+        return "Usual cause: the class in place of a system.\nFix: system = lj.System(lagrangian)."
+    if isinstance(system, CONSTRAINTS):
+        return (
+            "Usual cause: a constraint without its system.\n"
+            'Fix: system = lj.System(lagrangian, constraints={"rod": constraint}).'
+        )
+    if isinstance(getattr(system, "system", None), SYSTEMS):
+        return "Usual cause: a result of a system in place of the system.\nFix: its .system."
+    name = getattr(system, "__name__", "lagrangian") if callable(system) else "lagrangian"
+    name = "lagrangian" if name == "<lambda>" else name
+    cause = "the Lagrangian in place of its system" if callable(system) else "arguments in another order"
+    return f"Usual cause: {cause}.\nFix: system = lj.System({name}), and the system as the first argument."
+
+
+def by_name(call: str, *required: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Let a function explain a call without its `required` keyword arguments; `call`: a correct call."""
+
+    def decorate(function: Callable):
+        parameters = signature(function).parameters
+        most_positional = sum(x.kind is Parameter.POSITIONAL_OR_KEYWORD for x in parameters.values())
+        needed = frozenset(required)
+
+        @wraps(function)
+        def checked(*args, **kwargs):
+            # Unknown keywords are left to Python's own error.
+            if (len(args) > most_positional or not kwargs.keys() >= needed) and kwargs.keys() <= parameters.keys():
+                missing = [name for name in required if name not in kwargs]
+                raise TypeError(_wrong_call(function.__name__, len(args) - most_positional, missing, call))
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
+
+
+def _wrong_call(name: str, excess, missing, call):
+    words = [f"without {', '.join(f'{x}=' for x in missing)}"] if missing else []
+    words += [f"with {excess} positional argument{'s' * (excess > 1)} too many"] if excess > 0 else []
+    which = " and ".join(missing) or "further arguments"
+    return (
+        f"lj.{name} was called {' and '.join(words)}.\n"
+        f"Usual cause: {which} given by position, or left out.\n"
+        f"Fix: {call}, by name."
+    )
+
+
+def with_rates(system: Any, q: PyTree, v: PyTree) -> PyTree:
+    """v with zeros for the states that it leaves out: their velocities are determined."""
+    if not (isinstance(q, Mapping) and isinstance(v, Mapping)):
+        return v
+    left_out = {name for phase in system.phases for name in phase.states if name in q and name not in v}
+    return {**v, **{name: jtu.tree_map(_zeros_like, q[name]) for name in sorted(left_out)}} if left_out else v
+
+
+def _zeros_like(x: Any):
+    return 0.0 if isinstance(x, float | int) else numpy_of(x).zeros_like(x)
+
+
+def check_starts(states: Mapping, q: PyTree):
+    """Raise where q is not a dict, or has no array of numbers by the name of a state."""
+    for name, rate in states.items():
+        if isinstance(rate, Held) and isinstance(q, Mapping) and name not in q:
+            raise ValueError(
+                f"q0 has no entry '{name}', the output of the lj.SampledControl of that name before its first instant; "
+                f"q has {', '.join(map(repr, q))}.\nFix: q0 = {{..., '{name}': 0.0}}; v0 may leave it out."
+            )
+        if not isinstance(q, Mapping):
+            raise ValueError(
+                f"state '{name}' has a name, and q has none: it is {'a number' if not np.ndim(q) else 'an array'}.\n"
+                f"Fix: names for all, q0 = {{'x': ..., '{name}': 0.0}}, and q['x'] in L."
+            )
+        if name not in q or not jtu.treedef_is_leaf(jtu.tree_structure(q[name])):
+            has = "no start value" if name not in q else "a start value that is no number or array"
+            raise ValueError(
+                f"state '{name}' has {has}; q has {', '.join(map(repr, q))}.\n"
+                f"Fix: q0 = {{..., '{name}': 0.0}}; v0 may leave it out."
+            )
+
+
+def check_rate(call: Call, rate: Any, of: Array):
+    """Raise where the rate of a state is not like the state."""
+    shape, dtype = getattr(rate, "shape", None), getattr(rate, "dtype", None)
+    number = isinstance(rate, float) and not isinstance(rate, bool)
+    if not (number and not of.shape or shape == of.shape and np.issubdtype(dtype, np.floating)):
+        got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(rate).__name__}"
+        raise ValueError(
+            f"{call} must return real numbers like the state, of shape {of.shape}, and returned {got}.\n"
+            "Usual cause: an array of one entry for a number, a missing return, or several rates in one function.\n"
+            "Fix: the rate of this state alone, in the shape of its start value in q0."
+        )
+
+
+def check_use(system: System):
+    """Raise where a function reads of a state what it must not: a state has no inertia, and no force acts on it."""
+    energies = {"L": system.lagrangian, "dissipation": system.dissipation}
+    for name in system.states:
+        for role, f in energies.items():
+            if f is not None and _reads(f, "v", name):
+                raise ValueError(
+                    f"{role} contains the velocity of '{name}', which is a state: its rate is said to be a function.\n"
+                    "Usual cause: a coordinate by the same name, or a kinetic energy of all of v.\n"
+                    f"Fix: another name for the state, or v['{name}'] left out of {role}."
+                )
+        for other, f in system.states.items():
+            if _reads(f, "v", name):
+                raise ValueError(
+                    f"the rate of state '{other}' contains v['{name}'], the rate of a state, which is not known before "
+                    f"it.\nFix: write the rate of '{name}' out in its place."
+                )
+        for constraint, c in system.constraints.items():
+            if _reads(c.function, "q", name) or _reads(c.function, "v", name):
+                raise ValueError(
+                    f"constraint '{constraint}' contains state '{name}', and its force would have to act on it.\n"
+                    "Usual cause: an actuator that moves a point by a constraint.\n"
+                    f"Fix: a stiff spring to q['{name}'] in L; or a coordinate with lj.Nonholonomic for its rate."
+                )
+        if system.force is not None and _acts_on(system.force, name):
+            raise ValueError(
+                f"force acts on state '{name}', which has no inertia: its rate is what its function returns.\n"
+                f"Fix: '{name}': 0.0 in what force returns, and the term in the function of the state."
+            )
+
+
+def _reads(f: Traced, argument: str, name: str) -> bool:
+    """Whether a function depends on an entry of one of its arguments."""
+    return depends(f.program.jaxpr, [x for path, x in _inputs(f) if path[:2] == (argument, name)])
+
+
+def depends_on(f: Traced, *arguments: str) -> bool:
+    """Whether a function depends on any of these of its arguments."""
+    return depends(f.program.jaxpr, [x for (argument, _), x in _inputs(f) if argument in arguments])
+
+
+def _acts_on(force: Traced, name: str) -> bool:
+    """Whether an entry of the force depends on anything."""
+    program, places = force.program, {}
+    for i, (path, _) in enumerate(jtu.tree_leaves_with_path(program.value)):
+        places[getattr(path[0], "key", None) if path else None] = i
+    jaxpr = program.jaxpr.replace(outvars=[program.jaxpr.outvars[places[name]]])
+    return depends(jaxpr, jaxpr.invars)
+
+
+def _inputs(f: Traced) -> Iterator[tuple[tuple, Any]]:
+    """The variables of a function's program, each with the name of its argument and of its entry there."""
+    found = []
+    for argument, tree in zip(f.takes, f.program.like):
+        for path, leaf in jtu.tree_leaves_with_path(tree):
+            if varies(leaf):
+                found.append((argument, getattr(path[0], "key", None) if path else None))
+    variables = f.program.jaxpr.invars
+    return zip(found, variables[len(variables) - len(found) :])
+
 
 CAUSE = "an argument left out as the function does not need it, or one too many: a constraint of positions takes no v"
 # A vehicle written by hand has 260 operations in L, 32 links in a loop 580; what they cost is measured on these.
