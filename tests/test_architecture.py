@@ -359,7 +359,7 @@ def test_what_is_read_from_a_module_is_there():
     """No function, however rarely it is called, reads a name that another module no longer has; twin: one that does."""
     files = [*FILES, *(ROOT.parent / "benchmarks").rglob("*.py")]
     assert {str(path): found for path in files if (found := absent(path.read_text()))} == {}
-    assert absent("from lagjax.mechanics import projection as p\ndef f(x): return p.projectd(x)") == ["p.projectd"]
+    assert absent("from lagjax.system import coordinates as p\ndef f(x): return p.flaten(x)") == ["p.flaten"]
 
 
 def test_import_computes_nothing():
