@@ -285,98 +285,38 @@ from .system import PrecisionWarning as PrecisionWarning
 
 # isort: split
 # Analysis of a system.
-from .analysis.continuation import (
-    Branch as Branch,
-)
-from .analysis.continuation import (
-    Branches as Branches,
-)
-from .analysis.continuation import (
-    Critical as Critical,
-)
-from .analysis.continuation import (
-    CriticalOrbit as CriticalOrbit,
-)
-from .analysis.continuation import (
-    OrbitBranch as OrbitBranch,
-)
-from .analysis.continuation import (
-    continue_equilibria as continue_equilibria,
-)
-from .analysis.continuation import (
-    continue_orbits as continue_orbits,
-)
-from .analysis.equilibria import Equilibria as Equilibria
+from .analysis.balance import Equilibria as Equilibria
+from .analysis.branches import Branch as Branch
+from .analysis.branches import Branches as Branches
+from .analysis.branches import Critical as Critical
+from .analysis.branches import continue_equilibria as continue_equilibria
+from .analysis.cycles import CriticalOrbit as CriticalOrbit
+from .analysis.cycles import OrbitBranch as OrbitBranch
+from .analysis.cycles import continue_orbits as continue_orbits
 from .analysis.equilibria import equilibria as equilibria
-from .analysis.formulations import (
-    EquationsOfMotion as EquationsOfMotion,
-)
-from .analysis.formulations import (
-    Hamiltonian as Hamiltonian,
-)
-from .analysis.formulations import (
-    Routhian as Routhian,
-)
-from .analysis.formulations import (
-    action as action,
-)
-from .analysis.formulations import (
-    hamiltonian as hamiltonian,
-)
-from .analysis.formulations import (
-    latex as latex,
-)
-from .analysis.formulations import (
-    routhian as routhian,
-)
-from .analysis.modes import (
-    Linearisation as Linearisation,
-)
-from .analysis.modes import (
-    Mode as Mode,
-)
-from .analysis.modes import (
-    NormalModes as NormalModes,
-)
-from .analysis.modes import (
-    linearise as linearise,
-)
-from .analysis.modes import (
-    normal_modes as normal_modes,
-)
-from .analysis.orbits import (
-    Floquet as Floquet,
-)
-from .analysis.orbits import (
-    LyapunovExponents as LyapunovExponents,
-)
-from .analysis.orbits import (
-    OrbitWarning as OrbitWarning,
-)
-from .analysis.orbits import (
-    PeriodicOrbit as PeriodicOrbit,
-)
-from .analysis.orbits import (
-    floquet as floquet,
-)
-from .analysis.orbits import (
-    lyapunov_exponents as lyapunov_exponents,
-)
-from .analysis.orbits import (
-    periodic_orbit as periodic_orbit,
-)
-from .analysis.symmetry import (
-    Symmetries as Symmetries,
-)
-from .analysis.symmetry import (
-    SymmetryTest as SymmetryTest,
-)
-from .analysis.symmetry import (
-    is_symmetry as is_symmetry,
-)
-from .analysis.symmetry import (
-    symmetries as symmetries,
-)
+from .analysis.exponents import Floquet as Floquet
+from .analysis.exponents import LyapunovExponents as LyapunovExponents
+from .analysis.exponents import floquet as floquet
+from .analysis.exponents import lyapunov_exponents as lyapunov_exponents
+from .analysis.formulations import Hamiltonian as Hamiltonian
+from .analysis.formulations import Routhian as Routhian
+from .analysis.formulations import action as action
+from .analysis.formulations import hamiltonian as hamiltonian
+from .analysis.formulations import routhian as routhian
+from .analysis.latex import EquationsOfMotion as EquationsOfMotion
+from .analysis.latex import latex as latex
+from .analysis.linearise import Linearisation as Linearisation
+from .analysis.linearise import linearise as linearise
+from .analysis.normal_modes import Mode as Mode
+from .analysis.normal_modes import NormalModes as NormalModes
+from .analysis.normal_modes import normal_modes as normal_modes
+from .analysis.periodic_orbit import OrbitWarning as OrbitWarning
+from .analysis.periodic_orbit import PeriodicOrbit as PeriodicOrbit
+from .analysis.periodic_orbit import periodic_orbit as periodic_orbit
+from .analysis.symmetry_result import Symmetries as Symmetries
+from .analysis.symmetry_search import symmetries as symmetries
+from .analysis.symmetry_test import SymmetryTest as SymmetryTest
+from .analysis.symmetry_test import is_symmetry as is_symmetry
 
 # isort: split
 # Two points.

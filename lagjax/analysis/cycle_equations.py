@@ -17,7 +17,7 @@ which the accelerations at some times, for a state off the motion, repeat:
 There are more equations than unknowns if a conserved quantity makes some of them redundant. The flow carries tangents
 with respect to μ and `log T` together with those with respect to the state.
 
-Of a motion with switches the flow is that of `switching_flow.py`: the branch ends where other switches occur in its
+Of a motion with switches the flow is that of `flow.py`: the branch ends where other switches occur in its
 cycles. A drive is then seen in the accelerations of the first phase, and c are the constraints of that phase.
 
 Along a branch two functions of the monodromy matrix N are monitored. With the rows Q of its trivial
@@ -42,12 +42,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.continuation.arclength import BranchPoint, Tracer
-from lagjax.analysis.orbits.flow import Changes, Flow
-from lagjax.analysis.orbits.monodromy import Reasons, directions, orthonormal
-from lagjax.analysis.orbits.shooting import TURN, OrbitRequest, integral_at
-from lagjax.analysis.orbits.switching_flow import SwitchingFlow
-from lagjax.analysis.params_by_name import Number
+from lagjax.analysis.arclength import BranchPoint, Number, Tracer
+from lagjax.analysis.flow import Changes, Flow, SwitchingFlow
+from lagjax.analysis.monodromy import Reasons, directions, orthonormal
+from lagjax.analysis.shooting import TURN, OrbitRequest, integral_at
 from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled
 

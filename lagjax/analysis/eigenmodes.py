@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from lagjax.analysis.modes.linearise import Linearisation
+from lagjax.analysis.linearise import Linearisation
 from lagjax.numerics import Roots, dense, general_roots, lapack, roots_beside_zeros, symmetric_roots, zero_count
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)

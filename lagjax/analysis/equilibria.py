@@ -19,21 +19,24 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.analysis.equilibria import balance as equations
-from lagjax.analysis.equilibria import degenerate
-from lagjax.analysis.equilibria.balance import MOMENTUM, VELOCITY, Steady, SteadySymmetries
-from lagjax.analysis.equilibria.reduced_force import CREEPS_BELOW, nearest, soft_below
-from lagjax.analysis.equilibria.result import (
+from lagjax.analysis import balance as equations
+from lagjax.analysis import degenerate
+from lagjax.analysis.balance import (
     CONSTRAINED,
+    MOMENTUM,
     NO_BALANCE,
     NOT_FINITE,
     NOT_LASTING,
     OK,
     UNFINISHED,
+    VELOCITY,
     Equilibria,
     EquilibriumRow,
+    Steady,
+    SteadySymmetries,
     merged,
 )
+from lagjax.analysis.degenerate import CREEPS_BELOW, nearest, soft_below
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import are_angles, invariance, listed, structure
 from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below

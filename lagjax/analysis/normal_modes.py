@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from lagjax.analysis.equilibria import degenerate
-from lagjax.analysis.equilibria.balance import Steady, SteadySymmetries
-from lagjax.analysis.modes.eigenmodes import (
+from lagjax.analysis import degenerate
+from lagjax.analysis.balance import Steady, SteadySymmetries
+from lagjax.analysis.eigenmodes import (
     ASYMPTOTIC,
     DIVERGENCE,
     FLUTTER,
@@ -27,7 +27,7 @@ from lagjax.analysis.modes.eigenmodes import (
     Motions,
     motions_of,
 )
-from lagjax.analysis.modes.linearise import Linearisation, linearise, linearised
+from lagjax.analysis.linearise import Linearisation, linearise, linearised
 from lagjax.display import Animation, plots
 from lagjax.integrate import drawn
 from lagjax.jaxtools import compiled, is_eager, is_traced

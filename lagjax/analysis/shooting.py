@@ -33,8 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.orbits.flow import Flow, scale_of
-from lagjax.analysis.orbits.switching_flow import SwitchingFlow, any_flow, no_switches
+from lagjax.analysis.flow import Flow, SwitchingFlow, any_flow, no_switches, scale_of
 from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.numerics import damped_newton, while_in_python

@@ -1,7 +1,7 @@
 """Find all symmetries of a system within a basis of motions, as a numerical null space.
 
 At each state every motion of the basis changes its charge at some rate, and the constraints forbid part of its
-displacement (`charge_rates.py`). These numbers form rows with one column per motion. Gauge functions add columns, of
+displacement (`symmetry_test.py`). These numbers form rows with one column per motion. Gauge functions add columns, of
 which only the span matters; it is projected out. A combination that vanishes in all rows is a Noether symmetry.
 Symmetries without t are found first, so that a momentum across a uniform force is not hidden in two that grow with
 time.
@@ -30,11 +30,32 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.symmetry.ansatz import Basis, Clock, Combination, Gauge, gauges, motions
-from lagjax.analysis.symmetry.charge_rates import Affine, Precision, Rates, precision_of, rates
-from lagjax.analysis.symmetry.is_symmetry import AT_LEAST, STATES, too_few
-from lagjax.analysis.symmetry.random_states import draws
-from lagjax.analysis.symmetry.result import Found, Ratios, Scaling, Symmetries, Words, in_words, named_parameters
+from lagjax.analysis.symmetry_result import (
+    Basis,
+    Clock,
+    Combination,
+    Found,
+    Gauge,
+    Ratios,
+    Scaling,
+    Symmetries,
+    Words,
+    gauges,
+    in_words,
+    motions,
+    named_parameters,
+)
+from lagjax.analysis.symmetry_test import (
+    AT_LEAST,
+    STATES,
+    Affine,
+    Precision,
+    Rates,
+    draws,
+    precision_of,
+    rates,
+    too_few,
+)
 from lagjax.jaxtools import filled_up, is_traced, remembered
 from lagjax.mechanics import Generator, NoetherCharge, as_generator, conserved_momenta, describe
 from lagjax.system import Model, check_system, coordinates, model_of, traced_system

@@ -97,25 +97,25 @@ lagjax.analysis.energy
     closure scale allowed quadrature
 lagjax.sweep.batch_program
   Status: result steps scaled_error residual
-lagjax.analysis.orbits.floquet
+lagjax.analysis.exponents
   Floquet: multipliers trivial reasons monodromy log_volume error period ended apart words
-lagjax.analysis.orbits.lyapunov
+lagjax.analysis.exponents
   LyapunovExponents: exponents uncertainty t growth volume settled ended all_of_them
-lagjax.analysis.symmetry.is_symmetry
+lagjax.analysis.symmetry_test
   SymmetryTest: name residual charge_rate lagrangian force has_forces displacement invariance charge rate states at
-lagjax.analysis.continuation.result
+lagjax.analysis.branches
   Branches: branches critical along first last names params status
   Branch: parameter q v multipliers stable eigenvalues status critical
   Critical: kind parameter q v multipliers derivative frequency accuracy branches
-lagjax.analysis.modes.linearise
+lagjax.analysis.linearise
   Linearisation: mass gyroscopic damping circulatory stiffness positions velocities multipliers residual sound state
     parts kind names
-lagjax.analysis.modes.reduced_matrices
+lagjax.analysis.linearise
   LinearisationKind: unseen holonomic independent conservative at_rest timeless
   LinearParts: mass velocity position drift transfer positions velocities turning multipliers a off forces sound
     independent raw
   Raw: mass velocity position rows slopes
-lagjax.analysis.modes.normal_modes
+lagjax.analysis.normal_modes
   NormalModes: roots shapes energy zero growing double code unexplained linearisation zero_words
   Mode: root shape energy double linearisation label
 lagjax.numerics.windowed_least_squares

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.formulations.latex import written
+from lagjax.analysis.latex import written
 from lagjax.display import plots
 from lagjax.display.printable import by_line, printable
 from lagjax.system import coordinates
