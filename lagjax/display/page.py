@@ -1,6 +1,6 @@
 """A self-contained page: HTML, the numbers that it shows, and the scripts that show them, in one file.
 
-Numbers are stored as base64 of little-endian arrays in a JSON text, which the scripts (`*.js` in this folder) decode:
+Numbers are stored as base64 of little-endian arrays in a JSON text, which the scripts (`web_page/*.js`) decode:
 three bytes become four characters. No script loads anything from outside.
 """
 
@@ -82,9 +82,9 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
     """HTML with its numbers and scripts, for a page or a notebook's cell.
 
     **Arguments:** `body`: the HTML before a script runs; `spec`: the data for the scripts, as JSON; `scripts`: files in
-    this folder, in the order in which they build on each other; `last`: a line of script after them.
+    `web_page/`, in the order in which they build on each other; `last`: a line of script after them.
     """
-    folder = files(__package__)
+    folder = files(__package__) / "web_page"
     data = json.dumps(spec, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     script = "".join(folder.joinpath(name).read_text(encoding="utf-8") for name in scripts) + last
     # The same numbers give the same name, so a notebook that is run again does not change.

@@ -1,10 +1,29 @@
-"""Progress bars for long work, and messages about long waits.
+"""What a terminal shows: progress of long work, and text that cannot command it or hide other text.
 
 Short work shows nothing, and nothing is shown outside of terminals and notebooks.
 """
 
 import threading
 from contextlib import contextmanager, nullcontext
+
+
+def printable(text: object) -> str:
+    """Text with control characters, line ends among them, and characters without a width written as escapes."""
+    text = str(text)
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def by_line(text: object) -> str:
+    """Text of several lines, each as `printable` writes it."""
+    return "\n".join(map(printable, str(text).split("\n")))
+
+
+def is_plain(text: str) -> bool:
+    """Whether a text has only characters that `printable` leaves as they are, line ends and tabs."""
+    return text.replace("\n", "").replace("\t", "").isprintable()
+
 
 # Seconds of waiting before a message is shown, and between two updates of it.
 LONG, TICK = 0.5, 1.0

@@ -1,4 +1,4 @@
-"""The closed table of what files may hold besides numbers, text, dicts, lists and tuples (`tree_json.py`).
+"""The closed table of what files may hold besides numbers, text, dicts, lists and tuples (`npz.py`).
 
 A class or a function is looked up here by its package and its own name; a file's name that is not in the table is
 refused, and nothing is imported for it. Each class has the fields that a file may give it. A class that is not listed,

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lagjax.sliders.picture import FINE, MOST_PANELS, MOST_POINTS, Picture
+from lagjax.sliders import FINE, MOST_PANELS, MOST_POINTS, Picture
 from lagjax.sweep.web_page import drawn
 from tests.tiers import exhaustive_but
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.display import progress as meter
+from lagjax.display import terminal as meter
 from lagjax.jaxtools import identity
 from tests.counting import compiles
 
