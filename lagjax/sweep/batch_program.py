@@ -40,11 +40,15 @@ from lagjax.jaxtools import (
     program_of,
 )
 from lagjax.sweep.axes import POINT, Axes
-from lagjax.sweep.chunks import nothing
 from lagjax.system import Call, check_arguments, in_words
 
 NOT_RUN, LOST = -1, -2
 LAYOUTS = ("vmap", "map")
+
+
+def nothing(dtype: np.dtype) -> float:
+    """The fill value of a dtype."""
+    return np.nan if np.issubdtype(dtype, np.inexact) else 0
 
 
 class Status(NamedTuple):

@@ -61,11 +61,6 @@ class Spec(NamedTuple):
         }
 
 
-def nothing(dtype: np.dtype) -> float:
-    """The fill value of a dtype."""
-    return np.nan if np.issubdtype(dtype, np.inexact) else 0
-
-
 def chunk_file(folder: Path, spec: Spec, place: tuple[int, ...] = ()) -> Path | None:
     """The file of a chunk, the first along the dimensions that `place` does not name; None for an empty array."""
     inner = "0" * (len(spec.shape) - len(place))

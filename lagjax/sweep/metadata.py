@@ -30,7 +30,8 @@ from lagjax.display import by_line, printable
 from lagjax.files import MALFORMED, Explained, parsed
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.batch_program import NOT_RUN, STATUS_TYPES, Program, Status, digest
-from lagjax.sweep.chunks import Spec, chunk_file, nothing, write_chunk
+from lagjax.sweep.batch_program import nothing
+from lagjax.sweep.chunks import Spec, chunk_file, write_chunk
 from lagjax.sweep.labels import STORE_GROUP, labels_of, named_leaves, status_attributes
 
 META = "zarr.json"

@@ -17,7 +17,7 @@ from lagjax.integrate import Trajectory
 from lagjax.sweep import structure, tables
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.batch_program import LOST, TRUSTED, Status, is_motion
-from lagjax.sweep.chunks import nothing
+from lagjax.sweep.batch_program import nothing
 from lagjax.sweep.labels import key_of, named_leaves, with_path, words_of
 from lagjax.sweep.metadata import damaged, versions
 from lagjax.sweep.metadata import in_words as versions_in_words

@@ -33,13 +33,13 @@ from jaxtyping import ArrayLike, PyTree
 
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.batch_program import LOST, NOT_RUN, Program, Status
+from lagjax.sweep.batch_program import nothing
 from lagjax.sweep.chunks import (
     CHECKSUM,
     UNREADABLE,
     Spec,
     as_number,
     chunk_file,
-    nothing,
     read_bytes,
     read_chunk,
     write_chunk,
