@@ -7,15 +7,14 @@ NAMES = """
     analysis.branches.continue_equilibria analysis.energy.energy_ledger analysis.equilibria.equilibria
     analysis.explain.explain analysis.exponents.floquet analysis.exponents.lyapunov_exponents
     analysis.formulations.action analysis.periodic_orbit.periodic_orbit analysis.poincare.poincare
-    analysis.poincare.turning_points exchange.standalone_programs.export fit.fit.fit
-    fit.identifiability.identifiability fit.load.load_fit fit.loss.fit_loss fit.loss.fit_residuals
-    integrate.adjoint.replay.Replay integrate.contacts.contacts.touches integrate.events.event.Crossing
-    numerics.radau.Radau5 numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting
-    sweep.sweep.sweep system.constraints.CompliantContact system.constraints.Contact
-    system.constraints.SampledControl system.hybrid.Hybrid two_points.connect.connect
-    two_points.geodesic.exponential_map two_points.geodesic.geodesic two_points.optimal_control.steer
-    two_points.steering.Steering two_points.tracking.TrackingLQR work_precision.work_precision.horizons
-    work_precision.work_precision.work_precision
+    analysis.poincare.turning_points exchange.standalone_programs.export fit.fit.fit fit.fit.fit_loss
+    fit.fit.fit_residuals fit.fit.load_fit fit.uncertainty.identifiability integrate.adjoint.replay.Replay
+    integrate.contacts.contacts.touches integrate.events.event.Crossing numerics.radau.Radau5
+    numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting sweep.sweep.sweep
+    system.constraints.CompliantContact system.constraints.Contact system.constraints.SampledControl
+    system.hybrid.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
+    two_points.optimal_control.steer two_points.steering.Steering two_points.tracking.TrackingLQR
+    work_precision.work_precision.horizons work_precision.work_precision.work_precision
 """
 SLOW_EXAMPLES = {f"lagjax.{name}" for name in NAMES.split()}
 

@@ -95,7 +95,7 @@ lagjax.analysis.poincare
 lagjax.analysis.energy
   EnergyLedger: t jacobi_integral kinetic potential works constraints impact_times impacts switches impact_total
     closure scale allowed quadrature
-lagjax.sweep.batch_program
+lagjax.sweep.engine
   Status: result steps scaled_error residual
 lagjax.analysis.exponents
   Floquet: multipliers trivial reasons monodromy log_volume error period ended apart words
@@ -121,30 +121,30 @@ lagjax.analysis.normal_modes
 lagjax.numerics.windowed_least_squares
   Unknowns: shared local
   Covariance: shared local local_shared
-lagjax.fit.uncertainty.identifiable
+lagjax.fit.uncertainty
   Identifiability: names values singular_values combinations noise next
-lagjax.fit.uncertainty.candidates
+lagjax.fit.next_measurement
   NextMeasurements: of now candidates absolute
   Candidate: name t times sd alone sigma rows known direction least
-lagjax.fit.problem.parameters
+lagjax.fit.unknowns
   Leaf: number places
   FreeNumbers: params start low high mean sd names leaves weak
-lagjax.fit.problem.records
+lagjax.fit.records
   Windows: ts real sample last seam record
   Record: t measured q0 v0 hold_q hold_v params sigma
-lagjax.fit.problem.initial_states
+lagjax.fit.unknowns
   Chart: guess along across
   Starts: q v
-lagjax.fit.problem.residuals
+lagjax.fit.residuals
   FitProblem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
     options loss absolute
-lagjax.fit.search.search
+lagjax.fit.search
   Misfit: times large curved doubtful
-lagjax.fit.search.search
+lagjax.fit.search
   Evaluation: rows well covariance determined singular_values combinations chi2 freedom
 lagjax.bodies.body
   Pose: position quaternion
-lagjax.fit.result.result
+lagjax.fit.result
   Fit: problem unknowns cost steps rested misfit costs evaluation units
 """
 

@@ -10,10 +10,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.fit.problem.initial_states import starts
-from lagjax.fit.problem.parameters import FreeNumbers, find, leaf_name
-from lagjax.fit.problem.records import KINDS, Record, Windows, channels, cut, spread
-from lagjax.fit.problem.residuals import LOSSES, FitProblem, replace
+from lagjax.fit.records import KINDS, Record, Windows, channels, cut, spread
+from lagjax.fit.residuals import LOSSES, FitProblem, replace
+from lagjax.fit.unknowns import FreeNumbers, find, leaf_name, starts
 from lagjax.integrate import Crossing, traced_guard, traced_phases
 from lagjax.jaxtools import is_traced, numpy_of
 from lagjax.mechanics import listed

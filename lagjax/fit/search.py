@@ -36,14 +36,14 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.fit.problem.checks import check_predicted
-from lagjax.fit.problem.residuals import (
+from lagjax.fit.residuals import (
     LOSSES,
     WHOLE,
     FitProblem,
     Stage,
     assemble,
     assemble_slopes,
+    check_predicted,
     equations,
     hold_weights,
     over_windows,
