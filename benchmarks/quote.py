@@ -34,7 +34,7 @@ QUOTED = [
         "chain, 64 links: right-hand side / MuJoCo's step",
         "64 links, L by hand in angles, accelerations / MuJoCo's step",
     ),
-    ("trees", "evaluation / mj_forward, N = 64", "the same 64 links as `lj.Tree`"),
+    ("trees", "evaluation / mj_forward, N = 64", "the same 64 links as `lj.bodies.Tree`"),
     ("gradient_cost", "forward mode, 4 parameters: our gradient / our solve", "gradient by 4 parameters / one solve"),
     ("against_hand_written", "rolling_hoop, single: from L / by hand", "one evaluation, rolling hoop / by hand"),
     ("sweep", "trajectories/s, error 1e-06: lagjax / numba Dopri8", "sweep over 1,000 speeds, error 1e-6 / numba"),

@@ -229,21 +229,24 @@ def draw_woodpecker():
 def draw_open_joint():
     """A crank and a rod in a rough drawing, with frames."""
     y = (0.0, 1.0, 0.0)
-    crank, rod = lj.Body("crank", 1.0, (0.1, 0.1, 0.01)), lj.Body("rod", 1.0, (0.3, 0.3, 0.01))
+    crank, rod = lj.bodies.Body("crank", 1.0, (0.1, 0.1, 0.01)), lj.bodies.Body("rod", 1.0, (0.3, 0.3, 0.01))
     joints = {
-        "axle": lj.revolute(lj.ground.at(axis=y), crank.at((0.0, 0.0, -0.5), y)),
-        "pin": lj.revolute(crank.at((0.0, 0.0, 0.5), y), rod.at((0.0, 0.0, -1.0), y)),
+        "axle": lj.bodies.revolute(lj.bodies.ground.at(axis=y), crank.at((0.0, 0.0, -0.5), y)),
+        "pin": lj.bodies.revolute(crank.at((0.0, 0.0, 0.5), y), rod.at((0.0, 0.0, -1.0), y)),
     }
-    rough = {"crank": lj.Pose.at((0.0, 0.0, 0.5)), "rod": lj.Pose.at((1.0, 0.0, 1.3), axis=y, angle=np.pi / 2)}
-    return lj.draw(lj.multibody([crank, rod], joints), rough, frames=True).figure()
+    rough = {
+        "crank": lj.bodies.Pose.at((0.0, 0.0, 0.5)),
+        "rod": lj.bodies.Pose.at((1.0, 0.0, 1.3), axis=y, angle=np.pi / 2),
+    }
+    return lj.draw(lj.bodies.multibody([crank, rod], joints), rough, frames=True).figure()
 
 
 def draw_spinning_top():
     """A top on its tip, let go with its axis at rest: it nods between two angles and precesses."""
-    top = lj.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
-    tip = lj.spherical(lj.ground.at(), top.at((0.0, 0.0, -0.5)))
-    system = lj.multibody([top], {"tip": tip}, [lj.weight([top])])
-    start = lj.Pose.at().turned((0.0, 1.0, 0.0), TILT)
+    top = lj.bodies.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
+    tip = lj.bodies.spherical(lj.bodies.ground.at(), top.at((0.0, 0.0, -0.5)))
+    system = lj.bodies.multibody([top], {"tip": tip}, [lj.bodies.weight([top])])
+    start = lj.bodies.Pose.at().turned((0.0, 1.0, 0.0), TILT)
     axis = top.direction({"top": start}, (0.0, 0.0, 1.0))
     start = start._replace(position=0.5 * axis)
     q, v = {"top": start}, {"top": start.moving(spin=80.0 * axis)}
@@ -256,10 +259,10 @@ def draw_spinning_top():
     print("lowest height", heights.min(), "known", np.cos(TILT) - dip)
     end = top.at((0.0, 0.0, 0.3))
     shapes = [
-        lj.cylinder(top, 0.3, 0.04, color=plots.COLOURS[0]),
-        lj.rod(top.at((0.0, 0.0, -0.5)), end, 0.02, color=plots.COLOURS[1]),
-        lj.trail(end, color=plots.COLOURS[2]),
-        lj.line(lj.ground),
+        lj.shapes.cylinder(top, 0.3, 0.04, color=plots.COLOURS[0]),
+        lj.shapes.rod(top.at((0.0, 0.0, -0.5)), end, 0.02, color=plots.COLOURS[1]),
+        lj.shapes.trail(end, color=plots.COLOURS[2]),
+        lj.shapes.line(lj.bodies.ground),
     ]
     return traj.draw(shapes, times=[0.0, 1.4, 2.8], view=(-60.0, 24.0))
 

@@ -5,11 +5,9 @@ __all__: list[str]
 
 # isort: split
 # A system: its Lagrangian and its constraints.
+from . import guards as guards
 from .mechanics import (
     Generator as Generator,
-)
-from .mechanics import (
-    NoetherCharge as NoetherCharge,
 )
 from .mechanics import (
     noether_charge as noether_charge,
@@ -49,118 +47,18 @@ from .system import (
 )
 
 # isort: split
-# Rigid bodies.
-from .bodies import (
-    Body as Body,
-)
-from .bodies import (
-    Load as Load,
-)
-from .bodies import (
-    Marker as Marker,
-)
-from .bodies import (
-    Pose as Pose,
-)
-from .bodies import (
-    Surface as Surface,
-)
-from .bodies import (
-    Tree as Tree,
-)
-from .bodies import (
-    applied as applied,
-)
-from .bodies import (
-    box as box,
-)
-from .bodies import (
-    cylinder as cylinder,
-)
-from .bodies import (
-    cylindrical as cylindrical,
-)
-from .bodies import (
-    disk as disk,
-)
-from .bodies import (
-    fixed as fixed,
-)
-from .bodies import (
-    gear as gear,
-)
-from .bodies import (
-    ground as ground,
-)
-from .bodies import (
-    line as line,
-)
-from .bodies import (
-    mesh as mesh,
-)
-from .bodies import (
-    motor as motor,
-)
-from .bodies import (
-    multibody as multibody,
-)
-from .bodies import (
-    planar as planar,
-)
-from .bodies import (
-    prismatic as prismatic,
-)
-from .bodies import (
-    rack_and_pinion as rack_and_pinion,
-)
-from .bodies import (
-    revolute as revolute,
-)
-from .bodies import (
-    rod as rod,
-)
-from .bodies import (
-    rolling as rolling,
-)
-from .bodies import (
-    rolling_ellipsoid as rolling_ellipsoid,
-)
-from .bodies import (
-    rolling_sphere as rolling_sphere,
-)
-from .bodies import (
-    sphere as sphere,
-)
-from .bodies import (
-    spherical as spherical,
-)
-from .bodies import (
-    spring as spring,
-)
-from .bodies import (
-    torsion as torsion,
-)
-from .bodies import (
-    trail as trail,
-)
-from .bodies import (
-    universal as universal,
-)
-from .bodies import (
-    weight as weight,
-)
+# Rigid bodies, joints and loads; what they look like.
+from . import bodies as bodies
+from . import shapes as shapes
 
 # isort: split
 # Mechanisms from files.
-from .models import RobotModel as RobotModel
 from .models import read_mjcf as read_mjcf
 from .models import read_urdf as read_urdf
 
 # isort: split
 # One state: quantities from the Lagrangian and the constraints.
-from .analysis.explain import Explanation as Explanation
 from .analysis.explain import explain as explain
-from .display import Still as Still
 from .integrate import draw as draw
 from .mechanics import (
     accelerations as accelerations,
@@ -186,9 +84,7 @@ from .mechanics import (
 
 # isort: split
 # Motion.
-from .analysis.energy import EnergyLedger as EnergyLedger
 from .analysis.energy import energy_ledger as energy_ledger
-from .analysis.explain import HybridExplanation as HybridExplanation
 from .analysis.poincare import (
     PoincareSection as PoincareSection,
 )
@@ -201,9 +97,6 @@ from .analysis.poincare import (
 from .analysis.poincare import (
     turning_points as turning_points,
 )
-from .display import Animation as Animation
-from .display import Drawing as Drawing
-from .display import Shape as Shape
 from .integrate import (
     RESULTS as RESULTS,
 )
@@ -214,13 +107,7 @@ from .integrate import (
     Crossing as Crossing,
 )
 from .integrate import (
-    Crossings as Crossings,
-)
-from .integrate import (
     EventWarning as EventWarning,
-)
-from .integrate import (
-    HybridTrajectory as HybridTrajectory,
 )
 from .integrate import (
     JumpWarning as JumpWarning,
@@ -229,31 +116,10 @@ from .integrate import (
     Replay as Replay,
 )
 from .integrate import (
-    Snapshot as Snapshot,
-)
-from .integrate import (
-    Switches as Switches,
-)
-from .integrate import (
-    Trajectory as Trajectory,
-)
-from .integrate import (
     integrate as integrate,
 )
 from .integrate import (
     load_trajectory as load_trajectory,
-)
-from .integrate import (
-    releases as releases,
-)
-from .integrate import (
-    slips as slips,
-)
-from .integrate import (
-    sticks as sticks,
-)
-from .integrate import (
-    touches as touches,
 )
 from .numerics import (
     RK4 as RK4,
@@ -285,58 +151,26 @@ from .system import PrecisionWarning as PrecisionWarning
 
 # isort: split
 # Analysis of a system.
-from .analysis.balance import Equilibria as Equilibria
-from .analysis.branches import Branch as Branch
-from .analysis.branches import Branches as Branches
-from .analysis.branches import Critical as Critical
 from .analysis.branches import continue_equilibria as continue_equilibria
-from .analysis.cycles import CriticalOrbit as CriticalOrbit
-from .analysis.cycles import OrbitBranch as OrbitBranch
 from .analysis.cycles import continue_orbits as continue_orbits
 from .analysis.equilibria import equilibria as equilibria
-from .analysis.exponents import Floquet as Floquet
-from .analysis.exponents import LyapunovExponents as LyapunovExponents
 from .analysis.exponents import floquet as floquet
 from .analysis.exponents import lyapunov_exponents as lyapunov_exponents
-from .analysis.formulations import Hamiltonian as Hamiltonian
-from .analysis.formulations import Routhian as Routhian
 from .analysis.formulations import action as action
 from .analysis.formulations import hamiltonian as hamiltonian
 from .analysis.formulations import routhian as routhian
-from .analysis.latex import EquationsOfMotion as EquationsOfMotion
 from .analysis.latex import latex as latex
-from .analysis.linearise import Linearisation as Linearisation
 from .analysis.linearise import linearise as linearise
-from .analysis.normal_modes import Mode as Mode
-from .analysis.normal_modes import NormalModes as NormalModes
 from .analysis.normal_modes import normal_modes as normal_modes
 from .analysis.periodic_orbit import OrbitWarning as OrbitWarning
-from .analysis.periodic_orbit import PeriodicOrbit as PeriodicOrbit
 from .analysis.periodic_orbit import periodic_orbit as periodic_orbit
-from .analysis.symmetry_result import Symmetries as Symmetries
 from .analysis.symmetry_search import symmetries as symmetries
-from .analysis.symmetry_test import SymmetryTest as SymmetryTest
 from .analysis.symmetry_test import is_symmetry as is_symmetry
 
 # isort: split
 # Two points.
 from .two_points import (
-    LQR as LQR,
-)
-from .two_points import (
-    Connection as Connection,
-)
-from .two_points import (
     ConnectWarning as ConnectWarning,
-)
-from .two_points import (
-    Geodesic as Geodesic,
-)
-from .two_points import (
-    Steering as Steering,
-)
-from .two_points import (
-    TrackingLQR as TrackingLQR,
 )
 from .two_points import (
     connect as connect,
@@ -359,31 +193,18 @@ from .two_points import (
 
 # isort: split
 # Many motions.
-from .display import Page as Page
-from .sweep import Status as Status
-from .sweep import Sweep as Sweep
 from .sweep import open_sweep as open_sweep
 from .sweep import sweep as sweep
 
 # isort: split
 # Many motions, in a notebook.
-from .sliders import Knobs as Knobs
 from .sliders import interact as interact
 
 # isort: split
 # From measured motion.
 from . import learned as learned
 from .fit import (
-    Fit as Fit,
-)
-from .fit import (
-    FitFunction as FitFunction,
-)
-from .fit import (
     FitWarning as FitWarning,
-)
-from .fit import (
-    Identifiability as Identifiability,
 )
 from .fit import (
     Record as Record,
@@ -408,12 +229,6 @@ from .fit import (
 # Error against run time.
 from . import scenes as scenes
 from .work_precision import (
-    Horizons as Horizons,
-)
-from .work_precision import (
-    WorkPrecision as WorkPrecision,
-)
-from .work_precision import (
     horizons as horizons,
 )
 from .work_precision import (
@@ -425,3 +240,6 @@ from .work_precision import (
 from .exchange import export as export
 from .exchange import from_sympy as from_sympy
 from .exchange import result_codes as result_codes
+
+# Names that have left this map, by where they are.
+MOVED: dict[str, str]

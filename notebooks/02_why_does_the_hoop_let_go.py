@@ -301,8 +301,10 @@ slippery = lj.Hybrid(
         "flies": free,
     },
     [
-        lj.Switch("rolls", to="slips", when=lj.slips("rolling", on="contact", coefficient=lambda p: p["c"], side=1)),
-        lj.Switch("slips", to="flies", when=lj.releases("contact")),
+        lj.Switch(
+            "rolls", to="slips", when=lj.guards.slips("rolling", on="contact", coefficient=lambda p: p["c"], side=1)
+        ),
+        lj.Switch("slips", to="flies", when=lj.guards.releases("contact")),
     ],
     most_switches=2,
 )

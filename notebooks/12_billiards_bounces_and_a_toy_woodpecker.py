@@ -53,7 +53,7 @@ def height(t, q, params):
 
 flying = lj.System(falling, dissipation=drag)
 lying = lj.System(falling, constraints={"floor": lj.Holonomic(height)})
-bounce = lj.Switch("flying", to="flying", when=lj.touches(height, 0.8), rest="lying", slower_than=1e-3)
+bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(height, 0.8), rest="lying", slower_than=1e-3)
 ball = lj.Hybrid({"flying": flying, "lying": lying}, [bounce], most_switches=60)
 air = {"g": 9.81, "c": 0.05}
 bounced = lj.integrate(ball, 1.0, 0.0, air, ts=jnp.linspace(0.0, 5.0, 401))
@@ -99,7 +99,7 @@ def table(t, q, params):
 
 
 tables = {"ellipse": (0.0, 2.0), "stadium": (1.0, 1.0)}
-reflect = lj.Switch("inside", to="inside", when=lj.touches(table, 1.0))
+reflect = lj.Switch("inside", to="inside", when=lj.guards.touches(table, 1.0))
 billiard = lj.Hybrid({"inside": lj.System(free)}, [reflect], most_switches=40)
 ts, start = jnp.linspace(0.0, 40.0, 801), jnp.array([0.3, 0.2])
 

@@ -130,7 +130,7 @@ swept = lj.sweep(verdict, axes_of_map, progress=False)
 took = time.perf_counter() - began
 code = np.asarray(swept.values)
 print(f"{code.size} points, {'less' if took < 10 else 'more'} than 10 s; "
-      + ", ".join(f"{np.sum(code == i)} {lj.NormalModes.VERDICTS[i]}" for i in np.unique(code)))  # fmt: skip
+      + ", ".join(f"{np.sum(code == i)} {at.VERDICTS[i]}" for i in np.unique(code)))  # fmt: skip
 fig, axes = plot.figure(size=(5.2, 4.2))
 axis = axes[0, 0]
 colours = ListedColormap([plot.COLOURS[i] for i in (2, 5, 1)])

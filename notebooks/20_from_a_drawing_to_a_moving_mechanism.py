@@ -40,8 +40,8 @@ matplotlib.rcParams["savefig.dpi"] = 90  # small pictures
 
 # %%
 AXIS = np.array([0.0, -1.0, 0.5]) / np.sqrt(1.25)  # of the bearing, in space
-crank = lj.Body("crank", mass=2.0, inertia=(0.02, 0.02, 0.04))
-rod = lj.Body("rod", mass=1.0, inertia=(0.001, 0.05, 0.05))
+crank = lj.bodies.Body("crank", mass=2.0, inertia=(0.02, 0.02, 0.04))
+rod = lj.bodies.Body("rod", mass=1.0, inertia=(0.001, 0.05, 0.05))
 
 
 def pin(params):
@@ -61,16 +61,16 @@ def resistance(t, q, v, params):
 
 
 joints = {
-    "bearing": lj.revolute(lj.ground.at(axis=AXIS), crank.at()),
-    "pin": lj.universal(crank.at(pin), rod.at(lambda params: -piston(params), axis=(0.0, 1.0, 0.0))),
+    "bearing": lj.bodies.revolute(lj.bodies.ground.at(axis=AXIS), crank.at()),
+    "pin": lj.bodies.universal(crank.at(pin), rod.at(lambda params: -piston(params), axis=(0.0, 1.0, 0.0))),
     "rail": lj.Holonomic(off_rail),
 }
 loads = [
-    lj.motor(lj.ground.at(axis=AXIS), crank.at(), lambda t, q, v, params: params["torque"]),
-    lj.applied(rod.at(piston), resistance),
-    lj.weight([crank, rod]),
+    lj.bodies.motor(lj.bodies.ground.at(axis=AXIS), crank.at(), lambda t, q, v, params: params["torque"]),
+    lj.bodies.applied(rod.at(piston), resistance),
+    lj.bodies.weight([crank, rod]),
 ]
-pump = lj.multibody([crank, rod], joints, loads)
+pump = lj.bodies.multibody([crank, rod], joints, loads)
 params = {"crank": 0.2, "rod": 0.6, "rail": 0.1, "torque": 3.0, "c": 12.0}
 
 # %% [markdown]
@@ -83,8 +83,8 @@ params = {"crank": 0.2, "rod": 0.6, "rail": 0.1, "torque": 3.0, "c": 12.0}
 # %%
 TILT = np.arctan2(1.0, 0.5)  # turns the z axis into AXIS
 drawn = {
-    "crank": lj.Pose.at(axis=(1.0, 0.0, 0.0), angle=TILT),
-    "rod": lj.Pose.at((0.45, 0.03, -0.04), axis=(1.0, 0.05, 0.1), angle=TILT),
+    "crank": lj.bodies.Pose.at(axis=(1.0, 0.0, 0.0), angle=TILT),
+    "rod": lj.bodies.Pose.at((0.45, 0.03, -0.04), axis=(1.0, 0.05, 0.1), angle=TILT),
 }
 moving = {"crank": drawn["crank"].moving(spin=3.0 * AXIS), "rod": drawn["rod"].moving()}
 lj.draw(pump, drawn, params, frames=True).figure()
@@ -216,13 +216,13 @@ plt.tight_layout()
 # %%
 turning = run(params | {"crank": wanted})
 shapes = [
-    lj.disk(crank, radius=0.06),
-    lj.rod(crank, crank.at(pin), radius=0.012),
-    lj.rod(rod.at(lambda params: -piston(params)), rod.at(piston), radius=0.008),
-    lj.sphere(rod.at(piston), radius=0.03),
-    lj.line((0.2, 0.0, params["rail"]), (0.95, 0.0, params["rail"])),
-    lj.trail(crank.at(pin)),
-    lj.trail(rod),
+    lj.shapes.disk(crank, radius=0.06),
+    lj.shapes.rod(crank, crank.at(pin), radius=0.012),
+    lj.shapes.rod(rod.at(lambda params: -piston(params)), rod.at(piston), radius=0.008),
+    lj.shapes.sphere(rod.at(piston), radius=0.03),
+    lj.shapes.line((0.2, 0.0, params["rail"]), (0.95, 0.0, params["rail"])),
+    lj.shapes.trail(crank.at(pin)),
+    lj.shapes.trail(rod),
 ]
 turning.draw(shapes, times=[0.0, 0.15, 0.3])
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import ellipj, ellipk
 
 import lagjax as lj
+from lagjax.integrate import Trajectory
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory.error_report import Errors
 from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
@@ -19,7 +20,7 @@ HOW = SolveInfo("Dopri8", 8, 13, "tolerance")
 def by_hand(
     system, t, q, v, params=None, *, off=None, steps=100, more=200, asked=ASKED, how=HOW, solve: Any = trajectory_of,
     tolerance=(1e-9, 1e-9), **fields,
-) -> lj.Trajectory:  # fmt: skip
+) -> Trajectory:  # fmt: skip
     """A motion through q, v at the times t, in so many steps; `off`: their estimated errors, by `more` steps."""
     t, of_end = np.asarray(t, np.result_type(*jax.tree.leaves(q))), jax.tree.map(lambda x: np.asarray(x)[-1], (q, v))
     none, many = fields.get("multipliers", {}), np.asarray(steps)
@@ -31,7 +32,7 @@ def by_hand(
         "stats": {"num_steps": many, "num_accepted_steps": many, "num_rejected_steps": np.asarray(0)},
         "tolerance": tuple(np.full(2, x) for x in tolerance), "error": error,
     }  # fmt: skip
-    return lj.Trajectory(t=t, q=q, v=v, arrays=arrays, static=static, **(usual | fields))
+    return Trajectory(t=t, q=q, v=v, arrays=arrays, static=static, **(usual | fields))
 
 
 def with_problem(traj, system=None, params=None, **asked):

@@ -48,16 +48,20 @@ def test_python_blocks(name, capsys, tmp_path, monkeypatch):
     assert claimed == printed
 
 
+# What has names of its own in `lj.`.
+PARTS = "bodies|guards|scenes|shapes"
+
+
 def unknown(code):
     """The names that code reads from lagjax and that are not there."""
     dotted = {ast.unparse(node) for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Attribute)}
-    return sorted(name for name in dotted if re.match(r"lj\.(scenes\.)?\w+$", name) and not known(name))
+    return sorted(name for name in dotted if re.match(rf"lj\.(({PARTS})\.)?\w+$", name) and not known(name))
 
 
 def known(name):
-    """Whether `lj.a` or `lj.scenes.a` is there."""
-    *_, last = parts = name.split(".")[1:]
-    return hasattr(lj.scenes if len(parts) > 1 else lj, last)
+    """Whether `lj.a`, or `lj.scenes.a` and the like, is there."""
+    *part, last = name.split(".")[1:]
+    return hasattr(getattr(lj, part[0]) if part else lj, last)
 
 
 def test_code_of_pages_names_what_is_there():
@@ -65,6 +69,7 @@ def test_code_of_pages_names_what_is_there():
     assert {name for name, code in CODE.items() if not code} == WITHOUT_CODE
     assert {name: found for name, code in CODE.items() if (found := unknown(code))} == {}
     assert unknown("lj.integrat(lj.System(L), lj.scenes.hoop)") == ["lj.integrat", "lj.scenes.hoop"]
+    assert unknown("lj.rod(lj.shapes.rod, lj.shapes.weight)") == ["lj.rod", "lj.shapes.weight"]
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def sum_of_switched(t):
 
 def bouncing(rest=None):
     """A ball whose bounces halve its speed."""
-    touch = lj.touches(lambda t, q, p: q, restitution=0.5)
+    touch = lj.guards.touches(lambda t, q, p: q, restitution=0.5)
     switch = lj.Switch("flying", to="flying", when=touch, rest=rest, **({} if rest is None else {"slower_than": 1e-8}))
     return lj.Hybrid({"flying": ball} | ({"lying": lying} if rest else {}), [switch], most_switches=60)
 
@@ -115,7 +115,7 @@ def bouncing(rest=None):
 def row_of_balls(most=16):
     """Three balls of diameter 0.2 that collide without restitution: the first hits two that touch."""
     balls = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
-    gaps = [lj.touches(lambda t, q, p, i=i: q[i + 1] - q[i] - 0.2, restitution=0.0) for i in range(2)]
+    gaps = [lj.guards.touches(lambda t, q, p, i=i: q[i + 1] - q[i] - 0.2, restitution=0.0) for i in range(2)]
     return lj.Hybrid({"fly": balls}, [lj.Switch("fly", to="fly", when=gap) for gap in gaps], most_switches=most)
 
 

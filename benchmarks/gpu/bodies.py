@@ -1,7 +1,7 @@
 """Bodies and trees in lanes on a GPU, beside the same lanes on the CPU of that machine.
 
-links     accelerations of a chain of 64 hinged rods (`lj.Tree`), each lane in a state of its own
-tops      heavy tops (`lj.multibody`, a quaternion and its constraint) of different spins for one second
+links     accelerations of a chain of 64 hinged rods (`lj.bodies.Tree`), each lane in a state of its own
+tops      heavy tops (`lj.bodies.multibody`, a quaternion and its constraint) of different spins for one second
 arms      three hinged rods for one second, each lane released from angles of its own
 host      operations of these programs that need the host (`host_operations.py`)
 
@@ -45,11 +45,11 @@ def links(lanes):
 
 def tops(lanes):
     """Heavy tops on a spherical joint, by their spin."""
-    top = lj.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
-    tip = lj.spherical(lj.ground.at((0.0, 0.0, 0.0)), top.at((0.0, 0.0, -0.5)))
+    top = lj.bodies.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
+    tip = lj.bodies.spherical(lj.bodies.ground.at((0.0, 0.0, 0.0)), top.at((0.0, 0.0, -0.5)))
     weight = lambda t, q, v, p: -p["g"] * top.point(q, (0.0, 0.0, 0.0))[2]
-    system = lj.multibody([top], {"tip": tip}, lagrangian=weight)
-    lying = lj.Pose.at((0.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), angle=jnp.pi / 2)
+    system = lj.bodies.multibody([top], {"tip": tip}, lagrangian=weight)
+    lying = lj.bodies.Pose.at((0.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), angle=jnp.pi / 2)
 
     def end(spin):
         around = spin * jnp.array([1.0, 0.0, 0.0])

@@ -46,7 +46,9 @@ def gap(t, q, params):
 
 
 free = lj.System(pendulum)
-walled = lj.Hybrid({"swings": free}, [lj.Switch("swings", to="swings", when=lj.touches(gap, E))], most_switches=20)
+walled = lj.Hybrid(
+    {"swings": free}, [lj.Switch("swings", to="swings", when=lj.guards.touches(gap, E))], most_switches=20
+)
 
 
 def batch(system):

@@ -219,17 +219,18 @@ angle = np.array([0.4, 0.5, 0.8, 1.1])
 start = 0.5 * np.cumsum(np.stack([np.sin(angle), -np.cos(angle)], 1), 0), np.zeros((4, 2))
 """
 BODY = """
-body = lj.Body("body", mass=1.0, inertia=(0.1, 0.2, 0.3))
-system, params = lj.multibody([body]), {"g": 9.81}
-pose = lj.Pose.at((0.0, 0.0, 0.0))
+body = lj.bodies.Body("body", mass=1.0, inertia=(0.1, 0.2, 0.3))
+system, params = lj.bodies.multibody([body]), {"g": 9.81}
+pose = lj.bodies.Pose.at((0.0, 0.0, 0.0))
 start = {"body": pose}, {"body": pose.moving(spin=(0.1, 5.0, 0.1))}
 """
 TOP = """
-top = lj.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
-tip = lj.spherical(lj.ground.at((0.0, 0.0, 0.0)), top.at((0.0, 0.0, -0.5)))
+top = lj.bodies.Body("top", mass=1.0, inertia=(0.1, 0.1, 0.05))
+tip = lj.bodies.spherical(lj.bodies.ground.at((0.0, 0.0, 0.0)), top.at((0.0, 0.0, -0.5)))
 params = {"g": 9.81}
-system = lj.multibody([top], {"tip": tip}, lagrangian=lambda t, q, v, p: -p["g"] * top.point(q, (0.0, 0.0, 0.0))[2])
-lying = lj.Pose.at((0.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), angle=jnp.pi / 2)
+weight = lambda t, q, v, p: -p["g"] * top.point(q, (0.0, 0.0, 0.0))[2]
+system = lj.bodies.multibody([top], {"tip": tip}, lagrangian=weight)
+lying = lj.bodies.Pose.at((0.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), angle=jnp.pi / 2)
 spin = jnp.array([80.0, 0.0, 0.0])
 start = {"top": lying}, {"top": lying.moving(velocity=jnp.cross(spin, lying.position), spin=spin)}
 """
@@ -238,19 +239,19 @@ SHAFTS = """
 bend = 0.5
 places = [np.zeros(3), np.array([np.cos(bend), np.sin(bend), 0.0])]
 places.append(places[1] + np.array([np.cos(2 * bend), np.sin(2 * bend), 0.0]))
-shafts = [lj.Body(name, mass=1.0, inertia=(0.02, 0.1, 0.1)) for name in ("in", "middle", "out")]
+shafts = [lj.bodies.Body(name, mass=1.0, inertia=(0.02, 0.1, 0.1)) for name in ("in", "middle", "out")]
 ends = lambda body, side, axis: body.at((0.5 * side, 0.0, 0.0), axis)
 y, z, x = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 axis = np.array([np.cos(2 * bend), np.sin(2 * bend), 0.0])
-poses = [lj.Pose.at((-0.5, 0, 0)), lj.Pose.at(places[1] / 2, axis=z, angle=bend),
-         lj.Pose.at(places[1] + axis / 2, axis=z, angle=2 * bend)]
+poses = [lj.bodies.Pose.at((-0.5, 0, 0)), lj.bodies.Pose.at(places[1] / 2, axis=z, angle=bend),
+         lj.bodies.Pose.at(places[1] + axis / 2, axis=z, angle=2 * bend)]
 joints = {
-    "bearing": lj.revolute(lj.ground.at((-1.0, 0.0, 0.0), x), ends(shafts[0], -1, x)),
-    "first": lj.universal(ends(shafts[0], 1, y), ends(shafts[1], -1, z)),
-    "second": lj.universal(ends(shafts[1], 1, z), ends(shafts[2], -1, y)),
-    "far": lj.cylindrical(lj.ground.at(places[1] + axis, axis), ends(shafts[2], 1, x)),
+    "bearing": lj.bodies.revolute(lj.bodies.ground.at((-1.0, 0.0, 0.0), x), ends(shafts[0], -1, x)),
+    "first": lj.bodies.universal(ends(shafts[0], 1, y), ends(shafts[1], -1, z)),
+    "second": lj.bodies.universal(ends(shafts[1], 1, z), ends(shafts[2], -1, y)),
+    "far": lj.bodies.cylindrical(lj.bodies.ground.at(places[1] + axis, axis), ends(shafts[2], 1, x)),
 }
-system, params = lj.multibody(shafts, joints), {"g": 1.0}
+system, params = lj.bodies.multibody(shafts, joints), {"g": 1.0}
 q = {b.name: pose for b, pose in zip(shafts, poses)}
 v = {b.name: pose.moving() for b, pose in zip(shafts, poses)} | {"in": poses[0].moving(spin=(3.0, 0.0, 0.0))}
 start = lj.consistent_state(system, 0.0, q, v, params)
@@ -258,12 +259,14 @@ start = lj.consistent_state(system, 0.0, q, v, params)
 ARM = """
 # Seven rods, each on the one before it by a hinge, about y and x by turns.
 count, y, x = 7, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
-rods = [lj.Body(f"rod {i}", mass=1.0, inertia=(0.02, 0.02, 0.001)) for i in range(count)]
+rods = [lj.bodies.Body(f"rod {i}", mass=1.0, inertia=(0.02, 0.02, 0.001)) for i in range(count)]
 low, high = (0.0, 0.0, -0.25), (0.0, 0.0, 0.25)
-below = [lj.ground.at(axis=y), *(rod.at(high, (y, x)[(i + 1) % 2]) for i, rod in enumerate(rods[:-1]))]
-joints = {f"hinge {i}": lj.revolute(a, rod.at(low, (y, x)[i % 2])) for i, (a, rod) in enumerate(zip(below, rods))}
-system, params = lj.multibody(rods, joints, [lj.weight(rods, lambda p: jnp.array([0.0, 0.0, -p["g"]]))]), {"g": 9.81}
-poses = [lj.Pose.at((0.0, 0.0, 0.25 + 0.5 * i)) for i in range(count)]
+below = [lj.bodies.ground.at(axis=y), *(rod.at(high, (y, x)[(i + 1) % 2]) for i, rod in enumerate(rods[:-1]))]
+hinge = lambda i, a, rod: lj.bodies.revolute(a, rod.at(low, (y, x)[i % 2]))
+joints = {f"hinge {i}": hinge(i, a, rod) for i, (a, rod) in enumerate(zip(below, rods))}
+pull = lj.bodies.weight(rods, lambda p: jnp.array([0.0, 0.0, -p["g"]]))
+system, params = lj.bodies.multibody(rods, joints, [pull]), {"g": 9.81}
+poses = [lj.bodies.Pose.at((0.0, 0.0, 0.25 + 0.5 * i)) for i in range(count)]
 start = {rod.name: pose for rod, pose in zip(rods, poses)}, {rod.name: pose.moving() for rod, pose in zip(rods, poses)}
 """
 MOVING = """
@@ -273,12 +276,12 @@ start = start[0], {name: pose.moving(jnp.cross(spin, pose.position), spin) for n
 """
 PIPE = """
 # A ball that rolls in a standing pipe: f is the distance to the wall, or its square.
-ball, radius = lj.Body("ball", mass=1.0, inertia=(0.004, 0.004, 0.004)), 0.1
+ball, radius = lj.bodies.Body("ball", mass=1.0, inertia=(0.004, 0.004, 0.004)), 0.1
 across = lambda r: jnp.sqrt(r[0] ** 2 + r[1] ** 2)
-pipe = lj.Surface({f}, is_distance={is_distance})
-contact = lj.rolling_sphere(ball.at(), pipe, radius)
-system, params = lj.multibody([ball], {{"wall": contact}}, [lj.weight([ball])]), {{"radius": 1.0}}
-place = lj.Pose.at((0.9, 0.0, 0.0))
+pipe = lj.bodies.Surface({f}, is_distance={is_distance})
+contact = lj.bodies.rolling_sphere(ball.at(), pipe, radius)
+system, params = lj.bodies.multibody([ball], {{"wall": contact}}, [lj.bodies.weight([ball])]), {{"radius": 1.0}}
+place = lj.bodies.Pose.at((0.9, 0.0, 0.0))
 start = {{"ball": place}}, {{"ball": place.moving((0.0, 2.7, 0.5), spin=(0.0, 5.0, -27.0))}}
 start, key = lj.consistent_state(system, 0.0, *start, params), "radius"
 # The start is consistent for one radius alone.

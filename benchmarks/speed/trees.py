@@ -1,7 +1,7 @@
 """Do trees in joint coordinates cost as their number of bodies, and as much as engines written for them?
 
-Chains of N rods on hinges, one metre and one kilogram in all, released at rest, as a `lj.Tree`: accelerations by the
-articulated-body recursion. Measured are
+Chains of N rods on hinges, one metre and one kilogram in all, released at rest, as a `lj.bodies.Tree`: accelerations by
+the articulated-body recursion. Measured are
 
 - an evaluation of the accelerations inside a compiled loop, beside MuJoCo's `mj_forward` (without contacts) and
   Pinocchio's `aba` on the same chain, and the exponent p of its cost N^p from 64 to 1,000 links;
@@ -56,11 +56,13 @@ def moments(count):
 
 def chain(count):
     """A chain of rods along -z, on hinges about y: the system, and its first coordinates."""
-    rods = [lj.Body(f"rod {i}", 1 / count, moments(count)) for i in range(count)]
+    rods = [lj.bodies.Body(f"rod {i}", 1 / count, moments(count)) for i in range(count)]
     y, half = (0.0, 1.0, 0.0), 0.5 / count
-    above = [lj.ground.at(axis=y), *(rod.at((0.0, 0.0, -half), y) for rod in rods)]
-    tree = lj.Tree(rods, {"angles": [lj.revolute(a, rod.at((0.0, 0.0, half), y)) for a, rod in zip(above, rods)]})
-    return tree.system([lj.weight(rods)]), {"angles": jnp.asarray(relative_angles(count))}
+    above = [lj.bodies.ground.at(axis=y), *(rod.at((0.0, 0.0, -half), y) for rod in rods)]
+    tree = lj.bodies.Tree(
+        rods, {"angles": [lj.bodies.revolute(a, rod.at((0.0, 0.0, half), y)) for a, rod in zip(above, rods)]}
+    )
+    return tree.system([lj.bodies.weight(rods)]), {"angles": jnp.asarray(relative_angles(count))}
 
 
 def relative_angles(count):

@@ -1,26 +1,20 @@
-"""Link code such as `lj.fit` in a text to the page of that name."""
+"""Link code such as `lj.fit`, `lj.bodies.Body` or `Trajectory` in a text to the page of that name."""
 
-import re
-
-from api_pages import page_of
+from api_pages import name_in, page_of
 from docutils import nodes
-
-import lagjax
-
-NAME = re.compile(r"lj\.(\w+)\b")
 
 
 def link(app, doctree, docname):
     """Link each such piece of code, unless it is part of a link or a title, or stands on its own page."""
     for literal in list(doctree.findall(nodes.literal)):
-        found = NAME.match(literal.astext())
-        if not found or found[1] not in lagjax.__all__:
+        name = name_in(literal.astext())
+        if name is None:
             continue
         parents, node = [], literal.parent
         while node is not None:
             parents.append(node)
             node = node.parent
-        target = f"api/{page_of(found[1])}"
+        target = f"api/{page_of(name)}"
         if target == docname or any(isinstance(node, (nodes.reference, nodes.title)) for node in parents):
             continue
         uri = app.builder.get_relative_uri(docname, target)

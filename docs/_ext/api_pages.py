@@ -1,9 +1,14 @@
 """A page for each public name, in the sections of `lagjax/__init__.pyi`: signature, docstring, example, errors.
 
+A name is written here as it is after `lj.`, `integrate` or `bodies.Body`; a result, which is imported from where it is
+defined, by its own name alone.
+
 The docstrings are Markdown with doctest examples, which `pytest lagjax` runs.
 """
 
 import ast
+import functools
+import importlib
 import inspect
 import re
 import typing
@@ -18,11 +23,17 @@ FOLDER = Path(__file__).parent.parent / "api"
 INIT = Path(lagjax.__file__).with_suffix(".pyi")
 # The function whose example shows an object that no function is annotated to return.
 SHOWN_BY = {
-    "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "touches",
+    "Crossings": "Crossing", "Snapshot": "integrate", "Explanation": "explain", "Switches": "guards.touches",
     "Routhian": "routhian", "Branch": "continue_equilibria", "Critical": "continue_equilibria", "Mode": "normal_modes",
     "CriticalOrbit": "continue_orbits",
-    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "touches",
+    "Status": "sweep", "Knobs": "interact", "HybridTrajectory": "guards.touches",
 }  # fmt: skip
+# Code that begins with a name in `lj.`, or in a part of it.
+NAME = re.compile(r"lj\.(?P<part>\w+)(?:\.(?P<inner>\w+))?")
+# What has names of its own in `lj.`.
+PARTS = ("bodies", "guards", "shapes")
+# Where results are imported from.
+RESULTS = {name: place for place, names in lagjax.MOVED.items() if place.startswith("lagjax") for name in names.split()}
 # Examples for names whose docstring has no room for one.
 EXAMPLES = {
     "scenes": """
@@ -44,20 +55,46 @@ Traceback (most recent call last):
 
 
 def sections() -> dict[str, list[str]]:
-    """The public names under the comments above their imports, in the order of the map."""
+    """The public names under the comments above their imports, in the order of the map; each part after its section."""
     found: dict[str, list[str]] = {}
-    names: list[str] = []
-    for line in INIT.read_text().splitlines():
-        if re.match("# (?!isort)", line):
-            names = found.setdefault(line.strip("# ."), [])
-        else:
-            names += re.findall(r"(\w+) as \1\b", line)
-    return found
+    # What stands above the first comment belongs to no section, nor does what is no import.
+    for comment in re.split("^# (?!isort)", INIT.read_text(), flags=re.MULTILINE)[1:]:
+        title, _, text = comment.partition("\n")
+        if names := re.findall(r"(\w+) as \1\b", text):
+            found[title.strip(" .")] = names
+            for part in (name for name in names if name in PARTS):
+                found[f"In lj.{part}"] = [f"{part}.{name}" for name in getattr(lagjax, part).__all__]
+    return found | {"Results": sorted(RESULTS)}
+
+
+@functools.cache
+def public_names() -> tuple[str, ...]:
+    """All names that have a page."""
+    return tuple(name for names in sections().values() for name in names)
+
+
+def named(name: str):
+    """What has this name."""
+    return getattr(importlib.import_module(RESULTS[name]), name) if name in RESULTS else attrgetter(name)(lagjax)
+
+
+def written(name: str) -> str:
+    """The name as it is in code and texts."""
+    return name if name in RESULTS else f"lj.{name}"
+
+
+def name_in(code: str) -> str | None:
+    """The public name with which a piece of code begins, the longest; a result only where it stands alone."""
+    if code in RESULTS:
+        return code
+    found = NAME.match(code)
+    names = [f"{found['part']}.{found['inner']}", found["part"]] if found else []
+    return next((name for name in names if name in public_names() and name not in RESULTS), None)
 
 
 def page_of(name: str) -> str:
     """The file name of a page: `fit` and `Fit` must differ on file systems that ignore case."""
-    twins = [other for other in lagjax.__all__ if other.lower() == name.lower()]
+    twins = [other for other in public_names() if other.lower() == name.lower()]
     return name if len(twins) == 1 or name.islower() else f"{name.lower()}-class"
 
 
@@ -102,8 +139,8 @@ def signature(thing, name: str, method: bool = False) -> str:
 def makers(cls: type) -> list[str]:
     """The public functions that are annotated to return this class."""
     found = []
-    for name in lagjax.__all__:
-        function = getattr(lagjax, name)
+    for name in public_names():
+        function = named(name)
         if inspect.isfunction(inspect.unwrap(function)):
             returned = inspect.unwrap(function).__annotations__.get("return")
             if returned is cls or cls in typing.get_args(returned):
@@ -136,6 +173,12 @@ def added_example(thing, name: str) -> str:
     return EXAMPLES.get(name, "")
 
 
+def entry(name: str) -> str:
+    """A line of a list: a link to the page of a name, and the first line of its docstring."""
+    first = (inspect.getdoc(named(name)) or "").split("\n\n")[0].replace("\n", " ")
+    return f"- [`{written(name)}`]({page_of(name)}.md): {first}"
+
+
 def borrowed(thing, name: str) -> str:
     """The example of the function that returns such an object, or one added here."""
     if added := added_example(thing, name):
@@ -143,7 +186,7 @@ def borrowed(thing, name: str) -> str:
     maker = SHOWN_BY.get(name) or next(iter(makers(thing)), None)
     if maker is None:
         return ""
-    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(attrgetter(maker)(lagjax)) or '')}\n"
+    return f"\nAn example, that of `lj.{maker}`:\n\n{example(inspect.getdoc(named(maker)) or '')}\n"
 
 
 def described(thing, name: str) -> str:
@@ -162,9 +205,17 @@ def described(thing, name: str) -> str:
 
 def page(name: str) -> str:
     """The whole page of a public name."""
-    thing = getattr(lagjax, name)
+    thing = named(name)
     if not inspect.ismodule(thing):
-        return f"# lj.{name}\n\n:::{{py:currentmodule}} lagjax\n:::\n\n{described(thing, name)}"
+        part, _, last = name.rpartition(".")
+        module = RESULTS.get(name) or f"lagjax.{part}".strip(".")
+        imported = f"```python\nfrom {module} import {name}\n```\n\n" if name in RESULTS else ""
+        head = f"# {written(name)}\n\n{imported}:::{{py:currentmodule}} {module}\n:::\n\n"
+        return head + described(thing, last)
+    if name in PARTS:
+        entries = [entry(f"{name}.{inner}") for inner in thing.__all__]
+        head = f"# lj.{name}\n\n:::{{py:currentmodule}} lagjax.{name}\n:::\n"
+        return "\n".join([head, markdown(inspect.getdoc(thing) or ""), "", *entries, ""])
     parts = [
         f"# lj.{name}\n",
         markdown(inspect.getdoc(thing) or ""),
@@ -189,9 +240,7 @@ def index(groups: dict[str, list[str]]) -> str:
     parts = ["# Reference\n", "`import lagjax as lj`; the names are in the order of the physics.\n"]
     for title, names in groups.items():
         parts.append(f"## {title}\n")
-        for name in names:
-            first = (inspect.getdoc(getattr(lagjax, name)) or "").split("\n\n")[0].replace("\n", " ")
-            parts.append(f"- [`lj.{name}`]({page_of(name)}.md): {first}")
+        parts += map(entry, names)
         parts.append(f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(map(page_of, names)) + "\n```\n")
     return "\n".join(parts)
 
@@ -199,10 +248,10 @@ def index(groups: dict[str, list[str]]) -> str:
 def generate(app):
     """Write all pages."""
     groups = sections()
-    for name in lagjax.__all__:
+    for name in public_names():
         write(FOLDER / f"{page_of(name)}.md", page(name))
     write(FOLDER / "index.md", index(groups))
-    clear(FOLDER, {"index.md"} | {f"{page_of(name)}.md" for name in lagjax.__all__})
+    clear(FOLDER, {"index.md"} | {f"{page_of(name)}.md" for name in public_names()})
 
 
 def setup(app):

@@ -20,7 +20,7 @@ Source: Piessens et al., *QUADPACK* (1983), §2.2.
 
 import warnings
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -79,10 +79,10 @@ class Work(NamedTuple):
 
 
 class InPhases(NamedTuple):
-    """In which phase each row is, and the modes of elements as functions take them; None without elements."""
+    """In which phase each row is, and the modes of elements; None without elements."""
 
     phase: np.ndarray
-    given: InModes | None = None
+    modes: np.ndarray | None = None
 
 
 class Motion:
@@ -95,6 +95,7 @@ class Motion:
 
     def __init__(self, trajectory: Trajectory, accounted):
         self.trajectory, self.systems, self.params = trajectory, accounted.phases, trajectory.params
+        self.accounted = accounted
         # The number of outputs when the motion is integrated again.
         self.room = 0
         rows, end = jax.tree.map(np.asarray, (trajectory.rows(), trajectory.end))
@@ -121,8 +122,8 @@ class Motion:
             self.switch_times, to = np.asarray(self.switches.t)[:count], np.asarray(self.switches.to)[:count]
             self.entered = InPhases(np.array([int(trajectory.system.first), *to]))
             if trajectory.modes is not None:
-                self.where = self.where._replace(given=accounted.given(None, rows["modes"]))
-                self.entered = self.entered._replace(given=accounted.given(None, trajectory.modes_entered()))
+                self.where = self.where._replace(modes=rows["modes"])
+                self.entered = self.entered._replace(modes=trajectory.modes_entered())
         self.sources: dict[str, int] = {}
         self.models = model_of(accounted, *self._at(0), self.params).phases
         for model in self.models:
@@ -155,7 +156,8 @@ class Motion:
             model = self.models[i]
             # Other phases have other multipliers.
             of_phase = {name: multipliers[name] for name in model.zero_multipliers()}
-            for name, power in _powers(model, t, q, v, of_phase, where.given).items():
+            given = None if where.modes is None else self.accounted.given(None, where.modes, int(i))
+            for name, power in _powers(model, t, q, v, of_phase, given).items():
                 powers[name] = np.where((where.phase == i)[:, None], power, powers[name])
         return powers
 
@@ -235,7 +237,7 @@ class Motion:
         settings = traj.asked._asdict() | {"rtol": tuple(rtol), "atol": None if atol.ndim == 2 else tuple(atol)}
         if traj.asked.stepsize_controller is not None:
             del settings["max_step"], settings["jump_ts"]
-        if isinstance(traj, HybridTrajectory) and traj.modes is None:
+        if isinstance(traj, HybridTrajectory) and traj.switches.of_phases:
             settings["start"] = traj.system.names[self.entered.phase[0]]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -280,26 +282,28 @@ class Motion:
         """The phase before and after each switch, in words."""
         if self.switches is None:
             return ()
-        if self.entered.given is not None:
-            return tuple(self.switches.ways[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)])
-        names = [self.switches.names[i] for i in self.entered.phase]
-        return tuple(f"{x} -> {y}" for x, y in zip(names, names[1:]))
+        s, names = self.switches, [self.switches.names[i] for i in self.entered.phase]
+        ways = np.asarray(s.way)[: len(self.switch_times)]
+        both = zip(ways, names, names[1:])
+        return tuple(f"{x} -> {y}" if way < s.of_phases else s.ways[way] for way, x, y in both)
 
     def elements(self) -> tuple[str, ...]:
         """The names of the modes of elements, those of a vector once."""
-        laws = self.laws
-        return () if laws is None else tuple(law.name for law in (*laws.normals, *laws.tangents, *laws.compliant))
+        every = [law.name for of in self.laws for law in (*of.normals, *of.tangents, *of.compliant)]
+        return tuple(dict.fromkeys(every))
 
     @property
-    def laws(self) -> Any:
-        """The laws of the elements, if there are any."""
-        return getattr(self.trajectory.system, "laws", None)
+    def laws(self) -> list:
+        """The laws of the elements of each phase that has some."""
+        return [laws for laws in getattr(self.trajectory.system, "laws", ()) if laws is not None]
 
     def element_of_switches(self) -> list[str]:
-        """The element whose mode ended at each switch, a contact's friction counted to the contact."""
-        if self.switches is None or self.laws is None:
+        """The element whose mode ended at each switch, a contact's friction counted to the contact; "" at those of
+        phases. Nothing without elements."""
+        if self.switches is None or not self.laws:
             return []
-        return [self.laws.elements[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)]]
+        names = [*[""] * self.switches.of_phases, *(name for laws in self.laws for name in laws.elements)]
+        return [names[i] for i in np.asarray(self.switches.way)[: len(self.switch_times)]]
 
     def _work(self, name: str, power, work):
         total = np.sum(work, axis=1)
@@ -599,7 +603,9 @@ def _ledger(motion: Motion) -> EnergyLedger:
         impact_times=motion.switch_times, impacts=jumps, switches=motion.ways(), impact_total=jumped,
         closure=h - h[0] - total - jumped, scale=scale, allowed=100 * rtol, quadrature=error / scale,
         elements={name: works[words] for name in motion.elements() if (words := element_in_words(name)) in works},
-        element_impacts={str(name): summed(np.where(by == name, jumps, 0.0)) for name in sorted(set(by[jumped_there]))},
+        element_impacts={
+            str(name): summed(np.where(by == name, jumps, 0.0)) for name in sorted(set(by[jumped_there]) - {""})
+        },
     )  # fmt: skip
 
 

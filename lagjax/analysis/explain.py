@@ -59,7 +59,7 @@ class HybridExplanation:
 
     >>> import lagjax as lj
     >>> ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - 10.0 * q)
-    >>> bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, restitution=0.5))
+    >>> bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, params: q, restitution=0.5))
     >>> found = lj.explain(lj.Hybrid({"flying": ball}, [bounce]), 0.0, 5.0, 0.0)
     >>> print(list(found.phases), found.final)
     ['flying'] ()
@@ -203,16 +203,18 @@ def explain(system, t, q: PyTree, v: PyTree, params: PyTree = None):
     check_system(system, t, q, v, params, phases=True, elements=True)
     s = coordinates.state(t, q, with_rates(system, q, v), params)
     if system.in_phases:
-        return explained(system, {name: _explain(phase, s) for name, phase in zip(system.names, system.systems)}, s)
-    if system.elements is not None:
-        return _with_elements(system, s)
-    return _explain(system, s)
+        return explained(system, {name: _of_phase(phase, s) for name, phase in zip(system.names, system.systems)}, s)
+    return _of_phase(system, s)
+
+
+def _of_phase(system: System, s: coordinates.State) -> Explanation:
+    return _explain(system, s) if system.elements is None else _with_elements(system, s)
 
 
 def _with_elements(system: System, s: coordinates.State) -> Explanation:
     """The explanation of the system without elements, and of their modes."""
     assembly, found = traced_phases(system, s), _explain(replace(system, elements=None), s)
-    laws, met = assembly.laws, modes_at(assembly, s)
+    (laws,), met = assembly.laws, modes_at(assembly, s)
     kinds = dict(zip(laws.names, laws.modes_in_words(np.asarray(met.modes))))
     values, holds, held = _held(assembly, s._replace(v=met.v), met.modes)
     now = [
@@ -254,8 +256,8 @@ def _held(assembly, s: coordinates.State, modes):
     here, open_ones = assembly.given(s.params, modes), assembly.given(s.params)
     model = model_of(assembly.systems[0], *s[:3], here)
     x, u = model.vectors(s.q, s.v)
-    rows = [constraints.jacobian(model.of(given), s.t, x, u) for given in (here, open_ones)]
-    return assembly.laws.last(*s[:3], model.zero_multipliers(), here), assembly.laws.holds(modes), rows
+    rows, (laws,) = [constraints.jacobian(model.of(given), s.t, x, u) for given in (here, open_ones)], assembly.laws
+    return laws.last(*s[:3], model.zero_multipliers(), here), laws.holds(modes), rows
 
 
 def _explain(system: System, s: coordinates.State) -> Explanation:

@@ -45,7 +45,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate import (
     HybridTrajectory,
-    InElements,
     Switches,
     ended_well,
     integrate,
@@ -493,4 +492,4 @@ def no_switches(system: System | Hybrid, s: State) -> Switches | None:
     """The switches of a motion before any; None for a system without phases."""
     if not system.in_phases:
         return None
-    return switches_before_any(system, s.q, s.v, system.laws if isinstance(system, InElements) else None)
+    return switches_before_any(system, s.q, s.v)

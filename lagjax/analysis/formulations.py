@@ -450,7 +450,7 @@ def action(
         return found if error else found[0]
     if not callable(path):
         raise TypeError(
-            f"a path is a function of t or a lj.Trajectory, not {type(path).__name__}.\n"
+            f"a path is a function of t or a Trajectory, not {type(path).__name__}.\n"
             'Fix: lambda t: {"x": 2.0 * t, "y": 0.0 * t}.'
         )
     if t0 is None or t1 is None:

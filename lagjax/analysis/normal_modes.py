@@ -342,7 +342,7 @@ class Mode(eqx.Module):
     def animate(self, positions, *, amplitude=0.2, seconds: float = 6.0, rate: float = 25.0, trail: float = 0.0):
         """Play the mode: points in the plane or in space, as `Trajectory.animate` draws them.
 
-        **Arguments:** `positions(t, q, params)` -> points, see `lj.Trajectory.animate`; `amplitude`: the
+        **Arguments:** `positions(t, q, params)` -> points, see `Trajectory.animate`; `amplitude`: the
         amplitude of the coordinate that moves most, `[q]`; `seconds`, `rate`, `trail`: of the film.
 
         **Returns:** an `Animation` of a few periods on top of the steady motion; for a mode that grows or decays, of a
@@ -366,7 +366,7 @@ class NormalModes(eqx.Module):
     - `energy` (k,): the sign of the energy of each steadily oscillating mode; 0 for the others.
     - `zero` (k,): whether the root is zero. `growing` (k,): whether the mode grows. `double` (k,): whether another root
       is the same; its derivatives are then those of the mean of both, or zero if both share their shape.
-    - `code`, `stable`: the `verdict` as a number (its index in `lj.NormalModes.VERDICTS`), and whether nothing grows.
+    - `code`, `stable`: the `verdict` as a number (its index in `NormalModes.VERDICTS`), and whether nothing grows.
     - `unexplained`: how many zero roots may be those of a critical point. Outside of compiled programs, those that lead
       to other equilibria are not counted.
     - `linearisation`: the `Linearisation` that has these modes.

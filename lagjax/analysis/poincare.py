@@ -43,7 +43,7 @@ class PoincareSection(eqx.Module):
     - `t` (C,): the times of the crossings, `[t]`; NaN beyond the last one. C is `most` of the `lj.Crossing`.
     - `q`, `v`: the states there, each leaf with a leading axis C, padded in the same way; `[q]`, `[q]/[t]`.
     - `count`: how many crossings there were, including those that were not kept.
-    - `uncertain`: whether some may be missing; see `lj.Crossings`.
+    - `uncertain`: whether some may be missing; see `Crossings`.
 
     Crossings are found along the steps: they do not depend on the outputs of the motion. Under `vmap` every array
     has the batch's axes in front.
@@ -212,7 +212,7 @@ def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
     >>> t = jnp.array([0.5, 2.5, 4.75, jnp.nan])
-    >>> print(periods(lj.Crossings(t, q=t, v=t, multipliers={}, count=3, uncertain=False)))
+    >>> print(periods(Crossings(t, q=t, v=t, multipliers={}, count=3, uncertain=False)))
     [2.   2.25  nan]
 
     **Arguments:** `crossings`: `traj.events["apex"]`, or what `lj.poincare` returns. For crossings in both directions

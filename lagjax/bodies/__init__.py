@@ -1,6 +1,16 @@
-"""Rigid bodies in space, joints between them and what acts on them: ordinary terms of a Lagrangian, and constraints."""
+"""Rigid bodies in space, joints between them and what acts on them: ordinary terms of a Lagrangian, and constraints.
 
-from lagjax.bodies.assemble import multibody
+>>> import lagjax as lj
+>>> bob = lj.bodies.Body("bob", mass=1.0, inertia=(0.1, 0.1, 0.1))
+>>> pivot = lj.bodies.spherical(lj.bodies.ground.at(), bob.at((0.0, 0.0, 1.0)))
+>>> pendulum = lj.bodies.multibody([bob], {"pivot": pivot}, [lj.bodies.weight([bob])])
+>>> print(list(pendulum.constraints))
+['bob is turned', 'pivot']
+
+What they look like in pictures is in `lj.shapes`.
+"""
+
+from lagjax.bodies.assemble import multibody, usual_shapes
 from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
 from lagjax.bodies.gears import gear, rack_and_pinion
 from lagjax.bodies.joints import (
@@ -15,45 +25,33 @@ from lagjax.bodies.joints import (
 )
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
 from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body, unit_vector
-from lagjax.bodies.shapes import axis, box, cylinder, disk, line, mesh, rod, sphere, trail, usual_shapes
 from lagjax.bodies.tree import Tree
 from lagjax.bodies.wheels import Surface, rolling, rolling_ellipsoid, rolling_sphere
 
 __all__ = [
     "Body",
-    "Ground",
     "Load",
     "Marker",
     "Pose",
     "Surface",
     "Tree",
     "applied",
-    "box",
-    "cylinder",
     "cylindrical",
-    "disk",
     "fixed",
     "gear",
     "ground",
-    "line",
-    "mesh",
     "motor",
     "multibody",
     "planar",
     "prismatic",
     "rack_and_pinion",
     "revolute",
-    "rod",
     "rolling",
     "rolling_ellipsoid",
     "rolling_sphere",
-    "sphere",
     "spherical",
     "spring",
     "torsion",
-    "trail",
     "universal",
-    "axis",
-    "usual_shapes",
     "weight",
 ]

@@ -7,19 +7,32 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies, floats, kinetic_energy, together
+from lagjax.bodies.body import (
+    Body,
+    Pose,
+    PoseOnTree,
+    SystemFunction,
+    check_bodies,
+    floats,
+    kinetic_energy,
+    together,
+    valued,
+)
 from lagjax.bodies.driven import Driven
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
-from lagjax.bodies.shapes import usual_shapes
-from lagjax.display import Drawing, Shape
+from lagjax.display import CUBE, Anchor, Drawing, Shape
 from lagjax.jaxtools import numpy_of
+from lagjax.shapes import line
 from lagjax.system import Holonomic, Nonholonomic, System
 
 # What else a system may have: arguments of `lj.System` that are passed on.
 OTHERS = ("force", "dissipation", "states", "elements")
+# The least thickness of a body's box beside its length.
+THIN = 0.04
 
 
 def multibody(
@@ -33,21 +46,24 @@ def multibody(
 
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
-    >>> bob = lj.Body("bob", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    >>> bob = lj.bodies.Body("bob", mass=1.0, inertia=(0.1, 0.1, 0.1))
     >>> pendulum = multibody(
-    ...     [bob], {"pivot": lj.spherical(lj.ground.at(), bob.at((0.0, 0.0, 1.0)))}, [lj.weight([bob])]
+    ...     [bob],
+    ...     {"pivot": lj.bodies.spherical(lj.bodies.ground.at(), bob.at((0.0, 0.0, 1.0)))},
+    ...     [lj.bodies.weight([bob])],
     ... )
-    >>> pose = lj.Pose.at((0.0, 0.0, -1.0))
+    >>> pose = lj.bodies.Pose.at((0.0, 0.0, -1.0))
     >>> force = lj.constraint_force(pendulum, 0.0, {"bob": pose}, {"bob": pose.moving()}, None)
     >>> print(round(float(force["pivot"]["bob"].position[2]), 6))
     9.81
 
     **Arguments:**
 
-    - `bodies`: `lj.Body`s of different names; q and v are dicts of `lj.Pose` by these names, without those whose motion
-      is given. That their quaternions are unit ones is a constraint of the system, of the body's name.
-    - `joints`: constraints by name, `lj.spherical(...)` and the like, or written by hand.
-    - `loads`: `lj.weight`, `lj.spring`, `lj.motor`, `lj.applied`.
+    - `bodies`: `lj.bodies.Body`s of different names; q and v are dicts of `lj.bodies.Pose` by these names, without
+      those whose motion is given. That their quaternions are unit ones is a constraint of the system, of the body's
+      name.
+    - `joints`: constraints by name, `lj.bodies.spherical(...)` and the like, or written by hand.
+    - `loads`: `lj.bodies.weight`, `lj.bodies.spring`, `lj.bodies.motor`, `lj.bodies.applied`.
     - `lagrangian`: what L has besides, a function of (t, q, v, params); q may have further entries.
     - `others`: `force`, `dissipation`, `states` and `elements` of `lj.System`.
 
@@ -56,7 +72,7 @@ def multibody(
     **Raises:** `ValueError` for two bodies or constraints of one name; `TypeError` for a body, joint or load that is
     none, and for a keyword that is not among `others`.
     """
-    bodies, loads = check_bodies("lj.multibody", bodies), check_loads("lj.multibody", loads)
+    bodies, loads = check_bodies("lj.bodies.multibody", bodies), check_loads("lj.bodies.multibody", loads)
     _check_joints(joints)
     _check_keywords(others)
     driven, bodies = Driven.among(bodies), tuple(body for body in bodies if body.motion is None)
@@ -85,7 +101,7 @@ class BodiesLagrangian(SystemFunction):
 
     >>> import jax
     >>> import lagjax as lj
-    >>> bob, pose = lj.Body("bob", 2.0, (1.0, 1.0, 1.0)), lj.Pose.at()
+    >>> bob, pose = lj.bodies.Body("bob", 2.0, (1.0, 1.0, 1.0)), lj.bodies.Pose.at()
     >>> free = BodiesLagrangian((bob,), Driven(()), (), None, ())
     >>> print(jax.jit(free)(0.0, {"bob": pose}, {"bob": pose.moving((3.0, 0.0, 0.0))}, None))
     9.0
@@ -131,26 +147,27 @@ def _kinetic(bodies: tuple[Body, ...], q: PyTree, v: PyTree, params: PyTree) -> 
 def _check_pose(body: Body, given: Pose | PoseOnTree):
     if isinstance(given, PoseOnTree):
         raise TypeError(
-            f"the entry '{body.name}' of q and v of lj.multibody must be a lj.Pose, and is that of a lj.Tree, with its "
-            "rotation matrix.\n"
-            "Fix: q = {name: lj.Pose(*pose[:2]) for name, pose in tree.poses(q).items()}, and v in the same way."
+            f"the entry '{body.name}' of q and v of lj.bodies.multibody must be a lj.bodies.Pose, and is that of a "
+            "lj.bodies.Tree, with its rotation matrix.\n"
+            "Fix: q = {name: lj.bodies.Pose(*pose[:2]) for name, pose in tree.poses(q).items()}, and v in the same way."
         )
 
 
 def _check_joints(joints: Mapping | None):
     if not isinstance(joints or {}, Mapping):
         raise TypeError(
-            f"the joints of lj.multibody are a dict by name, and {type(joints).__name__} was given.\n"
-            "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}."
+            f"the joints of lj.bodies.multibody are a dict by name, and {type(joints).__name__} was given.\n"
+            "Fix: {'hinge': lj.bodies.revolute(lj.bodies.ground.at(), door.at())}."
         )
     for name, joint in (joints or {}).items():
         parts = joint.values() if isinstance(joint, Mapping) else (joint,)
         for part in parts:
             if not isinstance(part, Holonomic | Nonholonomic):
                 raise TypeError(
-                    f"joint '{name}' of lj.multibody is no constraint, but {type(part).__name__}.\n"
+                    f"joint '{name}' of lj.bodies.multibody is no constraint, but {type(part).__name__}.\n"
                     "Usual cause: a load among the joints, or a function without its kind.\n"
-                    "Fix: lj.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third argument."
+                    "Fix: lj.bodies.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third "
+                    "argument."
                 )
 
 
@@ -158,6 +175,30 @@ def _check_keywords(others: Mapping):
     unknown = [name for name in others if name not in OTHERS]
     if unknown:
         raise TypeError(
-            f"lj.multibody has no argument '{unknown[0]}'.\n"
+            f"lj.bodies.multibody has no argument '{unknown[0]}'.\n"
             f"Fix: bodies, joints, loads, lagrangian, or one of lj.System's {', '.join(OTHERS)}."
         )
+
+
+def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:
+    """What is drawn of a system if nothing is given: what its functions look like, and bodies as boxes.
+
+    A box of mass m has I_1 = m (b² + c²)/12 and so on, so that a² = 6 (I_2 + I_3 - I_1)/m. A wheel that rolls is a disk
+    instead.
+    """
+    # Several wheels have one surface.
+    found = list(dict.fromkeys(shape for function in functions for shape in getattr(function, "drawing", ())))
+    solid = {shape.owner for shape in found if shape.kind == "solid"}
+    return (*(_equal_box(body, params) for body in bodies if body.name not in solid), *found)
+
+
+def _equal_box(body: Body, params: PyTree) -> Shape:
+    inertia = np.asarray(valued(body.inertia, params), float)
+    moments, axes = (inertia, np.eye(3)) if inertia.ndim == 1 else np.linalg.eigh(inertia)
+    # Columns that are right-handed: a mirrored box would be seen from inside.
+    axes = axes * np.sign(np.linalg.det(axes))
+    edges = np.sqrt(np.maximum(6 * (np.sum(moments) - 2 * moments) / float(valued(body.mass, params)), 0.0))
+    if not edges.max() > 0:
+        return line(body)
+    anchor = Anchor(body.name, (0.0, 0.0, 0.0), tuple(map(tuple, axes.T.tolist())))
+    return Shape("solid", (anchor,), CUBE, tuple(np.maximum(edges, THIN * edges.max()).tolist()))

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.rotation import about, product, rotation_matrix, spin_in_body, spin_in_space, turned, unit_vector
+from lagjax.display import Anchor
 from lagjax.jaxtools import is_traced, numpy_of, to_jax
 from lagjax.system import OF_STATE, Call, Holonomic, check_arguments
 
@@ -84,7 +85,7 @@ class Pose(NamedTuple):
 
 
 class PoseOnTree(NamedTuple):
-    """A pose with its rotation matrix, from which the bodies of a `lj.Tree` take points and velocities.
+    """A pose with its rotation matrix, from which the bodies of a `lj.bodies.Tree` take points and velocities.
 
     As rates it holds those of all three. What is read of it is short: places of bodies of a tree are functions of all
     joints on the way there, of which two derivatives are taken in a contact.
@@ -164,11 +165,11 @@ def check_takes_state(role: str, owner: str, given):
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body in space, whose coordinates are `q[name]`, a `lj.Pose`.
+    """A rigid body in space, whose coordinates are `q[name]`, a `lj.bodies.Pose`.
 
     >>> import lagjax as lj
-    >>> top = lj.Body("top", mass=2.0, inertia=(1.0, 1.0, 0.5))
-    >>> pose = lj.Pose.at((0.0, 0.0, 3.0))
+    >>> top = lj.bodies.Body("top", mass=2.0, inertia=(1.0, 1.0, 0.5))
+    >>> pose = lj.bodies.Pose.at((0.0, 0.0, 3.0))
     >>> q, v = {"top": pose}, {"top": pose.moving(velocity=(1.0, 0.0, 0.0), spin=(0.0, 0.0, 2.0))}
     >>> print(top.kinetic(q, v), top.point(q, (0.0, 1.0, 0.0)))
     2.0 [0. 1. 3.]
@@ -177,11 +178,12 @@ class Body:
     principal moments, if the body's axes are the principal ones, or the symmetric (3, 3) matrix. Both may be functions
     of params.
 
-    Where all of them are zero it is a frame, as between two joints of a `lj.Tree`. `motion`, a function of (t, params)
-    that returns a `lj.Pose`, is for a body that moves as given, a turning table: it has no entry in q, nor mass and
-    inertia, and bodies are joined to it as to any other; in a `lj.Tree` it is one from which others hang.
+    Where all of them are zero it is a frame, as between two joints of a `lj.bodies.Tree`. `motion`, a function of (t,
+    params) that returns a `lj.bodies.Pose`, is for a body that moves as given, a turning table: it has no entry in q,
+    nor mass and inertia, and bodies are joined to it as to any other; in a `lj.bodies.Tree` it is one from which others
+    hang.
 
-    >>> table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
+    >>> table = lj.bodies.Body("table", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t))
 
     **Raises:** `ValueError` for a mass or an inertia that no body has: each principal moment is at most the sum of the
     two others; `TypeError` for numbers that JAX is tracing, which belong into params.
@@ -211,13 +213,18 @@ class Body:
         if not callable(self.mass) and not _is_mass(self.mass, massless):
             raise ValueError(
                 f"the mass of '{self.name}' must be a positive number, and is {self.mass!r}.\n"
-                "Fix: its mass; of a frame in a lj.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)."
+                "Fix: its mass; of a frame in a lj.bodies.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)."
             )
 
     @property
     def unit(self) -> Holonomic:
-        """The constraint |e|² = 1 of its quaternion, which `lj.multibody` puts into the system."""
+        """The constraint |e|² = 1 of its quaternion, which `lj.bodies.multibody` puts into the system."""
         return Holonomic(UnitQuaternion(self))
+
+    @property
+    def anchor(self) -> Anchor:
+        """Its centre of mass and axes, to which shapes hold on."""
+        return Anchor(self.name, (0.0, 0.0, 0.0))
 
     def pose(self, q: PyTree) -> Pose:
         """Where it is."""
@@ -266,7 +273,7 @@ class Body:
         return valued(self.mass, params), self._inertia(params, dtype)
 
     def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
-        """A place on the body for joints and springs: see `lj.Marker`."""
+        """A place on the body for joints and springs: see `lj.bodies.Marker`."""
         return Marker.on(self, point, axis)
 
     def _entry(self, q: PyTree) -> Pose:
@@ -285,9 +292,9 @@ class Body:
             given = f"an array of shape {entry.shape}" if is_array else type(entry).__name__
         if not hasattr(entry, "quaternion"):
             raise TypeError(
-                f"the entry '{self.name}' of q and v must be a lj.Pose, and is {given}.\n"
+                f"the entry '{self.name}' of q and v must be a lj.bodies.Pose, and is {given}.\n"
                 f"Fix: q0 = {{'{self.name}': pose}}, v0 = {{'{self.name}': pose.moving(velocity, spin)}}, with "
-                "pose = lj.Pose.at(position, axis, angle)."
+                "pose = lj.bodies.Pose.at(position, axis, angle)."
             )
         return entry
 
@@ -348,13 +355,20 @@ def kinetic_energy(mass: Float[Array, ""], inertia: Float[Array, "3 3"], pose: P
 
 @dataclass(frozen=True)
 class Ground:
-    """What does not move: joints, springs and wheels hold on to it as to a body. `lj.ground` is the one there is.
+    """What does not move: joints, springs and wheels hold on to it as to a body.
+
+    `lj.bodies.ground` is the one there is.
 
     >>> print(Ground().at((1.0, 0.0, 0.0)).position({}))
     [1. 0. 0.]
     """
 
     name: str = "ground"
+
+    @property
+    def anchor(self) -> Anchor:
+        """The origin and the axes of space, to which shapes hold on."""
+        return Anchor(None, (0.0, 0.0, 0.0))
 
     def pose(self, q: PyTree) -> Pose:
         """The origin."""
@@ -385,7 +399,7 @@ class Ground:
         return jnp.zeros(3, floats(q))
 
     def at(self, point: ArrayLike | Callable = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> "Marker":
-        """A place in space: see `lj.Marker`."""
+        """A place in space: see `lj.bodies.Marker`."""
         return Marker.on(self, point, axis)
 
 
@@ -396,13 +410,13 @@ ground = Ground()
 class Marker:
     """A place on a body, with an axis: what joints join and springs pull. `body.at(point, axis)` makes one.
 
-    `point` is given from the centre of mass along the body's axes (for `lj.ground`, in space), and may be a function of
-    params; `frame` holds three unit vectors of the body, at right angles, of which the last is the axis. The first is
-    the nearest to the body's first coordinate axis, or to its second where the axis lies along the first.
+    `point` is given from the centre of mass along the body's axes (for `lj.bodies.ground`, in space), and may be a
+    function of params; `frame` holds three unit vectors of the body, at right angles, of which the last is the axis.
+    The first is the nearest to the body's first coordinate axis, or to its second where the axis lies along the first.
 
     >>> import lagjax as lj
-    >>> rod = lj.Body("rod", 1.0, (1.0, 1.0, 0.1))
-    >>> end, q = rod.at((0.0, 0.0, 0.5)), {"rod": lj.Pose.at((2.0, 0.0, 0.0), (1.0, 0.0, 0.0), jnp.pi)}
+    >>> rod = lj.bodies.Body("rod", 1.0, (1.0, 1.0, 0.1))
+    >>> end, q = rod.at((0.0, 0.0, 0.5)), {"rod": lj.bodies.Pose.at((2.0, 0.0, 0.0), (1.0, 0.0, 0.0), jnp.pi)}
     >>> print(end.position(q).round(6), end.axis(q).round(6))
     [ 2.  -0.  -0.5] [ 0. -0. -1.]
     """
@@ -428,6 +442,11 @@ class Marker:
             raise ValueError(f"a point of '{body.name}' must be three numbers, not {point}.")
         return cls(body, place, tuple(map(tuple, rows.tolist())))
 
+    @property
+    def anchor(self) -> Anchor:
+        """The place and its axes, to which shapes hold on."""
+        return Anchor(self.body.anchor.body, self.place, self.frame)
+
     def position(self, q: PyTree, params: PyTree = None) -> Float[Array, "3"]:
         """Where it is in space."""
         return self.body.point(q, valued(self.place, params))
@@ -451,7 +470,7 @@ def check_markers(what: str, *given):
         if not isinstance(x, Marker):
             raise TypeError(
                 f"{what}, and {type(x).__name__} is none.\n"
-                "Fix: lj.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
+                "Fix: lj.bodies.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
             )
 
 
@@ -460,7 +479,7 @@ def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
     bodies = tuple(given) if isinstance(given, Iterable) else ()
     if not bodies or not all(isinstance(body, Body) for body in bodies):
         listed = ", ".join(type(body).__name__ for body in bodies) or type(given).__name__
-        raise TypeError(f"{what} takes a list of lj.Body, and was given {listed}.\nFix: {what}([crank, rod]).")
+        raise TypeError(f"{what} takes a list of lj.bodies.Body, and was given {listed}.\nFix: {what}([crank, rod]).")
     return bodies
 
 

@@ -24,7 +24,7 @@ class Driven(NamedTuple):
     """The bodies of a system whose motion is given.
 
     >>> import lagjax as lj
-    >>> table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
+    >>> table = lj.bodies.Body("table", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t))
     >>> q, v = Driven((table,)).placed(2.0, {}, {}, {"rate": 3.0})
     >>> print(table.spin(q, v), Driven(()).placed(2.0, {}, {}, None))
     [0. 0. 3.] ({}, {})
@@ -94,8 +94,8 @@ def _pose(body: Body, t, params: PyTree, dtype) -> Pose:
     pose = body.motion(t, params) if body.motion is not None else None
     if not isinstance(pose, Pose):
         raise TypeError(
-            f"the motion of '{body.name}' must return a lj.Pose, and returned {type(pose).__name__}.\n"
-            f'Fix: lj.Body("{body.name}", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t)).'
+            f"the motion of '{body.name}' must return a lj.bodies.Pose, and returned {type(pose).__name__}.\n"
+            f'Fix: lj.bodies.Body("{body.name}", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t)).'
         )
     position, e = (jnp.asarray(x, dtype) for x in pose)
     return Pose(position, e / jnp.sqrt(jnp.sum(e**2)))

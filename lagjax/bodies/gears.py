@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Body, Ground, Marker, SystemFunction, check_takes_params, ground, valued
 from lagjax.bodies.joints import check_two
-from lagjax.bodies.shapes import axis
 from lagjax.display import Shape
 from lagjax.jaxtools import is_traced
+from lagjax.shapes import axis
 from lagjax.system import Nonholonomic
 
 
@@ -33,9 +33,9 @@ def gear(a: Marker, b: Marker, ratio: ArrayLike | Callable, carrier: Body | Grou
     case of a differential. The rates of a and b are those against it.
 
     >>> import lagjax as lj
-    >>> sun, planet, arm = (lj.Body(name, 1.0, (1.0, 1.0, 1.0)) for name in ("sun", "planet", "arm"))
+    >>> sun, planet, arm = (lj.bodies.Body(name, 1.0, (1.0, 1.0, 1.0)) for name in ("sun", "planet", "arm"))
     >>> mesh = gear(sun.at(), planet.at(), ratio=-20 / 30, carrier=arm)
-    >>> q = {name: lj.Pose.at() for name in ("sun", "planet", "arm")}
+    >>> q = {name: lj.bodies.Pose.at() for name in ("sun", "planet", "arm")}
     >>> v = {name: q[name].moving(spin=(0.0, 0.0, x)) for name, x in {"sun": 5.0, "planet": -4.0, "arm": 1.0}.items()}
     >>> print(mesh.phi(0.0, q, v, None).round(6))
     0.666667
@@ -46,8 +46,8 @@ def gear(a: Marker, b: Marker, ratio: ArrayLike | Callable, carrier: Body | Grou
     **Raises:** `TypeError` unless both are markers and the carrier is a body; `ValueError` for two places on one body,
     a carrier that is one of the two, and a ratio that is 0 or no number.
     """
-    _check_gear("lj.gear", a, b, carrier)
-    _check_number("ratio", "lj.gear", ratio)
+    _check_gear("lj.bodies.gear", a, b, carrier)
+    _check_number("ratio", "lj.bodies.gear", ratio)
     return Nonholonomic(Geared(a, b, ratio, carrier))
 
 
@@ -57,23 +57,23 @@ def rack_and_pinion(
     """Let a rack slide along its axis by `radius` times the angle by which the pinion turns; one equation.
 
     `radius` is a number or a function of params, negative where the rack slides against its axis as the pinion turns
-    about its. Where both axes are parallel this is a screw and its nut, of lead 2π `radius`. `carrier` as in `lj.gear`;
-    the rack may be fixed and the pinion's centre move.
+    about its. Where both axes are parallel this is a screw and its nut, of lead 2π `radius`. `carrier` as in
+    `lj.bodies.gear`; the rack may be fixed and the pinion's centre move.
 
     >>> import lagjax as lj
-    >>> wheel, rail = lj.Body("wheel", 1.0, (1.0, 1.0, 1.0)), lj.ground.at(axis=(1.0, 0.0, 0.0))
+    >>> wheel, rail = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 1.0)), lj.bodies.ground.at(axis=(1.0, 0.0, 0.0))
     >>> mesh = rack_and_pinion(wheel.at(axis=(0.0, 1.0, 0.0)), rail, radius=-0.5)
-    >>> q, still = {"wheel": lj.Pose.at((0.0, 0.0, 0.5))}, lj.Pose.at((0.0, 0.0, 0.5))
+    >>> q, still = {"wheel": lj.bodies.Pose.at((0.0, 0.0, 0.5))}, lj.bodies.Pose.at((0.0, 0.0, 0.5))
     >>> print(mesh.phi(0.0, q, {"wheel": still.moving((2.0, 0.0, 0.0), spin=(0.0, 4.0, 0.0))}, None))
     0.0
 
     **Returns:** a constraint. Its multiplier is the force on the rack along its axis; the torque on the pinion about
     its axis is -`radius` times as large.
 
-    **Raises:** as `lj.gear` does.
+    **Raises:** as `lj.bodies.gear` does.
     """
-    _check_gear("lj.rack_and_pinion", pinion, rack, carrier)
-    _check_number("radius", "lj.rack_and_pinion", radius)
+    _check_gear("lj.bodies.rack_and_pinion", pinion, rack, carrier)
+    _check_number("radius", "lj.bodies.rack_and_pinion", radius)
     return Nonholonomic(Racked(pinion, rack, radius, carrier))
 
 
@@ -82,8 +82,8 @@ class Geared(SystemFunction):
     """By how much a turns faster than `ratio` times b, a function of (t, q, v, params).
 
     >>> import lagjax as lj
-    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 1.0)), lj.Pose.at()
-    >>> mesh = Geared(wheel.at(), lj.ground.at(), 2.0, lj.ground)
+    >>> wheel, pose = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 1.0)), lj.bodies.Pose.at()
+    >>> mesh = Geared(wheel.at(), lj.bodies.ground.at(), 2.0, lj.bodies.ground)
     >>> print(mesh(0.0, {"wheel": pose}, {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}, None))
     3.0
     """
@@ -108,8 +108,8 @@ class Racked(SystemFunction):
     """By how much a rack is faster than its pinion, a function of (t, q, v, params).
 
     >>> import lagjax as lj
-    >>> bar, pose = lj.Body("bar", 1.0, (1.0, 1.0, 1.0)), lj.Pose.at()
-    >>> mesh = Racked(lj.ground.at(), bar.at(), 2.0, lj.ground)
+    >>> bar, pose = lj.bodies.Body("bar", 1.0, (1.0, 1.0, 1.0)), lj.bodies.Pose.at()
+    >>> mesh = Racked(lj.bodies.ground.at(), bar.at(), 2.0, lj.bodies.ground)
     >>> print(mesh(0.0, {"bar": pose}, {"bar": pose.moving((0.0, 0.0, 3.0))}, None))
     3.0
     """
@@ -142,13 +142,14 @@ def _check_gear(whose: str, a: Marker, b: Marker, carrier: Body | Ground):
     if not isinstance(carrier, Body | Ground):
         raise TypeError(
             f"the carrier of {whose} is a body, and {type(carrier).__name__} is none.\n"
-            "Fix: carrier=arm, the lj.Body itself and no place on it; lj.ground, the default, where it does not turn."
+            "Fix: carrier=arm, the lj.bodies.Body itself and no place on it; lj.bodies.ground, the default, where it "
+            "does not turn."
         )
     if isinstance(carrier, Body) and carrier in (a.body, b.body):
         raise ValueError(
             f"the carrier of {whose}, '{carrier.name}', is one of the two bodies, which does not turn against itself.\n"
             "Usual cause: the hinge of the other body was meant.\n"
-            "Fix: the body that holds both hinges; lj.ground, the default, where it does not turn."
+            "Fix: the body that holds both hinges; lj.bodies.ground, the default, where it does not turn."
         )
 
 
@@ -161,5 +162,5 @@ def _check_number(role: str, whose: str, given: ArrayLike | Callable):
         raise ValueError(
             f"the {role} of {whose} must be a number that is not 0, and is {given}.\n"
             "Usual cause: numbers of teeth divided as whole numbers, 20 // 60.\n"
-            f"Fix: {role}=-60 / 20; a body that does not turn is held by lj.fixed or lj.prismatic."
+            f"Fix: {role}=-60 / 20; a body that does not turn is held by lj.bodies.fixed or lj.bodies.prismatic."
         )

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Ground, Marker, check_markers
-from lagjax.bodies.shapes import axis, gap, line
 from lagjax.display import Shape
+from lagjax.shapes import axis, gap, line
 from lagjax.system import Holonomic, Nonholonomic
 
 
@@ -30,9 +30,9 @@ def spherical(a: Marker, b: Marker) -> Holonomic:
     """Hold two points together, as a ball in its socket: three equations.
 
     >>> import lagjax as lj
-    >>> bob = lj.Body("bob", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"bob": lj.Pose.at((0.1, 0.0, -1.0))}
-    >>> joint = spherical(lj.ground.at(), bob.at((0.0, 0.0, 1.0)))
+    >>> bob = lj.bodies.Body("bob", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"bob": lj.bodies.Pose.at((0.1, 0.0, -1.0))}
+    >>> joint = spherical(lj.bodies.ground.at(), bob.at((0.0, 0.0, 1.0)))
     >>> print(joint.g(0.0, q, None))
     [0.1 0.  0. ]
 
@@ -47,9 +47,9 @@ def revolute(a: Marker, b: Marker) -> Holonomic:
     """Hold two points and two axes together, as a hinge: five equations.
 
     >>> import lagjax as lj
-    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"door": lj.Pose.at((-0.5, 0.0, 0.1))}
-    >>> joint = revolute(lj.ground.at(), door.at((0.5, 0.0, 0.0)))
+    >>> door = lj.bodies.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"door": lj.bodies.Pose.at((-0.5, 0.0, 0.1))}
+    >>> joint = revolute(lj.bodies.ground.at(), door.at((0.5, 0.0, 0.0)))
     >>> print(joint.g(0.0, q, None))
     [0.  0.  0.1 0.  0. ]
 
@@ -64,9 +64,9 @@ def universal(a: Marker, b: Marker) -> Holonomic:
     """Hold two points together and two axes at right angles, those of the cross of a Cardan joint: four equations.
 
     >>> import lagjax as lj
-    >>> shaft = lj.Body("shaft", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"shaft": lj.Pose.at((0.0, 0.0, 1.0))}
-    >>> joint = universal(lj.ground.at(), shaft.at((0.0, 0.0, -1.0), axis=(1.0, 0.0, 0.0)))
+    >>> shaft = lj.bodies.Body("shaft", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"shaft": lj.bodies.Pose.at((0.0, 0.0, 1.0))}
+    >>> joint = universal(lj.bodies.ground.at(), shaft.at((0.0, 0.0, -1.0), axis=(1.0, 0.0, 0.0)))
     >>> print(joint.g(0.0, q, None))
     [0. 0. 0. 0.]
 
@@ -81,9 +81,9 @@ def cylindrical(a: Marker, b: Marker) -> Holonomic:
     """Hold two axes together, along which and about which the bodies move: two equations for points, two for axes.
 
     >>> import lagjax as lj
-    >>> ring = lj.Body("ring", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"ring": lj.Pose.at((0.2, 0.0, 3.0))}
-    >>> joint = cylindrical(lj.ground.at(), ring.at())
+    >>> ring = lj.bodies.Body("ring", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"ring": lj.bodies.Pose.at((0.2, 0.0, 3.0))}
+    >>> joint = cylindrical(lj.bodies.ground.at(), ring.at())
     >>> print(joint.g(0.0, q, None))
     [0.2 0.  0.  0. ]
 
@@ -98,9 +98,9 @@ def prismatic(a: Marker, b: Marker) -> Holonomic:
     """Let a body slide along the other's axis without turning, the markers' frames alike: five equations.
 
     >>> import lagjax as lj
-    >>> slider = lj.Body("slider", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"slider": lj.Pose.at((0.2, 0.0, 3.0))}
-    >>> joint = prismatic(lj.ground.at(), slider.at())
+    >>> slider = lj.bodies.Body("slider", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"slider": lj.bodies.Pose.at((0.2, 0.0, 3.0))}
+    >>> joint = prismatic(lj.bodies.ground.at(), slider.at())
     >>> print(joint.g(0.0, q, None))
     [0.2 0.  0.  0.  0. ]
 
@@ -115,9 +115,9 @@ def planar(a: Marker, b: Marker) -> Holonomic:
     """Hold a point in the plane at right angles to an axis, and the axes together: a plate on a table, three equations.
 
     >>> import lagjax as lj
-    >>> plate = lj.Body("plate", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"plate": lj.Pose.at((0.2, 0.5, 0.1), angle=1.0)}
-    >>> joint = planar(lj.ground.at(), plate.at())
+    >>> plate = lj.bodies.Body("plate", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"plate": lj.bodies.Pose.at((0.2, 0.5, 0.1), angle=1.0)}
+    >>> joint = planar(lj.bodies.ground.at(), plate.at())
     >>> print(joint.g(0.0, q, None))
     [0.1 0.  0. ]
 
@@ -132,9 +132,9 @@ def fixed(a: Marker, b: Marker) -> Holonomic:
     """Make two bodies one, their markers' points and frames alike: six equations.
 
     >>> import lagjax as lj
-    >>> lid = lj.Body("lid", 1.0, (1.0, 1.0, 1.0))
-    >>> q = {"lid": lj.Pose.at((0.0, 0.0, 1.0), angle=0.1)}
-    >>> joint = fixed(lj.ground.at((0.0, 0.0, 1.0)), lid.at())
+    >>> lid = lj.bodies.Body("lid", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"lid": lj.bodies.Pose.at((0.0, 0.0, 1.0), angle=0.1)}
+    >>> joint = fixed(lj.bodies.ground.at((0.0, 0.0, 1.0)), lid.at())
     >>> print(joint.g(0.0, q, None).round(4))
     [0.     0.     0.     0.     0.     0.0998]
 
@@ -186,8 +186,9 @@ class Joined:
     """The rows of a joint between two markers, as a function of (t, q, params).
 
     >>> import lagjax as lj
-    >>> bob = lj.Body("bob", 1.0, (1.0, 1.0, 1.0))
-    >>> Joined(lj.ground.at(), bob.at(), (apart,))(0.0, {"bob": lj.Pose.at((0.0, 0.5, 0.0))}, None).tolist()
+    >>> bob = lj.bodies.Body("bob", 1.0, (1.0, 1.0, 1.0))
+    >>> q = {"bob": lj.bodies.Pose.at((0.0, 0.5, 0.0))}
+    >>> Joined(lj.bodies.ground.at(), bob.at(), (apart,))(0.0, q, None).tolist()
     [0.0, 0.5, 0.0]
     """
 
@@ -219,5 +220,5 @@ def check_two(a: Marker, b: Marker):
         raise ValueError(
             f"a joint joins two bodies, and both places are on '{a.body.name}'.\n"
             "Usual cause: a name that was copied.\n"
-            "Fix: one of the places on the other body, or on lj.ground."
+            "Fix: one of the places on the other body, or on lj.bodies.ground."
         )

@@ -23,9 +23,9 @@ from lagjax.bodies.body import (
     check_takes_state,
     valued,
 )
-from lagjax.bodies.shapes import line
 from lagjax.display import Shape
 from lagjax.jaxtools import numpy_of
+from lagjax.shapes import line
 
 
 class Load(NamedTuple):
@@ -47,14 +47,14 @@ def weight(bodies: Iterable[Body], g: ArrayLike | Callable = (0.0, 0.0, -9.81)) 
     """The weight of bodies in a uniform field `g`, `[length]/[t]²`, (3,) numbers or a function of params.
 
     >>> import lagjax as lj
-    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
-    >>> print(weight([stone]).potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
+    >>> stone = lj.bodies.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> print(weight([stone]).potential(0.0, {"stone": lj.bodies.Pose.at((0.0, 0.0, 3.0))}, None, None))
     58.86
 
     **Raises:** `TypeError` unless `bodies` is a list of them and `g` takes params if it is a function.
     """
-    check_quantity("the field g", "lj.weight", g, (3,))
-    return Load(Weight(check_bodies("lj.weight", bodies), g))
+    check_quantity("the field g", "lj.bodies.weight", g, (3,))
+    return Load(Weight(check_bodies("lj.bodies.weight", bodies), g))
 
 
 class Weight(NamedTuple):
@@ -86,16 +86,16 @@ def spring(
     meet, without a damper.
 
     >>> import lagjax as lj
-    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
-    >>> pull = spring(lj.ground.at(), stone.at(), stiffness=lambda params: params["k"], length=1.0)
-    >>> print(pull.potential(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, {"k": 10.0}))
+    >>> stone = lj.bodies.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> pull = spring(lj.bodies.ground.at(), stone.at(), stiffness=lambda params: params["k"], length=1.0)
+    >>> print(pull.potential(0.0, {"stone": lj.bodies.Pose.at((0.0, 0.0, 3.0))}, None, {"k": 10.0}))
     20.0
 
     **Raises:** `TypeError` unless both are markers, and for a function of anything but params.
     """
     check_markers("a spring is held at two places on bodies", a, b)
     for role, given in {"stiffness": stiffness, "length": length, "damping": damping}.items():
-        check_quantity(f"the {role}", "lj.spring", given)
+        check_quantity(f"the {role}", "lj.bodies.spring", given)
 
     pull = Spring(a, b, stiffness, length, damping)
     return Load(pull, None if _is_zero(damping) else pull.dissipation)
@@ -106,9 +106,9 @@ class Spring(SystemFunction):
     """The potential energy of a spring between two points, a function of (t, q, v, params); `dissipation` another one.
 
     >>> import lagjax as lj
-    >>> stone = lj.Body("stone", 2.0, (1.0, 1.0, 1.0))
-    >>> pull = Spring(lj.ground.at(), stone.at(), 10.0, 1.0, 0.0)
-    >>> print(pull(0.0, {"stone": lj.Pose.at((0.0, 0.0, 3.0))}, None, None))
+    >>> stone = lj.bodies.Body("stone", 2.0, (1.0, 1.0, 1.0))
+    >>> pull = Spring(lj.bodies.ground.at(), stone.at(), 10.0, 1.0, 0.0)
+    >>> print(pull(0.0, {"stone": lj.bodies.Pose.at((0.0, 0.0, 3.0))}, None, None))
     20.0
     """
 
@@ -148,21 +148,21 @@ def torsion(
 
         V = ½ k (θ - α)²,      R = ½ c (n·(Ω_b - Ω_a))²
 
-    θ is the angle about a's axis n from the first vector of a's frame to that of b's (`lj.Marker`), between -π and π:
-    the spring of a hinge that turns further than that is one of a coordinate of its own. `stiffness` k, `angle` α
-    without load and `damping` c are numbers or functions of params.
+    θ is the angle about a's axis n from the first vector of a's frame to that of b's (`lj.bodies.Marker`), between -π
+    and π: the spring of a hinge that turns further than that is one of a coordinate of its own. `stiffness` k, `angle`
+    α without load and `damping` c are numbers or functions of params.
 
     >>> import lagjax as lj
-    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
-    >>> closer = torsion(lj.ground.at(), door.at(), stiffness=3.0, angle=0.5)
-    >>> print(closer.potential(0.0, {"door": lj.Pose.at(angle=2.5)}, None, None))
+    >>> door = lj.bodies.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> closer = torsion(lj.bodies.ground.at(), door.at(), stiffness=3.0, angle=0.5)
+    >>> print(closer.potential(0.0, {"door": lj.bodies.Pose.at(angle=2.5)}, None, None))
     6.0
 
     **Raises:** `TypeError` unless both are markers, and for a function of anything but params.
     """
     check_markers("a spring is held at two places on bodies", a, b)
     for role, given in {"stiffness": stiffness, "angle": angle, "damping": damping}.items():
-        check_quantity(f"the {role}", "lj.torsion", given)
+        check_quantity(f"the {role}", "lj.bodies.torsion", given)
 
     turns = Torsion(a, b, stiffness, angle, damping)
     return Load(turns, None if _is_zero(damping) else turns.dissipation)
@@ -173,9 +173,9 @@ class Torsion(SystemFunction):
     """The potential energy of a spring about an axis, a function of (t, q, v, params); `dissipation` another one.
 
     >>> import lagjax as lj
-    >>> door = lj.Body("door", 1.0, (1.0, 1.0, 1.0))
-    >>> closer = Torsion(lj.ground.at(), door.at(), 3.0, 0.5, 0.0)
-    >>> print(closer(0.0, {"door": lj.Pose.at(angle=2.5)}, None, None))
+    >>> door = lj.bodies.Body("door", 1.0, (1.0, 1.0, 1.0))
+    >>> closer = Torsion(lj.bodies.ground.at(), door.at(), 3.0, 0.5, 0.0)
+    >>> print(closer(0.0, {"door": lj.bodies.Pose.at(angle=2.5)}, None, None))
     6.0
     """
 
@@ -200,15 +200,15 @@ def motor(a: Marker, b: Marker, torque: ArrayLike | Callable) -> Load:
     """A torque from body a on body b about the axis of a: a number, or a function of (t, q, v, params).
 
     >>> import lagjax as lj
-    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> wheel, pose = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.bodies.Pose.at()
     >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
-    >>> print(motor(lj.ground.at(), wheel.at(), 5.0).power(0.0, {"wheel": pose}, turning, turning, None))
+    >>> print(motor(lj.bodies.ground.at(), wheel.at(), 5.0).power(0.0, {"wheel": pose}, turning, turning, None))
     15.0
 
     **Raises:** `TypeError` unless both are markers, and for a function of anything but the state.
     """
     check_markers("a motor is held at two places on bodies", a, b)
-    check_takes_state("torque", "lj.motor", torque)
+    check_takes_state("torque", "lj.bodies.motor", torque)
 
     return Load(power=TurningPower(a, b, torque))
 
@@ -218,9 +218,9 @@ class TurningPower(SystemFunction):
     """The power of a torque about the axis of a, a function of (t, q, w, v, params).
 
     >>> import lagjax as lj
-    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> wheel, pose = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.bodies.Pose.at()
     >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
-    >>> print(TurningPower(lj.ground.at(), wheel.at(), 5.0)(0.0, {"wheel": pose}, turning, turning, None))
+    >>> print(TurningPower(lj.bodies.ground.at(), wheel.at(), 5.0)(0.0, {"wheel": pose}, turning, turning, None))
     15.0
     """
 
@@ -242,7 +242,7 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     """A force in space on a point of a body: (3,) numbers, or a function of (t, q, v, params).
 
     >>> import lagjax as lj
-    >>> wheel, pose = lj.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> wheel, pose = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 2.0)), lj.bodies.Pose.at()
     >>> turning = {"wheel": pose.moving(spin=(0.0, 0.0, 3.0))}
     >>> rim = wheel.at((1.0, 0.0, 0.0))
     >>> print(applied(rim, (0.0, 2.0, 0.0)).power(0.0, {"wheel": pose}, turning, turning, None))
@@ -251,7 +251,7 @@ def applied(at: Marker, force: ArrayLike | Callable) -> Load:
     **Raises:** `TypeError` unless `at` is a marker, and for a function of anything but the state.
     """
     check_markers("a force acts at a place on a body", at)
-    check_takes_state("force", "lj.applied", force)
+    check_takes_state("force", "lj.bodies.applied", force)
 
     return Load(power=PointPower(at, force))
 
@@ -261,7 +261,7 @@ class PointPower(SystemFunction):
     """The power of a force on a point, a function of (t, q, w, v, params).
 
     >>> import lagjax as lj
-    >>> cart, pose = lj.Body("cart", 1.0, (1.0, 1.0, 2.0)), lj.Pose.at()
+    >>> cart, pose = lj.bodies.Body("cart", 1.0, (1.0, 1.0, 2.0)), lj.bodies.Pose.at()
     >>> moving = {"cart": pose.moving((0.0, 3.0, 0.0))}
     >>> print(PointPower(cart.at(), (0.0, 2.0, 0.0))(0.0, {"cart": pose}, moving, moving, None))
     6.0
@@ -339,14 +339,16 @@ class Losing(SystemFunction):
 def check_loads(whose: str, loads: Iterable[Load]) -> tuple[Load, ...]:
     """The loads as a tuple; a `TypeError` in the name of `whose` unless they are a list of some."""
     if isinstance(loads, Load):
-        raise TypeError(f"the loads of {whose} are a list, and one load was given.\nFix: loads=[lj.weight([rod])].")
+        raise TypeError(
+            f"the loads of {whose} are a list, and one load was given.\nFix: loads=[lj.bodies.weight([rod])]."
+        )
     loads = tuple(loads)
     for i, load in enumerate(loads):
         if not isinstance(load, Load):
             raise TypeError(
-                f"load {i} of {whose} is no lj.Load, but {type(load).__name__}.\n"
+                f"load {i} of {whose} is no lj.bodies.Load, but {type(load).__name__}.\n"
                 "Usual cause: a function of (t, q, v, params) by itself, or a joint among the loads.\n"
-                "Fix: lj.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
+                "Fix: lj.bodies.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
             )
     return loads
 

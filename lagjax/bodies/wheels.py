@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.bodies.body import Ground, Marker, SystemFunction, check_quantity, ground, valued
 from lagjax.bodies.contact_point import Touch, below, on_plane, searched
 from lagjax.bodies.joints import check_two
-from lagjax.bodies.shapes import disk, ellipsoid, level, sphere
 from lagjax.display import Shape
+from lagjax.shapes import disk, ellipsoid, level, sphere
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
 # By how much the slope of a distance may differ from one.
@@ -35,20 +35,21 @@ class Surface:
     >>> import jax
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
-    >>> bowl = lj.Surface(lambda r, params: params["radius"] ** 2 - jnp.sum(r**2))
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> contact = lj.rolling_sphere(ball.at(), bowl, radius=1.0)
-    >>> print(jax.jit(contact["touches"].g)(0.0, {"ball": lj.Pose.at((0.0, 0.0, -3.5))}, {"radius": 5.0}).round(6))
+    >>> bowl = lj.bodies.Surface(lambda r, params: params["radius"] ** 2 - jnp.sum(r**2))
+    >>> ball = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> contact = lj.bodies.rolling_sphere(ball.at(), bowl, radius=1.0)
+    >>> q = {"ball": lj.bodies.Pose.at((0.0, 0.0, -3.5))}
+    >>> print(jax.jit(contact["touches"].g)(0.0, q, {"radius": 5.0}).round(6))
     0.527778
 
     **Arguments:** `f`, a function of (r, params) with r (3,) a point; twice differentiable, of any unit, its gradient
     not zero near the surface nor at the centre of what rolls. `on`: the marker in whose frame r is, on a body that may
-    move, or `lj.ground`. `is_distance`: whether f is the distance to the surface, |∇f| = 1. A ball then touches
+    move, or `lj.bodies.ground`. `is_distance`: whether f is the distance to the surface, |∇f| = 1. A ball then touches
     straight below its centre, and nothing is searched, which compiles in half the time.
 
-    >>> pipe = lj.Surface(lambda r, params: 5.0 - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
-    >>> contact = lj.rolling_sphere(ball.at(), pipe, radius=1.0)
-    >>> print(jax.jit(contact["touches"].g)(0.0, {"ball": lj.Pose.at((0.0, 3.5, 0.0))}, None))
+    >>> pipe = lj.bodies.Surface(lambda r, params: 5.0 - jnp.sqrt(r[0] ** 2 + r[1] ** 2), is_distance=True)
+    >>> contact = lj.bodies.rolling_sphere(ball.at(), pipe, radius=1.0)
+    >>> print(jax.jit(contact["touches"].g)(0.0, {"ball": lj.bodies.Pose.at((0.0, 3.5, 0.0))}, None))
     0.5
 
     What rolls must be less curved inward than the surface, so that it touches in one point: a ball in a bowl is smaller
@@ -66,16 +67,16 @@ class Surface:
     def __post_init__(self):
         if not callable(self.f):
             raise TypeError(
-                f"a lj.Surface takes a function f(r, params), not {type(self.f).__name__}.\n"
-                "Fix: lj.Surface(lambda r, params: r[2] - r[0] ** 2)."
+                f"a lj.bodies.Surface takes a function f(r, params), not {type(self.f).__name__}.\n"
+                "Fix: lj.bodies.Surface(lambda r, params: r[2] - r[0] ** 2)."
             )
-        check_arguments(Call("f", self.f, ("r", "params"), " of lj.Surface"), "x, y and z as three arguments")
+        check_arguments(Call("f", self.f, ("r", "params"), " of lj.bodies.Surface"), "x, y and z as three arguments")
         if isinstance(self.on, Ground):
             object.__setattr__(self, "on", self.on.at())
         if not isinstance(self.on, Marker):
             raise TypeError(
-                f"a lj.Surface is on a marker, and {type(self.on).__name__} is none.\n"
-                "Fix: lj.Surface(f, on=table.at())."
+                f"a lj.bodies.Surface is on a marker, and {type(self.on).__name__} is none.\n"
+                "Fix: lj.bodies.Surface(f, on=table.at())."
             )
 
     @cached_property
@@ -87,9 +88,9 @@ class Surface:
 def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holonomic | Nonholonomic]:
     """Let the rim of a thin wheel roll without slipping: one equation for positions, two for velocities.
 
-    `wheel` is its centre and its axis, `floor` a point of a plane and the normal, or a `lj.Surface`, `radius` a number
-    or a function of params. On a plane the rim's lowest point lies from the centre along d, the part of the normal at
-    right angles to the axis a:
+    `wheel` is its centre and its axis, `floor` a point of a plane and the normal, or a `lj.bodies.Surface`, `radius` a
+    number or a function of params. On a plane the rim's lowest point lies from the centre along d, the part of the
+    normal at right angles to the axis a:
 
         d = n - (n·a) a,      g = (c - p)·n - R |d|,      phi = (velocity of the wheel - that of the floor, there)
 
@@ -97,10 +98,10 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
     by Newton's method from there, and g = f/|∇f|, a length.
 
     >>> import lagjax as lj
-    >>> wheel = lj.Body("wheel", 1.0, (1.0, 2.0, 1.0))
-    >>> upright = lj.Pose.at((0.0, 0.0, 0.5))
+    >>> wheel = lj.bodies.Body("wheel", 1.0, (1.0, 2.0, 1.0))
+    >>> upright = lj.bodies.Pose.at((0.0, 0.0, 0.5))
     >>> q, v = {"wheel": upright}, {"wheel": upright.moving((2.0, 0.0, 0.0), spin=(0.0, 4.0, 0.0))}
-    >>> contact = rolling(wheel.at(axis=(0.0, 1.0, 0.0)), lj.ground.at(), radius=0.5)
+    >>> contact = rolling(wheel.at(axis=(0.0, 1.0, 0.0)), lj.bodies.ground.at(), radius=0.5)
     >>> print(contact["touches"].g(0.0, q, None), contact["rolls"].phi(0.0, q, v, None))
     0.0 [0. 0.]
 
@@ -110,22 +111,22 @@ def rolling(wheel: Marker, floor: "Marker | Surface", radius) -> dict[str, Holon
 
     Source: Bloch, *Nonholonomic Mechanics and Control*, §1.4 (the rolling disk).
     """
-    check_quantity("the radius", "lj.rolling", radius, above_zero=True)
+    check_quantity("the radius", "lj.bodies.rolling", radius, above_zero=True)
     return _contact(Touching(wheel, floor, "rim", radius))
 
 
 def rolling_sphere(ball: Marker, floor: "Marker | Surface", radius) -> dict[str, Holonomic | Nonholonomic]:
-    """Let a sphere roll without slipping; `ball` is its centre, the rest as in `lj.rolling`.
+    """Let a sphere roll without slipping; `ball` is its centre, the rest as in `lj.bodies.rolling`.
 
     >>> import lagjax as lj
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> contact = rolling_sphere(ball.at(), lj.ground.at(), radius=1.0)
-    >>> print(contact["touches"].g(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
+    >>> ball = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> contact = rolling_sphere(ball.at(), lj.bodies.ground.at(), radius=1.0)
+    >>> print(contact["touches"].g(0.0, {"ball": lj.bodies.Pose.at((3.0, 0.0, 1.25))}, None))
     0.25
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body.
     """
-    check_quantity("the radius", "lj.rolling_sphere", radius, above_zero=True)
+    check_quantity("the radius", "lj.bodies.rolling_sphere", radius, above_zero=True)
     return _contact(Touching(ball, floor, "sphere", radius))
 
 
@@ -133,19 +134,19 @@ def rolling_ellipsoid(stone: Marker, floor: "Marker | Surface", half_axes: Seque
     """Let an ellipsoid roll without slipping, as a rattleback does.
 
     `stone` is its centre, and the axes of its shape, which may be turned against the principal axes of inertia;
-    `half_axes` three numbers or functions of params, along these axes; the rest as in `lj.rolling`. On a plane with
-    normal n it touches at
+    `half_axes` three numbers or functions of params, along these axes; the rest as in `lj.bodies.rolling`. On a plane
+    with normal n it touches at
 
         c - S² n / |S n|,      S² = Σ s_i² e_i e_iᵀ
 
     >>> import lagjax as lj
-    >>> stone = lj.Body("stone", 1.0, (2.0, 16.0, 17.0))
-    >>> contact = rolling_ellipsoid(stone.at(), lj.ground.at(), (2.0, 0.3, 0.2))
-    >>> on_its_end = lj.Pose.at((0.0, 0.0, 2.25), (0.0, 1.0, 0.0), jnp.pi / 2)
+    >>> stone = lj.bodies.Body("stone", 1.0, (2.0, 16.0, 17.0))
+    >>> contact = rolling_ellipsoid(stone.at(), lj.bodies.ground.at(), (2.0, 0.3, 0.2))
+    >>> on_its_end = lj.bodies.Pose.at((0.0, 0.0, 2.25), (0.0, 1.0, 0.0), jnp.pi / 2)
     >>> print(contact["touches"].g(0.0, {"stone": on_its_end}, None).round(12))
     0.25
 
-    **Returns:** as `lj.rolling`.
+    **Returns:** as `lj.bodies.rolling`.
 
     **Raises:** `TypeError` unless both are markers; `ValueError` for two places on one body, and unless there are three
     half axes.
@@ -154,11 +155,12 @@ def rolling_ellipsoid(stone: Marker, floor: "Marker | Surface", half_axes: Seque
     """
     if np.shape(half_axes) != (3,):
         raise ValueError(
-            f"lj.rolling_ellipsoid takes three half axes, and was given {half_axes!r}.\n"
-            "Usual cause: one radius.\nFix: (a, b, c) along the axes of the marker; lj.rolling_sphere for a sphere."
+            f"lj.bodies.rolling_ellipsoid takes three half axes, and was given {half_axes!r}.\n"
+            "Usual cause: one radius.\n"
+            "Fix: (a, b, c) along the axes of the marker; lj.bodies.rolling_sphere for a sphere."
         )
     for half_axis in half_axes:
-        check_quantity("a half axis", "lj.rolling_ellipsoid", half_axis, above_zero=True)
+        check_quantity("a half axis", "lj.bodies.rolling_ellipsoid", half_axis, above_zero=True)
     return _contact(Touching(stone, floor, "ellipsoid", tuple(half_axes)))
 
 
@@ -174,8 +176,9 @@ class Touching(SystemFunction):
     `form`: "rim", "sphere" or "ellipsoid", of which `size` is the radius, or the half axes.
 
     >>> import lagjax as lj
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> print(Touching(ball.at(), lj.ground.at(), "sphere", 1.0)(0.0, {"ball": lj.Pose.at((3.0, 0.0, 1.25))}, None))
+    >>> ball = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> q = {"ball": lj.bodies.Pose.at((3.0, 0.0, 1.25))}
+    >>> print(Touching(ball.at(), lj.bodies.ground.at(), "sphere", 1.0)(0.0, q, None))
     0.25
     """
 

@@ -195,9 +195,9 @@ class Still:
     In space it can be turned, moved and zoomed in a notebook and on the page that `save("arm.html")` writes.
 
     >>> import lagjax as lj
-    >>> arm = lj.Body("arm", 1.0, (0.1, 0.1, 0.01))
-    >>> pivot = lj.spherical(lj.ground.at(), arm.at((0.0, 0.0, 0.5)))
-    >>> print(lj.draw(lj.multibody([arm], {"pivot": pivot}), {"arm": lj.Pose.at((0.0, 0.0, -0.7))}))
+    >>> arm = lj.bodies.Body("arm", 1.0, (0.1, 0.1, 0.01))
+    >>> pivot = lj.bodies.spherical(lj.bodies.ground.at(), arm.at((0.0, 0.0, 0.5)))
+    >>> print(lj.draw(lj.bodies.multibody([arm], {"pivot": pivot}), {"arm": lj.bodies.Pose.at((0.0, 0.0, -0.7))}))
     Picture of 'arm': turns in a notebook, and with .save("picture.html") in a browser; .figure() is for papers
       apart: 'arm' from the ground by 0.2
 

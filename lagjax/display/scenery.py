@@ -234,8 +234,7 @@ class Anchor(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Something to draw that moves with bodies: `lj.box`, `lj.cylinder`, `lj.sphere`, `lj.disk`, `lj.mesh`, `lj.rod`,
-    `lj.line` and `lj.trail` make them.
+    """Something to draw that moves with bodies: `lj.shapes.box` and its like make them.
 
     - `kind`: "solid" at one anchor; "rod", a solid from one to another; "line" through two or more; "dot" or "trail" at
       one; "level", the surface on which `level` vanishes, in one's frame. "mark", a line in front of everything. Of
@@ -245,8 +244,8 @@ class Shape:
     - `level`: `level(points, params)`, (n, 3) -> (n,).
 
     >>> import lagjax as lj
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> print(lj.sphere(ball, radius=0.5))
+    >>> ball = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> print(lj.shapes.sphere(ball, radius=0.5))
     Shape(a solid on 'ball')
     """
 
@@ -291,7 +290,7 @@ def poses_in_q(t: Any, q: PyTree, params: PyTree) -> Any:
 class Drawing(NamedTuple):
     """What is drawn of a motion: shapes, and where the bodies are that carry them.
 
-    - `shapes`: `lj.box(...)` and the like, or a function of params that gives them. Functions
+    - `shapes`: `lj.shapes.box(...)` and the like, or a function of params that gives them. Functions
       `positions(t, q, params)` may be among them.
     - `poses`: `poses(t, q, params)` -> by the names of bodies, the centre of mass (3,) and the unit quaternion
       (w, x, y, z); by default they are the entries of q.
@@ -300,10 +299,10 @@ class Drawing(NamedTuple):
 
     >>> import lagjax as lj
     >>> import jax.numpy as jnp
-    >>> arm = lj.Body("arm", 1.0, (0.1, 0.1, 0.01))
+    >>> arm = lj.bodies.Body("arm", 1.0, (0.1, 0.1, 0.01))
     >>> def poses(t, q, params):
-    ...     return {"arm": lj.Pose.at((0.0, 0.0, -0.5)).turned((1.0, 0.0, 0.0), q)}
-    >>> Drawing([lj.box(arm, (0.1, 0.1, 1.0))], poses).shapes
+    ...     return {"arm": lj.bodies.Pose.at((0.0, 0.0, -0.5)).turned((1.0, 0.0, 0.0), q)}
+    >>> Drawing([lj.shapes.box(arm, (0.1, 0.1, 1.0))], poses).shapes
     [Shape(a solid on 'arm')]
     """
 

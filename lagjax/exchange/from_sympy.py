@@ -7,9 +7,9 @@ A coordinate is a function of time, `dynamicsymbols("theta")` or `Function("thet
 SymPy uses two signs of multipliers. In the equations of its `LagrangesMethod` and from `solve_multipliers` they push
 along -∂g/∂q; the last unknowns of `mass_matrix_full` and `rhs()` push along +∂g/∂q, like all multipliers here.
 
-An expression becomes the source text of a JAX function. A `System` from SymPy contains this text: it can be read,
-compared, copied and pickled, and Python compiles it at its first call. Common subexpressions are computed once. Integer
-powers stay integers: JAX computes them, and their derivatives, by products.
+An expression becomes the source text of a JAX function, by SymPy's own printer for JAX. A `System` from SymPy contains
+this text: it can be read, compared, copied and pickled, and Python compiles it at its first call. Common subexpressions
+are computed once. Integer powers stay integers: JAX computes them, and their derivatives, by products.
 
 A `Piecewise` becomes `jnp.where`, which computes every branch. JAX's reverse mode multiplies the slope of a branch that
 is not taken by zero, and zero times an infinite slope or NaN is NaN: for example (-x)**1.5 for x < 0, 0 for x > 0.
@@ -24,7 +24,7 @@ from contextlib import suppress
 from functools import reduce
 from importlib import import_module
 from itertools import count
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,27 +34,16 @@ from lagjax.jaxtools import once
 from lagjax.mechanics import listed
 from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System
 
-# JAX's functions by SymPy's names, including those of two arguments.
+# JAX's functions by SymPy's names, where SymPy's printer for JAX has none.
 FUNCTIONS = {
-    **{name: f"jnp.{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},
-    **{f"a{name}": f"jnp.arc{name}" for name in ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")},
-    **{"Abs": "jnp.abs", "ceiling": "jnp.ceil", "Mod": "jnp.mod", "Heaviside": "jnp.heaviside", "hypot": "jnp.hypot"},
-    **{name: f"jnp.{name}" for name in ("exp2", "expm1", "log1p", "log2", "log10")},
-    **{"erf": "jax.scipy.special.erf", "erfc": "jax.scipy.special.erfc", "gamma": "jax.scipy.special.gamma"},
-    **{"loggamma": "jax.scipy.special.gammaln", "digamma": "jax.scipy.special.digamma"},
+    **{name: f"jax.scipy.special.{name}" for name in ("erf", "erfc", "gamma")},
+    **{"loggamma": "jax.scipy.special.gammaln", "Abs": "jnp.abs", "Heaviside": "jnp.heaviside"},
 }  # fmt: skip
 # Functions without a value or a slope at some numbers, but with both at one half.
-DELICATE = ("log", "asin", "acos", "atanh", "log2", "log10", "log1p", "gamma", "loggamma", "digamma")
-# SymPy's nodes as text in JAX, and those that are functions of two arguments, applied one after the other. The only
-# undefined function left is `harmless`.
-TEMPLATES = {
-    "Not": "jnp.logical_not({})", "BooleanTrue": "True", "BooleanFalse": "False", "Infinity": "jnp.inf",
-    "NegativeInfinity": "(-jnp.inf)", "AppliedUndef": "jnp.where({1}, {0}, 0.5)", "frac": "jnp.mod({}, 1)",
-}  # fmt: skip
-PAIRWISE = {
-    "Max": "jnp.maximum({}, {})", "Min": "jnp.minimum({}, {})", "And": "jnp.logical_and({}, {})",
-    "Or": "jnp.logical_or({}, {})",
-}  # fmt: skip
+DELICATE = ("log", "asin", "acos", "atanh", "log2", "log10", "log1p", "Sqrt", "gamma", "loggamma")
+# JaxPrinter reduces arrays of these, in one version otherwise than in another.
+PAIRWISE = {"And": "jnp.logical_and({}, {})", "Or": "jnp.logical_or({}, {})",
+            "Max": "jnp.maximum({}, {})", "Min": "jnp.minimum({}, {})"}  # fmt: skip
 # Larger integers are written as floats, since JAX's integers may have 32 bits.
 WHOLE = 2**31 - 1
 RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
@@ -181,28 +170,31 @@ def _in_jax(expression):
     }
     for function, instead in others.items():
         expression = expression.replace(function, instead)
-    kinds = [sympy.Add, sympy.Mul, sympy.Pow, sympy.Symbol, sympy.Number, sympy.NumberSymbol, sympy.sinc, sympy.frac]
+    kinds = [sympy.Add, sympy.Mul, sympy.Pow, sympy.Symbol, sympy.Number, sympy.NumberSymbol]
     kinds += [sympy.Piecewise, sympy.functions.elementary.piecewise.ExprCondPair, sympy.ITE, sympy.Max, sympy.Min]
+    kinds += [sympy.sinc, sympy.frac, sympy.Mod]
     kinds += [sympy.And, sympy.Or, sympy.Not, sympy.core.relational.Relational, sympy.logic.boolalg.BooleanAtom]
     for part in sympy.preorder_traversal(expression):
         # SymPy counts `nan` and `zoo` as numbers.
         known = isinstance(part, tuple(kinds)) and part not in (sympy.nan, sympy.zoo)
         undefined = isinstance(part, sympy.core.function.AppliedUndef)
-        if not known and (undefined or type(part).__name__ not in FUNCTIONS):
+        if not known and (undefined or type(part).__name__ not in type(_printer())._kf):
             raise NotInJax(type(part).__name__ if part.args and not part.is_Atom else str(part))
     return expression
 
 
 @once
-def _printer():
-    """SymPy's Python printer, which sets parentheses, with JAX's names for functions and numbers."""
-    from sympy.printing.pycode import PythonCodePrinter
+def _printer() -> Any:
+    """SymPy's printer for JAX, but for what would lose digits, 32 bits, or the comparisons that lagjax looks for."""
+    from sympy.printing.numpy import JaxPrinter
 
-    sympy, of_python = sympy_itself(), cast(Any, PythonCodePrinter)
+    sympy = sympy_itself()
 
-    class Printer(of_python):
-        def _of_function(self, expr):
-            return f"{FUNCTIONS[type(expr).__name__]}({', '.join(map(self._print, expr.args))})"
+    class Printer(JaxPrinter):
+        _kf = JaxPrinter._kf | FUNCTIONS
+
+        def _module_format(self, fqn, register=True):
+            return fqn.replace("jax.numpy", "jnp")
 
         def _print_Integer(self, expr):
             return repr(int(expr)) if abs(expr) <= WHOLE else repr(float(expr))
@@ -210,13 +202,12 @@ def _printer():
         def _print_Float(self, expr):
             return repr(float(expr))
 
-        def _print_Rational(self, expr):
-            return f"{self._print(expr.numerator)}/{self._print(expr.denominator)}"
-
         def _print_Pow(self, expr, rational=False):
+            # JaxPrinter makes negative integer powers powers of floats.
             return self._hprint_Pow(expr, rational=rational, sqrt="jnp.sqrt")
 
         def _print_Piecewise(self, expr):
+            # In JaxPrinter's `jnp.select` no comparison chooses between two values: jumps would not be found.
             (value, condition), *others = expr.args
             if condition == sympy.true:
                 return self._print(value)
@@ -224,19 +215,11 @@ def _printer():
             other = self._print(expr.func(*others, evaluate=False)) if others else "jnp.nan"
             return f"jnp.where({self._print(condition)}, {self._print(value)}, {other})"
 
-        def _print_Relational(self, expr):
-            return f"({self._print(expr.lhs)} {expr.rel_op} {self._print(expr.rhs)})"
+        def _print_AppliedUndef(self, expr):
+            # The only undefined function left is `harmless`.
+            argument, where = map(self._print, expr.args)
+            return f"jnp.where({where}, {argument}, 0.5)"
 
-        _print_Exp1 = _print_Pi = _print_NumberSymbol = _print_Float
-        _print_EulerGamma = _print_GoldenRatio = _print_Catalan = _print_Float
-
-        def _print_sinc(self, expr):
-            return f"jnp.sinc({self._print(expr.args[0] / sympy.pi)})"
-
-    for name in FUNCTIONS:
-        setattr(Printer, f"_print_{name}", Printer._of_function)
-    for name, template in TEMPLATES.items():
-        setattr(Printer, f"_print_{name}", lambda self, e, text=template: text.format(*map(self._print, e.args)))
     for name, of_two in PAIRWISE.items():
         setattr(Printer, f"_print_{name}", lambda self, e, text=of_two: reduce(text.format, map(self._print, e.args)))
     return Printer()

@@ -49,14 +49,15 @@ class AtContacts(NamedTuple):
 def of_elements(trajectory, start: State) -> Exception:
     """The error of a failed motion with elements."""
     result, switches, count = trajectory.result, trajectory.switches, len(trajectory.switches)
-    laws, user, end = trajectory.system.laws, trajectory.system.user, trajectory.end
+    phase, end = trajectory.last_phase(), trajectory.end
+    laws, user = trajectory.system.laws[phase], trajectory.system.user.phases[phase]
     last = list(dict.fromkeys(switches.ways[i] for i in np.asarray(switches.way)[max(0, count - LAST) : count]))
     when = f"t = {float(end.t):.9g}"
     # A motion that does not begin has no end.
     begun = count or all(np.all(np.isfinite(x)) for x in jax.tree.leaves((end.q, end.v)))
     s = State(end.t, end.q, end.v, trajectory.params) if begun else start._replace(params=trajectory.params)
     if is_among(result, [RESULTS.element_refused]):
-        return _refused(laws, s)
+        return _refused([laws for laws in trajectory.system.laws if laws is not None], s)
     if is_among(result, [RESULTS.normal_below_zero]):
         return _lifted(laws, s)
     if is_among(result, [RESULTS.too_many_switches]):
@@ -84,11 +85,12 @@ def of_elements(trajectory, start: State) -> Exception:
     return RuntimeError(f"at {when}: {message(result)}")
 
 
-def _refused(laws, s: State) -> Exception:
-    """The error of numbers that no law allows."""
+def _refused(every: list, s: State) -> Exception:
+    """The error of numbers that no law of these phases allows."""
     t, q, v, params = coordinates.as_arrays(s, s.t.dtype)
-    found = [(role, np.asarray(value)) for role, value, allowed in laws.numbers(t, params) if not np.all(allowed)]
-    if not found:
+    numbers = [number for laws in every for number in laws.numbers(t, params)]
+    found = [(role, np.asarray(value)) for role, value, allowed in numbers if not np.all(allowed)]
+    for laws in every if not found else ():
         # Those that depend on speeds.
         for law in laws.normals:
             rates = jax.jvp(lambda t, q, law=law: law.gaps(t, q, params), (t, q), (jnp.ones_like(t), v))[1]

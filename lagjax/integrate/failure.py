@@ -27,7 +27,7 @@ from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, m
 from lagjax.integrate.trajectory.trajectory import Trajectory
 from lagjax.jaxtools import as_usual, compiled, primitive
 from lagjax.mechanics import accelerations, describe, explain_failure
-from lagjax.system import Hybrid, State, coordinates
+from lagjax.system import OF_STATE, Hybrid, State, coordinates, takes_of
 
 
 @as_usual
@@ -85,7 +85,7 @@ def _raise(trajectory, start: State, settings: Settings, about_guards: str, wher
 
 def _raise_in_phase(trajectory, start: State, settings: Settings, about_guards: str) -> NoReturn:
     hybrid, switches, result = trajectory.system, trajectory.switches, trajectory.result
-    if hybrid.elements is not None:
+    if hybrid.elements is not None and _is_of_elements(trajectory, start):
         raise of_elements(trajectory, start)
     if is_among(result, [RESULTS.too_many_switches]):
         raise RuntimeError(_too_many(trajectory))
@@ -122,6 +122,16 @@ def _raise_in_phase(trajectory, start: State, settings: Settings, about_guards: 
         t=trajectory.t, multipliers=of_phase(trajectory.multipliers), events={}, arrays=arrays, static=static, **fields
     )
     _raise(alone, entered, settings, about_guards, there)
+
+
+def _is_of_elements(trajectory, start: State) -> bool:
+    """Whether elements ended a motion, and no switch of phases."""
+    result, hybrid = trajectory.result, trajectory.system
+    if is_among(result, [RESULTS.element_refused]):
+        return True
+    of_switch = is_among(result, [RESULTS.guard_not_seen, RESULTS.reset_not_finite])
+    of_switch = of_switch or is_among(result, [RESULTS.guard_below_zero]) and bool(_switches_below(hybrid, start))
+    return hybrid.laws[trajectory.last_phase()] is not None and not of_switch
 
 
 def _too_many(trajectory):
@@ -172,7 +182,7 @@ def _no_state_after(trajectory):
         return said + (
             "Usual cause: a contact that jams. The gap and the constraints fix how it slides, whatever friction does, "
             "and friction exceeds the force that pushes the contact together: no impulse satisfies both.\n"
-            "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.touches(gap)."
+            "Fix: less friction, or a plastic impact onto a phase in which the contact holds: lj.guards.touches(gap)."
         )
     return said + (
         "Usual cause: a reset that divides by something that is zero there, or takes its root; or constraints of the "
@@ -203,17 +213,27 @@ def _phases_along(trajectory):
     return [int(hybrid.first), *map(int, np.asarray(switches.to)[: len(switches)])]
 
 
-def _below_zero(hybrid: Hybrid, start: State):
+def _switches_below(hybrid: Hybrid, start: State) -> list[str]:
+    """The guards of switches of the first phase that are below zero at the start, in words."""
     first, found = int(hybrid.first), []
     system = hybrid.systems[first]
-    multipliers = accelerations(system, *start)[1] if system.constraints else {}
+    # The multipliers of elements depend on their modes.
+    known = hybrid.elements is None and bool(system.constraints)
+    multipliers = accelerations(system, *start)[1] if known else {}
     for i in hybrid.leaving(first):
         switch = hybrid.switches[i]
+        if not known and takes_of(switch.when) != OF_STATE:
+            continue
         value = switch.value(start.t, start.q, start.v, multipliers, start.params)
         if float(value) < 0:
             found.append(f"that of {switch.in_words()} is {float(value):.6g}")
+    return found
+
+
+def _below_zero(hybrid: Hybrid, start: State):
+    name, found = hybrid.names[int(hybrid.first)], "; ".join(_switches_below(hybrid, start))
     return (
-        f"a guard of phase '{hybrid.names[first]}' is below zero at the start: {'; '.join(found)}.\n"
+        f"a guard of phase '{name}' is below zero at the start: {found}.\n"
         "Usual cause: a motion that starts in the wrong phase, or a guard with the wrong sign: it must be above zero "
         "as long as the phase lasts.\n"
         "Fix: lj.integrate(..., start=name), or -guard."

@@ -52,10 +52,11 @@ def prepare(
     if isinstance(method, EqualSteps):
         method = with_traced_pace(method, state)
     system = traced_phases(system if start is None else system.starting(start), state, ts)
-    for phase in system.phases:
+    for i, phase in enumerate(system.phases):
         if phase.dissipation is None:
             continue
-        given = state._replace(params=system.given(state.params)) if isinstance(system, Hybrid) else state
+        params = system.given(state.params, phase=i) if isinstance(system, Hybrid) else state.params
+        given = state._replace(params=params)
         warn_of_odd_dissipation(phase.dissipation, given)
     crossings, left = crossings_of(events, event), left_to_diffrax(event)
     if system.in_phases:

@@ -217,7 +217,7 @@ def _structure(model: Model, names: Sequence[str]):
     nonzero = np.array([not is_zero(x) for x in mass.program.jaxpr.outvars]).reshape(n, n)
     lagrangian = _numbers(_of(system.lagrangian), model)
     linear = _numbers(_of(partial(_momentum_at_rest, system.lagrangian)), model)
-    programs = [_numbers(_of(f), model) for f in functions_of(model)]
+    programs = [_numbers(_of(f), model) for f, _ in functions_of(model)]
     return Structure(
         mass_depends_on=_depends_on(mass, names),
         blocks=tuple(tuple(names[i] for i in block) for block in banded.blocks(nonzero)),
@@ -250,7 +250,7 @@ def invariance(model: Model) -> Invariance:
 
     def values(model: Model, t: Array, q: PyTree, v: PyTree):
         momentum = _momentum_at_rest(model.system.lagrangian, t, q, v, model.params)
-        return [f(t, q, v, model.params) for f in functions_of(model)], momentum
+        return [f(t, q, v, phase.params) for f, phase in functions_of(model)], momentum
 
     try:
         if model.n + model.m > UP_TO:
@@ -353,7 +353,7 @@ def _by_leaf(model: Model) -> list[set[Depends]]:
     """How the functions of the motion depend on each leaf of q."""
 
     def on_leaf(i: int) -> set[Depends]:
-        return {_dependence(f, model, lambda args: jtu.tree_leaves(args[1])[i : i + 1]) for f in functions_of(model)}
+        return {_dependence(*of, lambda args: jtu.tree_leaves(args[1])[i : i + 1]) for of in functions_of(model)}
 
     return [on_leaf(i) for i in range(len(model.form.shapes))]
 
@@ -365,7 +365,7 @@ def conserved_momenta(model: Model) -> list[str]:
         return []
     model = in_numbers(model)
     try:
-        occurring = [_depends_on(_numbers(_of(f), model), names) for f in functions_of(model)]
+        occurring = [_depends_on(_numbers(_of(f), model), names) for f, _ in functions_of(model)]
     except TooLong:
         return []
     return [name for name in names if not any(name in found for found in occurring)]
@@ -457,18 +457,19 @@ def sees_time(function: Callable, model: Model) -> bool:
 
 def is_autonomous(model: Model) -> bool:
     """Whether nothing that the motion depends on depends on t."""
-    return not any(sees_time(f, model) for f in functions_of(model))
+    return not any(sees_time(*of) for of in functions_of(model))
 
 
-def functions_of(model: Model):
-    """All functions that the motion depends on, of (t, q, v, params)."""
+def functions_of(model: Model) -> list[tuple[Callable, Model]]:
+    """All functions that the motion depends on, of (t, q, v, params), each with the model of its phase."""
     functions = []
     for phase in model.phases:
         system = phase.system
         forced = None if system.force is None else force_with_ones(phase)
-        functions += [system.lagrangian, forced, system.dissipation]
-        functions += [c.residual for c in system.constraints.values()] + [*system.states.values()]
-    return [f for f in functions if f is not None]
+        of_phase = [system.lagrangian, forced, system.dissipation, *system.states.values()]
+        of_phase += [c.residual for c in system.constraints.values()]
+        functions += [(f, phase) for f in of_phase if f is not None]
+    return functions
 
 
 def _dependence(function: Callable, model: Model, leaves_of: Callable) -> Depends:

@@ -11,20 +11,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
-from lagjax.models.parts import (
-    BEFORE_TEXT,
-    LinkShape,
+from lagjax.models.links_and_joints import (
     Loop,
     MergedLinks,
-    NotTaken,
     Placement,
     RobotJoint,
     RobotLink,
-    file_of,
+    inertia_along,
     made_up,
     merged,
 )
-from lagjax.models.robot_model import RobotModel
+from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
+from lagjax.models.shapes import LinkShape
 
 KIND = {"mjJNT_HINGE": "revolute", "mjJNT_SLIDE": "prismatic", "mjJNT_BALL": "spherical", "mjJNT_FREE": "floating"}
 # What is listed as not taken, by the names of MuJoCo's lists.
@@ -64,9 +62,9 @@ def read_mjcf(source: str | Path) -> RobotModel:
     left out, and listed in `model.not_taken`.
 
     Positions of joints count from the file's drawing: MuJoCo's `qpos` minus its `qpos0`. That of a free joint is the
-    `lj.Pose` of its body, and goes by the body's name.
+    `lj.bodies.Pose` of its body, and goes by the body's name.
 
-    **Returns:** a `lj.RobotModel`.
+    **Returns:** a `RobotModel`.
 
     **Raises:** `ImportError` without MuJoCo; `FileNotFoundError`; `ValueError` for what MuJoCo refuses, in its words,
     and for equalities that are not supported.
@@ -138,13 +136,12 @@ class _Reading:
             pivot = np.zeros(3) if self._kind(k) == "floating" else m.jnt_pos[k]
             child = name if k == numbers[-1] else self._made_up(f"{name} before {self.joints[k + 1]}")
             joints.append(self._joint(k, parent, child, frame.then(Placement(pivot - at, np.eye(3)))))
-            links[child] = RobotLink(child, 0.0, np.zeros(3), np.zeros((3, 3)), line)
+            links[child] = RobotLink.frame(child, line)
             parent, frame, at = child, Placement(np.zeros(3), np.eye(3)), pivot
         if not numbers:
             joints.append(RobotJoint(f"{name} is fixed", "fixed", parent, name, frame, np.zeros(3), line))
-        axes = _matrix(m.body_iquat[i])
-        inertia = axes @ np.diag(m.body_inertia[i]) @ axes.T
-        links[name] = RobotLink(name, float(m.body_mass[i]), m.body_ipos[i] - at, inertia / 2 + inertia.T / 2, line)
+        inertia = inertia_along(_matrix(m.body_iquat[i]), np.diag(m.body_inertia[i]))
+        links[name] = RobotLink(name, float(m.body_mass[i]), m.body_ipos[i] - at, inertia, line)
         return at
 
     def _kind(self, k: int) -> str:
@@ -203,7 +200,7 @@ class _Reading:
         for body, place in inner:
             head, frame = tree.frames[self.bodies[body]]
             places.append((head, frame.then(place)))
-        return Loop(name, "spherical" if kind == "connect" else "fixed", (places[0], places[1]))
+        return Loop(name, "spherical" if kind == "connect" else "fixed", (places[0], places[1]), line)
 
     def _shape(self, i: int) -> LinkShape:
         m, collides = self.m, bool(self.m.geom_contype[i] or self.m.geom_conaffinity[i])

@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +20,9 @@ from lagjax.bodies import (
     Marker,
     Pose,
     Tree,
-    axis,
     cylindrical,
     fixed,
     ground,
-    line,
     multibody,
     planar,
     prismatic,
@@ -35,27 +34,24 @@ from lagjax.bodies import (
 )
 from lagjax.display import Drawing, Shape, Still
 from lagjax.integrate import still, subject_of
-from lagjax.models.joint_positions import (
+from lagjax.models.links_and_joints import (
     BodyJoint,
-    all_positions,
-    connected,
-    drawn,
-    moved,
-    quaternion_of,
-    rate_squared,
-)
-from lagjax.models.looks import looks_of, not_drawn
-from lagjax.models.parts import (
-    LinkShape,
     Loop,
     MergedLinks,
-    NotTaken,
     Placement,
     RobotJoint,
     RobotLink,
+    all_positions,
+    connected,
+    drawn,
     made_up,
+    moved,
+    quaternion_of,
+    rate_squared,
     unmoved,
 )
+from lagjax.models.shapes import LinkShape, is_file, looks_of, not_drawn
+from lagjax.shapes import axis, line
 from lagjax.system import Holonomic, System
 
 EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherical, "planar": planar,
@@ -65,6 +61,17 @@ EQUATIONS = {"revolute": revolute, "prismatic": prismatic, "spherical": spherica
 UPWARD = (0.0, 0.0, 1.0)
 # How many of a kind `print` lists.
 LISTED = 6
+# What may stand before the text of a file: white space and a byte-order mark.
+BEFORE_TEXT = " \t\r\n\ufeff"
+LONGEST_SHOWN = 200
+
+
+class NotTaken(NamedTuple):
+    """What a file says and the model leaves out: what it is, whose, and its line."""
+
+    what: str
+    name: str
+    line: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,15 +86,15 @@ class RobotModel:
     >>> print(q["cart"].position, model.joint_positions(q)["s"], model.joint_rates(q, v)["s"])
     [0.5 0.  0. ] 0.5 3.0
 
-    - `name`: as in the file; `bodies`: `lj.Body`s by the names of their links, with the links' axes; `shapes`: the
-      shapes on them; `gravity`: (3,).
+    - `name`: as in the file; `bodies`: `lj.bodies.Body`s by the names of their links, with the links' axes; `shapes`:
+      the shapes on them; `gravity`: (3,).
     - `links`, `joints`: what moves, as plain numbers, parents first; `frames`: by each link of the file, the link that
       it is part of (None: the ground) and where its frame is in that; `loops`: what is held together besides.
     - `not_taken`: what the file says and the model leaves out, each with its line; `print(model)` lists it.
 
     Positions of joints, by name, count from the file's drawing, `[length]` or radians: a number for revolute and
     prismatic joints, (3,) for planar ones (two lengths, an angle), a unit quaternion for spherical ones; for floating
-    ones, which go by the name of their body, its `lj.Pose` in space.
+    ones, which go by the name of their body, its `lj.bodies.Pose` in space.
     """
 
     name: str
@@ -120,13 +127,17 @@ class RobotModel:
                 f"{empty[0].line}: '{empty[0].name}' has moments of inertia and no mass.\n"
                 "Fix: its mass; or all of them zero, if it is a frame."
             )
-        for link in merged.links.values():
-            if not np.isfinite([link.mass, *link.centre, *link.inertia.flat]).all():
+        loops = tuple(loops)
+        told = [(link.line, link.name, (link.mass, *link.centre, *link.inertia.flat)) for link in merged.links.values()]
+        told += [(joint.line, joint.name, joint.placement.origin) for joint in merged.joints.values()]
+        told += [(loop.line, loop.name, np.concatenate([x.origin for _, x in loop.places])) for loop in loops]
+        for where, whose, numbers in told:
+            if not np.isfinite(numbers).all():
                 raise ValueError(
-                    f"{link.line}: mass, centre or inertia of '{link.name}', with what is fixed to it, are beyond the "
-                    "largest number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
+                    f"{where}: mass, inertia or place of '{whose}', with what is fixed to it, are beyond the largest "
+                    "number.\nUsual cause: a misprinted exponent.\nFix: its numbers in the file."
                 )
-        return cls(name, *merged, placed, tuple(loops), tuple(field.tolist()), tuple(not_taken))
+        return cls(name, *merged, placed, loops, tuple(field.tolist()), tuple(not_taken))
 
     def __reduce__(self):
         # Without what is kept, which has compiled programs.
@@ -159,14 +170,14 @@ class RobotModel:
         return self._of_bodies(q, v)[1]
 
     def at(self, link: str, point: ArrayLike = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> Marker:
-        """A place on a link of the file, in its frame there, for loads and further joints: a `lj.Marker`."""
+        """A place on a link of the file, in its frame there, for loads and further joints: a `lj.bodies.Marker`."""
         if link not in self.frames:
             raise ValueError(f"there is no link '{link}'.\nFix: one of {', '.join(self.frames)}.")
         head, frame = self.frames[link]
         return self._marker(head, Placement(frame.point(point), frame.axes), axis)
 
     def markers(self, joint: str) -> tuple[Marker, Marker]:
-        """The two places that a joint joins: `lj.motor(*model.markers("elbow"), torque)`."""
+        """The two places that a joint joins: `lj.bodies.motor(*model.markers("elbow"), torque)`."""
         for x in self._between.values():
             if [y.name for y in x.joints] == [joint]:
                 return x.a, x.b
@@ -175,10 +186,10 @@ class RobotModel:
         raise ValueError(f"there is no joint '{joint}'.\nFix: one of {', '.join(self.joints)}.")
 
     def system(self, loads: Iterable[Load] = (), joints: Mapping | None = None, **others) -> System:
-        """Return the system of its bodies: q and v are dicts of `lj.Pose` by body, joints are constraints.
+        """Return the system of its bodies: q and v are dicts of `lj.bodies.Pose` by body, joints are constraints.
 
         Weight, dampers, springs and rotors of joints are in it, and loops; `loads`, `joints` and `others` are further
-        ones of `lj.multibody`. A spring's angle counts from -π to π.
+        ones of `lj.bodies.multibody`. A spring's angle counts from -π to π.
 
         **Raises:** `ValueError` for a massless link that no joint of `lj` stands for, by its line.
         """
@@ -203,8 +214,8 @@ class RobotModel:
 
         It is that of `tree()`, solved at O(n). Springs of joints count whole turns.
 
-        `loads` are those of `lj.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and the
-        position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
+        `loads` are those of `lj.bodies.multibody`, `closures` constraints by name; both read `q[body]` as a pose, and
+        the position of a joint under any other name. Loops of the file are in it. `others` are `force`, `dissipation`,
         `states` and `elements` of `lj.System`, in joint coordinates.
         """
         dissipation, joints = others.pop("dissipation", None), self.joints.values()
@@ -237,7 +248,7 @@ class RobotModel:
         return still(subject_of(Drawing(self._looks), None, None), 0.0, poses, frames, view)
 
     def tree(self) -> Tree:
-        """Return the `lj.Tree` of its links, with the rotors of joints; without what else acts, and without loops.
+        """Return the `lj.bodies.Tree` of its links, with the rotors of joints; without what else acts, and loops.
 
         **Raises:** `ValueError` for a link without mass that moves and carries none, by its line.
         """
@@ -444,3 +455,28 @@ def _on_body(shape: LinkShape, merged: MergedLinks) -> LinkShape:
     frame = frame.then(Placement(shape.origin, shape.axes))
     centre = np.zeros(3) if head is None else merged.links[head].centre
     return shape._replace(body="ground" if head is None else head, origin=frame.origin - centre, axes=frame.axes)
+
+
+def file_of(source: str | Path, user: str) -> Path | None:
+    """The path of an existing file, None where the text itself was given; `user` is the function that asks."""
+    if isinstance(source, str) and source.lstrip(BEFORE_TEXT).startswith("<"):
+        try:
+            source.encode()
+        except UnicodeEncodeError as error:
+            line = source.count("\n", 0, error.start) + 1
+            raise ValueError(
+                f"line {line} of the text has the character {source[error.start]!r}, which no file can have.\n"
+                "Usual cause: a file that was decoded with errors='surrogateescape'.\n"
+                f"Fix: {user}(path), and the file in UTF-8."
+            ) from error
+        return None
+    if not isinstance(source, (str, Path)):
+        raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
+    path = Path(source).expanduser()
+    if not is_file(path):
+        shown = str(source) if len(str(source)) <= LONGEST_SHOWN else str(source)[:LONGEST_SHOWN] + "..."
+        raise FileNotFoundError(
+            f"there is no file '{shown}', seen from {Path.cwd()}.\nUsual cause: another working directory, or a "
+            f'package:// name, which ROS alone knows.\nFix: {user}("/path/to/the/file"), or the text itself.'
+        )
+    return path

@@ -2,6 +2,11 @@
 
 The elements are those of `wiki.ros.org/urdf/XML`. A rotation `rpy="r p y"` turns about the fixed axes x, y, z in this
 order, R = Rz(y) Ry(p) Rx(r). Numbers are in the file's units, which are meant to be SI, angles in radians.
+
+Why MuJoCo, which reads MJCF here, does not read URDF as well: the numbers of what both read are the same, but it has
+no lines of elements, passes over what it does not know (a misspelt <origin>, quat_xyzw=, a second root) without a word,
+and does not take massless links that move, floating joints below the root, rows of more than 1,024 links, and meshes
+that are not there (`tests/models/test_both_readers.py`). To know all this beforehand is to read the file.
 """
 
 import codecs
@@ -14,25 +19,28 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import unit_vector
-from lagjax.models.meshes import mesh_of
-from lagjax.models.parts import (
-    BEFORE_TEXT,
-    LinkShape,
-    NotTaken,
+from lagjax.models.links_and_joints import (
     Placement,
     RobotJoint,
     RobotLink,
     fault_of_inertia,
-    file_of,
+    inertia_along,
     merged,
     unmoved,
 )
-from lagjax.models.robot_model import RobotModel
+from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
+from lagjax.models.shapes import LinkShape, mesh_of
 
-# What stands in a file beside links and joints without being mechanics, and parts of joints that the model leaves out.
-BESIDE = {"gazebo", "transmission", "material", "sensor", "ros2_control", "mujoco", "plugin", "force_torque"}
-BESIDE_LINK = {"visual", "collision", "sensor", "self_collision_checking", "contact", "type"}
-BESIDE_JOINT = {"limit": "limits", "safety_controller": "safety controllers", "calibration": "calibrations"}
+# What an element may have inside, and in which words what the model leaves out is listed; "" where nothing is.
+LEFT_OUT = {
+    "robot": dict.fromkeys(("link", "joint", "material"), "")
+    | {x: f"<{x}>" for x in ("gazebo", "transmission", "sensor", "ros2_control", "mujoco", "plugin", "force_torque")},
+    "link": {"inertial": "", "visual": "", "collision": "contacts of <collision>"}
+    | {x: f"<{x}>" for x in ("sensor", "self_collision_checking", "contact", "type")},
+    "inertial": dict.fromkeys(("origin", "mass", "inertia"), ""),
+    "joint": dict.fromkeys(("origin", "parent", "child", "axis", "dynamics", "mimic"), "")
+    | {"limit": "limits", "safety_controller": "safety controllers", "calibration": "calibrations"},
+}
 TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "planar": "planar",
          "floating": "floating", "fixed": "fixed"}  # fmt: skip
 SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "capsule": ("radius", "length"), "sphere": ("radius",)}
@@ -99,6 +107,19 @@ class XMLElement:
         """An attribute that is a number."""
         return float(self.numbers(attribute, 1, None if default is None else [default])[0])
 
+    def left_out(self, name: str | None = None) -> list[NotTaken]:
+        """What is inside and not taken, under this name or its own; what is not known is refused."""
+        found = []
+        for x in self.inside:
+            what = LEFT_OUT[self.tag].get(x.tag)
+            # A prefix is that of an extension of some program.
+            if what is None and ":" not in x.tag:
+                raise _unknown(x, self)
+            if what != "":
+                whose = x.attributes.get("name", "") if name is None else name
+                found.append(NotTaken(what or f"<{x.tag}>", whose, f"line {x.line}"))
+        return found
+
     def only(self, *attributes: str):
         """Refuse attributes that would be left out silently."""
         for name in self.attributes.keys() - set(attributes):
@@ -140,7 +161,7 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
     known, `<mimic>`, a loop) is refused, by its line; limits, friction, transmissions, contacts, sensors, plugins are
     left out, and listed in `model.not_taken`.
 
-    **Returns:** a `lj.RobotModel`.
+    **Returns:** a `RobotModel`.
 
     **Raises:** `FileNotFoundError`; `ValueError` for what is not URDF or not supported, for inertias that no body has,
     for links with two parents, in a circle or without a way to the root: with the line of each.
@@ -151,11 +172,7 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
         raise ValueError(f'base= must be "fixed" or "free", and is {base!r}.')
     path = file_of(source, "lj.read_urdf")
     robot = _parsed(source, "the text") if path is None else _parsed(path.read_bytes(), path.name)
-    for x in robot.inside:
-        if x.tag not in {"link", "joint"} | BESIDE and ":" not in x.tag:
-            raise _unknown(x, robot)
-    not_taken = [NotTaken(f"<{x.tag}>", x.attributes.get("name", ""), f"line {x.line}")
-                 for x in robot.inside if x.tag not in ("link", "joint", "material")]  # fmt: skip
+    not_taken = robot.left_out()
     links = {x.text("name"): _link(x, not_taken) for x in _named_once(robot, "link")}
     joints = [_joint(x, links, not_taken) for x in _named_once(robot, "joint")]
     ordered = _from_the_root(links, joints, base)
@@ -243,26 +260,17 @@ def _placement(x: XMLElement | None) -> Placement:
 
 
 def _link(x: XMLElement, not_taken: list[NotTaken]) -> RobotLink:
-    name, line = x.text("name"), f"line {x.line}"
-    for part in x.inside:
-        if part.tag not in {"inertial"} | BESIDE_LINK and ":" not in part.tag:
-            raise _unknown(part, x)
-        if part.tag not in ("inertial", "visual"):
-            what = "contacts of <collision>" if part.tag == "collision" else f"<{part.tag}>"
-            not_taken.append(NotTaken(what, name, f"line {part.line}"))
-    inertial = x.one("inertial")
+    name, inertial = x.text("name"), x.one("inertial")
+    not_taken += x.left_out(name)
     if inertial is None:
-        return RobotLink(name, 0.0, np.zeros(3), np.zeros((3, 3)), line)
-    for part in inertial.inside:
-        if part.tag not in ("origin", "mass", "inertia"):
-            raise _unknown(part, inertial)
+        return RobotLink.frame(name, f"line {x.line}")
+    not_taken += inertial.left_out(name)
     frame, mass, given = _placement(inertial.one("origin")), inertial.needed("mass"), inertial.needed("inertia")
     given.only("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     xx, yy, zz = (given.number(key) for key in ("ixx", "iyy", "izz"))
     xy, xz, yz = (given.number(key, 0.0) for key in ("ixy", "ixz", "iyz"))
-    with np.errstate(over="ignore", invalid="ignore"):
-        inertia = frame.axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ frame.axes.T
-    return RobotLink(name, mass.number("value"), frame.origin, inertia / 2 + inertia.T / 2, f"line {inertial.line}")
+    inertia = inertia_along(frame.axes, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    return RobotLink(name, mass.number("value"), frame.origin, inertia, f"line {inertial.line}")
 
 
 def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]) -> RobotJoint:
@@ -271,17 +279,13 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
         raise ValueError(
             f"line {x.line}: type='{kind}' of {x.called} is not supported.\nFix: one of {', '.join(sorted(TYPES))}."
         )
-    for part in x.inside:
-        if part.tag == "mimic":
-            raise ValueError(
-                f"line {part.line}: <mimic> of {x.called} is not supported: without it the joint would move freely.\n"
-                "Fix: remove it, and tie the joints in joint coordinates: model.joint_system(closures={'mimic': "
-                f"lj.Holonomic(lambda t, q, params: q['{name}'] - q['{part.attributes.get('joint', 'other')}'])}})."
-            )
-        if part.tag in BESIDE_JOINT:
-            not_taken.append(NotTaken(BESIDE_JOINT[part.tag], name, f"line {part.line}"))
-        elif part.tag not in ("origin", "parent", "child", "axis", "dynamics") and ":" not in part.tag:
-            raise _unknown(part, x)
+    if (mimic := x.one("mimic")) is not None:
+        raise ValueError(
+            f"line {mimic.line}: <mimic> of {x.called} is not supported: without it the joint would move freely.\n"
+            "Fix: remove it, and tie the joints in joint coordinates: model.joint_system(closures={'mimic': "
+            f"lj.Holonomic(lambda t, q, params: q['{name}'] - q['{mimic.attributes.get('joint', 'other')}'])}})."
+        )
+    not_taken += x.left_out(name)
     ends = [x.needed(tag).text("link") for tag in ("parent", "child")]
     for tag, end in zip(("parent", "child"), ends):
         if end not in links:
@@ -289,14 +293,14 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
     if ends[0] == ends[1]:
         raise ValueError(f"line {x.line}: {x.called} joins '{ends[0]}' to itself.")
     given = x.one("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if given is None else given.numbers("xyz", 3)
+    told, axis = f"line {(given or x).line}", np.array([1.0, 0.0, 0.0]) if given is None else given.numbers("xyz", 3)
     with np.errstate(over="ignore"):
         size = np.hypot.reduce(axis)
-    if kind in ("revolute", "continuous", "prismatic", "planar"):
+    if kind not in ("fixed", "floating"):
         if not size > 0:
-            raise ValueError(f"line {given.line if given else x.line}: the axis of {x.called} is zero.")
+            raise ValueError(f"{told}: the axis of {x.called} is zero.")
         if abs(size - 1) > 1e-3:
-            not_taken.append(NotTaken("length of the axis", name, f"line {given.line if given else x.line}"))
+            not_taken.append(NotTaken("length of the axis", name, told))
     dynamics, damping = x.one("dynamics"), 0.0
     if dynamics is not None:
         damping = dynamics.number("damping", 0.0)
@@ -316,7 +320,8 @@ def _from_the_root(links: dict[str, RobotLink], joints: list[RobotJoint], base: 
         if before is not joint:
             raise ValueError(
                 f"{joint.line}: '{joint.child}' is the child of '{joint.name}' and of '{before.name}' ({before.line}), "
-                "and URDF has trees only.\nFix: one of the joints as lj.revolute(*...) in model.system(joints={...})."
+                "and URDF has trees only.\n"
+                "Fix: one of the joints as lj.bodies.revolute(*...) in model.system(joints={...})."
             )
     roots = [name for name in links if name not in above]
     if len(roots) != 1:

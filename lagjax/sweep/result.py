@@ -141,7 +141,7 @@ def page_of(
         contents = "; ".join(found.left_out) or "nothing"
         raise ValueError(
             f"there is nothing to draw: each point has {contents}.\n"
-            "Fix: return numbers, a lj.Trajectory, or arrays over time with few columns from run."
+            "Fix: return numbers, a Trajectory, or arrays over time with few columns from run."
         )
     spec = {
         "axes": _axes(axes),

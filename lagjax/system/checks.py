@@ -387,7 +387,7 @@ def _check_linear(model: Model, s: State):
             "force(t, q, v, multipliers, params) must be linear in the multipliers, and is not.\n"
             "Usual cause: the size of a normal force, jnp.abs(multipliers[...]) or jnp.maximum(multipliers[...], 0).\n"
             'Fix: the multiplier itself, -mu * multipliers["contact"]: a phase ends where it reaches zero '
-            '(lj.releases("contact")).'
+            '(lj.guards.releases("contact")).'
         )
 
 

@@ -41,7 +41,7 @@ class Switch(eqx.Module):
       multipliers by constraint name; a number of any unit, above zero as long as the phase lasts. Values that it
       closes over are differentiated too.
     - `reset`: the jump, or None: `reset(t, q, v, params)` -> velocities like `v`, or a pair (q, v) for the whole state;
-      it may take multipliers, as `when`. Guards such as `lj.touches` have a reset of their own.
+      it may take multipliers, as `when`. Guards such as `lj.guards.touches` have a reset of their own.
 
     - `rest`: the name of the phase to enter instead of `to` where the guard, after the reset, opens more slowly than
       `slower_than` per unit of time: this ends infinitely many impacts in finite time. The velocities become the
@@ -86,7 +86,7 @@ class Switch(eqx.Module):
                 )
         self.phase, self.to, self.when, self.rest = phase, to, when, rest
         self.slower_than = slower_than if isinstance(slower_than, jax.Array) else np.asarray(slower_than, float)
-        # A guard such as `lj.touches` has its impact as `reset`.
+        # A guard such as `lj.guards.touches` has its impact as `reset`.
         self.reset = getattr(when, "reset", None) if reset is None else reset
 
     def __repr__(self):
@@ -193,18 +193,28 @@ class Hybrid(eqx.Module):
         self.first = np.zeros((), np.int32)
 
     in_phases: ClassVar[bool] = True
-    elements: ClassVar[Elements | None] = None
 
     @property
     def phases(self) -> tuple[System, ...]:
         """The systems of all phases."""
         return self.systems
 
-    def given(self, params: PyTree, modes: Array | None = None) -> PyTree:
-        """What the functions of the phases take as `params`; `modes`: those of elements, of which there are none."""
+    @property
+    def elements(self) -> Elements | None:
+        """The elements of all phases; None without any."""
+        found = [system.elements for system in self.systems if system.elements is not None]
+        return Elements(dict(item for elements in found for item in elements.items())) if found else None
+
+    @property
+    def modes(self) -> list[tuple[str, str]]:
+        """The name and the kind of each mode of elements."""
+        return []
+
+    def given(self, params: PyTree, modes: Array | None = None, phase: int = 0) -> PyTree:
+        """What the functions of a phase take as `params`; `modes`: those of elements, of which there are none."""
         return params
 
-    def cases(self, params: PyTree) -> dict[str, PyTree]:
+    def cases(self, params: PyTree, phase: int = 0) -> dict[str, PyTree]:
         """The parameters in as many cases, by what is said of them, as it takes to see what every function returns."""
         return {"": params}
 
@@ -215,7 +225,7 @@ class Hybrid(eqx.Module):
     @property
     def first_phase(self) -> System:
         """The system of the phase in which motions start. Not while JAX is tracing."""
-        return self.systems[int(self.first)]
+        return self.systems[int(self.first)].first_phase
 
     def starting(self, start: str | ArrayLike | None, argument: str = "start") -> "Hybrid":
         """The same hybrid with motions that start in this phase, a name or a number; None keeps the present one.

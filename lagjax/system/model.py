@@ -177,7 +177,8 @@ class Model(eqx.Module):
         if not self.system.in_phases:
             return (self,)
         return tuple(
-            model_of(phase, *self.form.example, self.system.given(self.params)) for phase in self.system.phases
+            model_of(phase, *self.form.example, self.system.given(self.params, phase=i))
+            for i, phase in enumerate(self.system.phases)
         )
 
     def tree(self, x: Array):
@@ -328,8 +329,8 @@ def signature(system: System | Hybrid, state: State) -> dict[str, np.ndarray]:
     if isinstance(system, System):
         return _signature(system, state)
     found = {}
-    for name, phase in zip(system.names, system.systems):
-        for case, params in system.cases(state.params).items():
+    for i, (name, phase) in enumerate(zip(system.names, system.systems)):
+        for case, params in system.cases(state.params, i).items():
             of_phase = _signature(phase, state._replace(params=params))
             found |= {f"{role} of phase '{name}'{case}": x for role, x in of_phase.items()}
     names = [f"{i}: {switch.phase} -> {switch.to}, {switch.rest}" for i, switch in enumerate(system.switches)]

@@ -72,7 +72,7 @@ def parallel_transport(
     check_system(system, w, params, states=False)
     if not isinstance(path, Geodesic) and not callable(path):
         raise TypeError(
-            f"a path is a function of t or a lj.Geodesic, not {type(path).__name__}.\n"
+            f"a path is a function of t or a Geodesic, not {type(path).__name__}.\n"
             'Fix: lambda t: {"psi": 1.0, "theta": 2.0 * t}.'
         )
     if isinstance(path, Geodesic):

@@ -224,7 +224,7 @@ def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgra
     else:
         if events:
             raise TypeError(
-                "with events the reference must be a lj.Trajectory, which has the times of events.\n"
+                "with events the reference must be a Trajectory, which has the times of events.\n"
                 "Fix: reference=lj.integrate(..., events=events, rtol=1e-13), or leave it out."
             )
         how = "the function that was given" if callable(reference) else "the states that were given"

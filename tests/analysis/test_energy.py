@@ -11,6 +11,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis import energy
+from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.numerics import quadrature
 from lagjax.scenes import SCENES
@@ -163,13 +164,13 @@ def test_powers_are_the_rate_of_h(sign):
 def test_impacts():
     """A ball loses 1 - e² of its energy at each impact, and drag takes the rest; an output may be at an impact."""
     ball = DRAGGED
-    floor = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, 0.5))
+    floor = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, params: q, 0.5))
     hybrid = lj.Hybrid({"flying": ball}, [floor], most_switches=4)
     first = lj.integrate(hybrid, 1.0, 0.0, ts=np.array([0.0, 1.0]))
-    assert isinstance(first, lj.HybridTrajectory) and len(first.switches) == 2
+    assert isinstance(first, HybridTrajectory) and len(first.switches) == 2
     at_impact = lj.integrate(hybrid, 1.0, 0.0, ts=np.array([0.0, float(first.switches.t[0]), 1.0]))
     for traj in (first, at_impact):
-        assert isinstance(traj, lj.HybridTrajectory)
+        assert isinstance(traj, HybridTrajectory)
         ledger = lj.energy_ledger(traj)
         speeds = np.asarray(traj.switches.v)[:2]
         np.testing.assert_allclose(ledger.impacts, -0.5 * (1 - 0.25) * speeds**2, rtol=1e-9)

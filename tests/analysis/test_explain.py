@@ -29,9 +29,9 @@ def edge(t, q, v, params):
 
 
 SWITCHES = [
-    lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q["y"], 0.5), rest="sliding"),
+    lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, params: q["y"], 0.5), rest="sliding"),
     lj.Switch("sliding", to="flying", when=edge),
-    lj.Switch("sliding", to="flying", when=lj.releases("table")),
+    lj.Switch("sliding", to="flying", when=lj.guards.releases("table")),
 ]
 STATE = {"x": 1.0, "y": 0.0}, {"x": 2.0, "y": 0.0}
 

@@ -7,6 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.poincare import _within_half_turns
+from lagjax.integrate import Crossings
 from tests.analysis.closed_forms import swinging
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, cartesian_lagrangian, pendulum
@@ -57,7 +58,7 @@ def test_pendulum(q0):
 def crossings(t, q=None, v=None, count=None):
     """Crossings at these times."""
     q, v = (t if x is None else x for x in (q, v))
-    return lj.Crossings(t, q, v, {}, np.asarray(len(t) if count is None else count), np.asarray(False))
+    return Crossings(t, q, v, {}, np.asarray(len(t) if count is None else count), np.asarray(False))
 
 
 def test_nothing_beyond_the_last_one_is_differentiated():

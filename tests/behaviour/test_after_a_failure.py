@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 
 # Two balls that attract each other; slow impacts halve the speed, those faster than 100 are elastic.
 attracted = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * (q[1] - q[0]))
-hit = lj.touches(lambda t, q, p: q[1] - q[0] - p["d"], lambda speed: jnp.where(speed > 100.0, 1.0, 0.5))
+hit = lj.guards.touches(lambda t, q, p: q[1] - q[0] - p["d"], lambda speed: jnp.where(speed > 100.0, 1.0, 0.5))
 zeno = lj.Hybrid({"flying": attracted}, [lj.Switch("flying", to="flying", when=hit)], most_switches=50)
 TS = np.array([0.0, 1.0, 3.5])
 
@@ -28,7 +29,7 @@ def finite_after(traj, t):
     late = np.asarray(traj.t) > t
     for name, tree in rows.items():
         found += [name for x in jax.tree.leaves(tree) if np.isfinite(np.asarray(x)[late]).any()]
-    events = dict(traj.events) | ({"switches": traj.switches} if isinstance(traj, lj.HybridTrajectory) else {})
+    events = dict(traj.events) | ({"switches": traj.switches} if isinstance(traj, HybridTrajectory) else {})
     for name, crossings in events.items():
         times = np.asarray(crossings.t)
         found += [name] if np.any(times[np.isfinite(times)] > t + 1e-9) else []
@@ -68,7 +69,7 @@ def test_two_balls_that_touch(q, v, right, count):
     """A gap at round-off, of either sign, is touched: an impact happens only where it closes."""
     traj = thrown(q, v, d=0.2)
     np.testing.assert_allclose(np.asarray(traj.v)[-1], right, atol=200 * 1e-14)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     assert int(traj.switches.count) == count and not bool(traj.switches.uncertain)
 
 

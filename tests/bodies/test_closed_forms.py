@@ -31,8 +31,8 @@ def test_a_free_body(tmp_path):
     Dzhanibekov's nut: Ω about the middle axis of the sphere vanishes there, and 1 - k² = 8e-4 amplifies errors.
     """
     i1, i2, i3 = moments = np.array([1.0, 2.0, 3.0])
-    body, pose = lj.Body("b", 1.0, tuple(moments)), lj.Pose.at()
-    system = lj.multibody([body])
+    body, pose = lj.bodies.Body("b", 1.0, tuple(moments)), lj.bodies.Pose.at()
+    system = lj.bodies.multibody([body])
 
     def motion(spin, ts):
         return lj.integrate(
@@ -75,12 +75,12 @@ def test_a_free_body(tmp_path):
 def top_on_its_tip():
     """A symmetric top of moments A about the tip and C about its axis; its state by tilt, spin about it and turn."""
     mass, length, across, C = 1.0, 0.5, 0.1, 0.05
-    top = lj.Body("top", mass, (across, across, C))
-    tip = lj.spherical(lj.ground.at(), top.at((0.0, 0.0, -length)))
-    system = lj.multibody([top], {"tip": tip}, [lj.weight([top])])
+    top = lj.bodies.Body("top", mass, (across, across, C))
+    tip = lj.bodies.spherical(lj.bodies.ground.at(), top.at((0.0, 0.0, -length)))
+    system = lj.bodies.multibody([top], {"tip": tip}, [lj.bodies.weight([top])])
 
     def state(tilt, own, turn):
-        pose = lj.Pose.at(axis=(1.0, 0.0, 0.0), angle=tilt)
+        pose = lj.bodies.Pose.at(axis=(1.0, 0.0, 0.0), angle=tilt)
         axis = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
         spin = own * axis + turn * np.array([0.0, 0.0, 1.0])
         pose = pose._replace(position=jnp.asarray(length * axis))
@@ -153,13 +153,15 @@ def test_a_rolling_disk():
     """
     m, R = 1.0, 0.4
     A, C = m * R**2 / 4, m * R**2 / 2
-    disk = lj.Body("disk", m, (A, A, C))
-    system = lj.multibody([disk], {"rim": lj.rolling(disk.at(), lj.ground.at(), R)}, [lj.weight([disk])])
+    disk = lj.bodies.Body("disk", m, (A, A, C))
+    system = lj.bodies.multibody(
+        [disk], {"rim": lj.bodies.rolling(disk.at(), lj.bodies.ground.at(), R)}, [lj.bodies.weight([disk])]
+    )
 
     def state(tilt, w3, we, falling):
         axis, up = np.array([np.sin(tilt), 0.0, np.cos(tilt)]), np.array([-np.cos(tilt), 0.0, np.sin(tilt)])
         spin = w3 * axis + we * up - falling * np.cross(axis, up)
-        pose = lj.Pose.at(R * up, (0.0, 1.0, 0.0), tilt)
+        pose = lj.bodies.Pose.at(R * up, (0.0, 1.0, 0.0), tilt)
         return {"disk": pose}, {"disk": pose.moving(np.cross(spin, R * up), spin)}
 
     def motion(start, end):
@@ -227,23 +229,23 @@ def test_a_chain_in_space_beside_mujoco():
     mujoco.mj_forward(model, data)
 
     bodies, joints, q, v, expected = [], {}, {}, {}, {}
-    parent, rotation, centre = lj.ground, np.eye(3), np.zeros(3)
+    parent, rotation, centre = lj.bodies.ground, np.eye(3), np.zeros(3)
     for i in range(1, 6):
         anchor, axis = data.xanchor[i - 1], data.xaxis[i - 1]
         before = parent.at(rotation.T @ (anchor - centre), rotation.T @ axis)
         centre, rotation = data.xipos[i].copy(), data.ximat[i].reshape(3, 3).copy()
-        body = lj.Body(f"link {i}", float(model.body_mass[i]), tuple(model.body_inertia[i].tolist()))
-        joints[f"hinge {i}"] = lj.revolute(before, body.at(rotation.T @ (anchor - centre), rotation.T @ axis))
+        body = lj.bodies.Body(f"link {i}", float(model.body_mass[i]), tuple(model.body_inertia[i].tolist()))
+        joints[f"hinge {i}"] = lj.bodies.revolute(before, body.at(rotation.T @ (anchor - centre), rotation.T @ axis))
         turned, (place, turn, place_rate, turn_rate) = np.zeros(4), np.zeros((4, 3, 5))
         mujoco.mju_mat2Quat(turned, data.ximat[i])
         mujoco.mj_jac(model, data, place, turn, centre, i)
         mujoco.mj_jacDot(model, data, place_rate, turn_rate, centre, i)
-        q[body.name] = lj.Pose(jnp.asarray(centre), jnp.asarray(turned))
+        q[body.name] = lj.bodies.Pose(jnp.asarray(centre), jnp.asarray(turned))
         v[body.name] = q[body.name].moving(place @ data.qvel, turn @ data.qvel)
         expected[body.name] = place @ data.qacc + place_rate @ data.qvel, turn @ data.qacc + turn_rate @ data.qvel
         bodies.append(body)
         parent = body
-    system = lj.multibody(bodies, joints, [lj.weight(bodies)])
+    system = lj.bodies.multibody(bodies, joints, [lj.bodies.weight(bodies)])
     a, _ = lj.accelerations(system, 0.0, q, v, None)
     for body in bodies:
         # Of e'' only 2 vec(e'' e*) has a vector part: Ω' in space.
@@ -263,22 +265,22 @@ def test_a_parallelogram_of_four_hinges():
     """
     r, width, c, b = 0.5, 1.2, 0.7, 2.0
     inertia, axis = c * r**2 / 12, (0.0, 1.0, 0.0)
-    left, right = (lj.Body(name, c, (inertia, inertia, 1e-3)) for name in ("left", "right"))
-    bar = lj.Body("bar", b, (1e-3, b * width**2 / 12, b * width**2 / 12))
+    left, right = (lj.bodies.Body(name, c, (inertia, inertia, 1e-3)) for name in ("left", "right"))
+    bar = lj.bodies.Body("bar", b, (1e-3, b * width**2 / 12, b * width**2 / 12))
     up, down = (0.0, 0.0, r / 2), (0.0, 0.0, -r / 2)
     hinges = {
-        "A": lj.revolute(lj.ground.at(axis=axis), left.at(up, axis)),
-        "B": lj.revolute(left.at(down, axis), bar.at((-width / 2, 0.0, 0.0), axis)),
-        "C": lj.revolute(bar.at((width / 2, 0.0, 0.0), axis), right.at(down, axis)),
-        "D": lj.revolute(lj.ground.at((width, 0.0, 0.0), axis), right.at(up, axis)),
+        "A": lj.bodies.revolute(lj.bodies.ground.at(axis=axis), left.at(up, axis)),
+        "B": lj.bodies.revolute(left.at(down, axis), bar.at((-width / 2, 0.0, 0.0), axis)),
+        "C": lj.bodies.revolute(bar.at((width / 2, 0.0, 0.0), axis), right.at(down, axis)),
+        "D": lj.bodies.revolute(lj.bodies.ground.at((width, 0.0, 0.0), axis), right.at(up, axis)),
     }
-    system = lj.multibody([left, right, bar], hinges, [lj.weight([left, right, bar])])
+    system = lj.bodies.multibody([left, right, bar], hinges, [lj.bodies.weight([left, right, bar])])
     angle = 0.8
     arm = r * np.array([np.sin(angle), 0.0, -np.cos(angle)])
     q = {
-        "left": lj.Pose.at(arm / 2, axis, -angle),
-        "right": lj.Pose.at(arm / 2 + [width, 0.0, 0.0], axis, -angle),
-        "bar": lj.Pose.at(arm + [width / 2, 0.0, 0.0]),
+        "left": lj.bodies.Pose.at(arm / 2, axis, -angle),
+        "right": lj.bodies.Pose.at(arm / 2 + [width, 0.0, 0.0], axis, -angle),
+        "bar": lj.bodies.Pose.at(arm + [width / 2, 0.0, 0.0]),
     }
     v = {name: pose.moving() for name, pose in q.items()}
     rate = np.sqrt((c + b) * G * r / (2 * (inertia + c * r**2 / 4) + b * r**2))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 
 G, MU = 9.81, 0.12
 RADIUS, MASS = 0.11, 6.0
@@ -15,7 +16,7 @@ FLOOR = jnp.array([0.0, 0.0, -RADIUS])
 # Moments of inertia over m R² of a ball, a disk and a hoop, which roll about y.
 BALL, DISK, HOOP = (0.4, 0.4, 0.4), (0.25, 0.5, 0.25), (0.5, 1.0, 0.5)
 
-round_body = lj.Body("round", MASS, lambda p: p["moments"] * MASS * RADIUS**2)
+round_body = lj.bodies.Body("round", MASS, lambda p: p["moments"] * MASS * RADIUS**2)
 
 
 def slip(t, q, v, p):
@@ -28,7 +29,7 @@ def thrown() -> lj.System:
     floor = lj.Contact(
         lambda t, q, p: round_body.pose(q).position[2] - RADIUS, friction=lambda p: p["mu"], sliding=slip
     )
-    return lj.multibody([round_body], {}, [lj.weight([round_body])], elements={"floor": floor})
+    return lj.bodies.multibody([round_body], {}, [lj.bodies.weight([round_body])], elements={"floor": floor})
 
 
 @pytest.mark.exhaustive
@@ -40,7 +41,7 @@ def test_thrown_bodies_come_to_roll():
     Routh, *Advanced Rigid Dynamics*, § 233: with k = I/(m R²) the slip s decays by (1 + 1/k) μ g, so that sliding ends
     at t = s k/((1 + k) μ g).
     """
-    system, start = thrown(), lj.Pose.at((0.0, 0.0, RADIUS))
+    system, start = thrown(), lj.bodies.Pose.at((0.0, 0.0, RADIUS))
     speed = np.array([8.0, 0.0])
     thrown_as = {
         "ball": (BALL, (0.0, 0.0, 0.0)), "disk": (DISK, (0.0, 0.0, 0.0)), "hoop": (HOOP, (0.0, 0.0, 0.0)),
@@ -55,7 +56,7 @@ def test_thrown_bodies_come_to_roll():
 
     moments, spins = (np.array(x) for x in zip(*thrown_as.values()))
     traj = motion(moments, spins)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     k = moments[:, 1]
     first = speed + np.stack([-spins[:, 1], spins[:, 0]], axis=1) * RADIUS
     lost = first * (k / (1 + k))[:, None]
@@ -76,7 +77,7 @@ def test_a_box_slides_and_stops():
     """A box on its four corners, thrown obliquely, slides straight with μ g and stops; the corners ahead carry more.
     Twin: as if all corners carried the same."""
     half, mu, mass = np.array([0.3, 0.2, 0.1]), 0.3, 2.0
-    box = lj.Body("box", mass, tuple(mass / 3 * (np.sum(half**2) - half**2)))
+    box = lj.bodies.Body("box", mass, tuple(mass / 3 * (np.sum(half**2) - half**2)))
     corners = np.array([[x, y, -1.0] for x in (1.0, -1.0) for y in (1.0, -1.0)]) * half
 
     def gaps(t, q, p):
@@ -86,11 +87,11 @@ def test_a_box_slides_and_stops():
         return (box.rates(v).position[None] + jnp.cross(box.spin(q, v)[None], box.directions(q, corners)))[:, :2]
 
     floor = lj.Contact(gaps, friction=mu, sliding=slips)
-    system = lj.multibody([box], {}, [lj.weight([box])], elements={"floor": floor})
-    pose, throw, ts = lj.Pose.at((0.0, 0.0, half[2]), angle=0.3), np.array([2.0, 1.0]), np.linspace(0.0, 1.0, 6)
+    system = lj.bodies.multibody([box], {}, [lj.bodies.weight([box])], elements={"floor": floor})
+    pose, throw, ts = lj.bodies.Pose.at((0.0, 0.0, half[2]), angle=0.3), np.array([2.0, 1.0]), np.linspace(0.0, 1.0, 6)
     v = {"box": pose.moving((*throw, 0.0))}
     traj = lj.integrate(system, {"box": pose}, v, None, ts=ts, rtol=1e-10)
-    assert isinstance(traj, lj.HybridTrajectory) and traj.multipliers["floor friction"].shape == (6, 4, 2)
+    assert isinstance(traj, HybridTrajectory) and traj.multipliers["floor friction"].shape == (6, 4, 2)
     speed = np.linalg.norm(throw)
     slides = np.minimum(ts, speed / (mu * G))[:, None]
     places = throw * slides - mu * G * throw / speed * slides**2 / 2

@@ -13,16 +13,16 @@ from tests.bodies.test_tree import a_body, a_place, like, missed
 def shaken(t, params):
     """The motion of a table that turns faster and faster about its normal, which is z, and is shaken."""
     angle = params["rate"] * t + 0.3 * t**2
-    return lj.Pose.at((jnp.sin(2.0 * t), 0.5 * t**2, jnp.cos(t)), angle=angle)
+    return lj.bodies.Pose.at((jnp.sin(2.0 * t), 0.5 * t**2, jnp.cos(t)), angle=angle)
 
 
-TABLE, PLATE = lj.Body("table", motion=shaken), lj.Body("plate", 2.0, (1.0, 1.0, 1.5))
+TABLE, PLATE = lj.bodies.Body("table", motion=shaken), lj.bodies.Body("plate", 2.0, (1.0, 1.0, 1.5))
 
 
 @pytest.mark.slow
 def test_a_plate_on_a_table_that_turns_and_is_shaken():
     """r'' = -R^T p'' - 2 w x r' - w x (w x r) - w' x r in the table's frame, to 1e-12; without Coriolis it is not."""
-    tree = lj.Tree([TABLE, PLATE], {"on": lj.planar(TABLE.at((0.0, 0.0, 0.2)), PLATE.at())})
+    tree = lj.bodies.Tree([TABLE, PLATE], {"on": lj.bodies.planar(TABLE.at((0.0, 0.0, 0.2)), PLATE.at())})
     recursion = tree.system().forward_dynamics
     assert recursion is not None
     t, params = 0.7, {"rate": 1.1}
@@ -49,23 +49,23 @@ def test_a_plate_on_a_table_that_turns_and_is_shaken():
 
 def test_refused_trees_on_driven_bodies():
     """A joint that ends on what moves as given, poses without a time."""
-    hinge = lj.revolute(TABLE.at(), PLATE.at())
-    tree = lj.Tree([PLATE, TABLE], {"hinge": hinge})
+    hinge = lj.bodies.revolute(TABLE.at(), PLATE.at())
+    tree = lj.bodies.Tree([PLATE, TABLE], {"hinge": hinge})
     assert repr(tree) == "Tree(2 bodies; hinge)" and list(tree.reference()) == ["hinge"]
     with pytest.raises(TypeError, match="a body of this tree moves as given"):
         tree.poses({"hinge": 0.1}, {"rate": 1.0})
     with pytest.raises(ValueError, match="body 'table' moves as given, and hangs on the joint 'hinge'"):
-        lj.Tree([PLATE, TABLE], {"hinge": lj.revolute(PLATE.at(), TABLE.at())})
+        lj.bodies.Tree([PLATE, TABLE], {"hinge": lj.bodies.revolute(PLATE.at(), TABLE.at())})
 
 
 def test_driven_bodies_in_pictures():
     """What is fixed in a turning table is drawn where it is at the time of the picture."""
-    hinge = lj.revolute(TABLE.at((1.0, 0.0, 0.0)), PLATE.at())
+    hinge = lj.bodies.revolute(TABLE.at((1.0, 0.0, 0.0)), PLATE.at())
     expected = [np.sin(1.0) + np.cos(0.625), 0.125 + np.sin(0.625), np.cos(0.5)]
-    pose = lj.Pose.at(expected)
+    pose = lj.bodies.Pose.at(expected)
     for system, q in (
-        (lj.Tree([TABLE, PLATE], {"hinge": hinge}).system(), {"hinge": 0.0}),
-        (lj.multibody([TABLE, PLATE], {"hinge": hinge}), {"plate": pose}),
+        (lj.bodies.Tree([TABLE, PLATE], {"hinge": hinge}).system(), {"hinge": 0.0}),
+        (lj.bodies.multibody([TABLE, PLATE], {"hinge": hinge}), {"plate": pose}),
     ):
         picture = lj.draw(system, q, {"rate": 1.1}, t=0.5)
         assert isinstance(picture.points, InSpace)
@@ -81,19 +81,19 @@ def test_the_recursion_solves_lagranges_equations(count):
     rng = np.random.default_rng(5)
 
     def tumbling(t, params):
-        turned = lj.Pose.at((jnp.sin(params["w"] * t), 0.3 * t**2, 0.2), (1.0, 2.0, 0.5), jnp.cos(2.0 * t))
+        turned = lj.bodies.Pose.at((jnp.sin(params["w"] * t), 0.3 * t**2, 0.2), (1.0, 2.0, 0.5), jnp.cos(2.0 * t))
         return turned.turned((0.0, 0.3, 1.0), params["w"] * t)
 
-    base, bodies = lj.Body("base", motion=tumbling), [a_body(rng, f"b{i}") for i in range(count)]
-    kinds = lj.revolute, lj.prismatic, lj.spherical, lj.universal
+    base, bodies = lj.bodies.Body("base", motion=tumbling), [a_body(rng, f"b{i}") for i in range(count)]
+    kinds = lj.bodies.revolute, lj.bodies.prismatic, lj.bodies.spherical, lj.bodies.universal
     parents = base, bodies[0], base, *bodies[2:3]
     joints = {f"j{i}": kinds[i](a_place(rng, parents[i]), a_place(rng, body)) for i, body in enumerate(bodies)}
     free = [a_body(rng, "free")] if count == 4 else []
-    tree = lj.Tree([*bodies, base, *free], joints)
+    tree = lj.bodies.Tree([*bodies, base, *free], joints)
     loads = [
-        lj.weight(bodies),
-        lj.spring(a_place(rng, base), a_place(rng, bodies[-1]), 3.0, 0.2, damping=0.4),
-        lj.motor(a_place(rng, base), a_place(rng, bodies[0]), 0.7),
+        lj.bodies.weight(bodies),
+        lj.bodies.spring(a_place(rng, base), a_place(rng, bodies[-1]), 3.0, 0.2, damping=0.4),
+        lj.bodies.motor(a_place(rng, base), a_place(rng, bodies[0]), 0.7),
     ]
     off = missed(tree.system(loads))
     q = like(rng, tree.reference())
@@ -106,10 +106,10 @@ def test_the_recursion_solves_lagranges_equations(count):
 @pytest.mark.exhaustive
 def test_a_bead_on_a_turning_rod():
     """x = x0 cosh wt + v0/w sinh wt, its gradient by w in both modes, lanes, and h = T2 + V that stays."""
-    bead = lj.Body("bead", 2.0, (1.0, 1.0, 1.0))
-    rod = lj.Body("rod", motion=lambda t, params: lj.Pose.at(angle=params * t))
+    bead = lj.bodies.Body("bead", 2.0, (1.0, 1.0, 1.0))
+    rod = lj.bodies.Body("rod", motion=lambda t, params: lj.bodies.Pose.at(angle=params * t))
     along = (1.0, 0.0, 0.0)
-    system = lj.Tree([rod, bead], {"x": lj.prismatic(rod.at(axis=along), bead.at(axis=along))}).system()
+    system = lj.bodies.Tree([rod, bead], {"x": lj.bodies.prismatic(rod.at(axis=along), bead.at(axis=along))}).system()
     q, v = {"x": jnp.asarray(0.5)}, {"x": jnp.asarray(0.2)}
     end = lambda w: lj.integrate(system, q, v, w, ts=jnp.array([0.0, 1.0]), rtol=1e-12, atol=1e-12).q["x"][-1]
     exact = lambda w: 0.5 * jnp.cosh(w) + 0.2 / w * jnp.sinh(w)

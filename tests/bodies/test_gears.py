@@ -13,7 +13,7 @@ RADIUS, AWAY = 0.1, 0.25
 AXIS = np.array([1.0, 2.0, -2.0]) / 3.0
 IN_PLANE = np.array([2.0, 1.0, 2.0]) / 3.0
 BODIES = sun, planet, ring, arm, rack = [
-    lj.Body(name, mass, (1.0, 1.0, moment))
+    lj.bodies.Body(name, mass, (1.0, 1.0, moment))
     for name, mass, moment in (("sun", 1.0, 1.3), ("planet", 2.0, 0.9), ("ring", 3.0, 1.8), ("arm", 4.0, 1.1),
                                ("rack", 5.0, 1.0))
 ]  # fmt: skip
@@ -21,26 +21,26 @@ BODIES = sun, planet, ring, arm, rack = [
 
 def joints_and_meshes(inner: float = -PLANET / SUN):
     """A planetary gear about a slanting axis, whose sun drives a rack."""
-    axle = lj.ground.at(axis=AXIS)
+    axle = lj.bodies.ground.at(axis=AXIS)
     joints = {
-        "s": lj.revolute(axle, sun.at()),
-        "c": lj.revolute(axle, arm.at()),
-        "r": lj.revolute(axle, ring.at()),
-        "p": lj.revolute(arm.at((AWAY, 0.0, 0.0)), planet.at()),
-        "x": lj.prismatic(lj.ground.at(axis=IN_PLANE), rack.at()),
+        "s": lj.bodies.revolute(axle, sun.at()),
+        "c": lj.bodies.revolute(axle, arm.at()),
+        "r": lj.bodies.revolute(axle, ring.at()),
+        "p": lj.bodies.revolute(arm.at((AWAY, 0.0, 0.0)), planet.at()),
+        "x": lj.bodies.prismatic(lj.bodies.ground.at(axis=IN_PLANE), rack.at()),
     }
     meshes = {
-        "inner": lj.gear(sun.at(), planet.at(), inner, carrier=arm),
-        "outer": lj.gear(ring.at(), planet.at(), lambda params: params["outer"], carrier=arm),
-        "rack": lj.rack_and_pinion(sun.at(), rack.at(), -RADIUS),
+        "inner": lj.bodies.gear(sun.at(), planet.at(), inner, carrier=arm),
+        "outer": lj.bodies.gear(ring.at(), planet.at(), lambda params: params["outer"], carrier=arm),
+        "rack": lj.bodies.rack_and_pinion(sun.at(), rack.at(), -RADIUS),
     }
     return joints, meshes
 
 
 PARAMS = {"outer": np.array(PLANET / RING)}
 TORQUES = np.array([2.0, -0.7])
-TREE = lj.Tree(BODIES, joints_and_meshes()[0])
-LOADS = [lj.motor(lj.ground.at(axis=AXIS), body.at(), x) for body, x in zip((sun, ring), TORQUES)]
+TREE = lj.bodies.Tree(BODIES, joints_and_meshes()[0])
+LOADS = [lj.bodies.motor(lj.bodies.ground.at(axis=AXIS), body.at(), x) for body, x in zip((sun, ring), TORQUES)]
 
 
 def by_willis(of_sun, of_ring):
@@ -65,15 +65,16 @@ def test_willis_equation():
                           q, v, PARAMS)  # fmt: skip
     assert np.max(right) < 1e-14 and wrong > 0.1
     # A rack that slides along a turning arm, moved by a pinion on it; its place is not where the teeth meet.
-    slides = lj.Tree(
+    slides = lj.bodies.Tree(
         [arm, planet, rack],
-        {"c": lj.revolute(lj.ground.at(axis=AXIS), arm.at()), "p": lj.revolute(arm.at((AWAY, 0.0, 0.0)), planet.at()),
-         "x": lj.prismatic(arm.at((AWAY, 0.5, 0.0), axis=(1.0, 0.0, 0.0)), rack.at(axis=(1.0, 0.0, 0.0)))},
+        {"c": lj.bodies.revolute(lj.bodies.ground.at(axis=AXIS), arm.at()),
+         "p": lj.bodies.revolute(arm.at((AWAY, 0.0, 0.0)), planet.at()),
+         "x": lj.bodies.prismatic(arm.at((AWAY, 0.5, 0.0), axis=(1.0, 0.0, 0.0)), rack.at(axis=(1.0, 0.0, 0.0)))},
     )  # fmt: skip
     v = {"c": 1.3, "p": 0.7, "x": -0.3 * 0.7}
     q = {name: q[name] for name in v}
     teeth = planet.at(), rack.at(axis=(1.0, 0.0, 0.0)), -0.3
-    meshes = [lj.rack_and_pinion(*teeth, carrier=arm), lj.rack_and_pinion(*teeth)]
+    meshes = [lj.bodies.rack_and_pinion(*teeth, carrier=arm), lj.bodies.rack_and_pinion(*teeth)]
     right, wrong = slips(slides, meshes, q, v, None)
     assert right < 1e-14 and wrong > 0.1
 
@@ -100,8 +101,8 @@ def test_a_planetary_gear():
     for name, x in by_willis(*expected()[0]).items():
         np.testing.assert_allclose(a[name], x, rtol=1e-12, err_msg=name)
     np.testing.assert_allclose([multipliers[name] for name in meshes], expected()[1], rtol=1e-12)
-    q, v = ({name: lj.Pose(*x[name][:2]) for name in x} for x in (TREE.poses(q), TREE.rates(q, v)))
-    _, multipliers = lj.accelerations(lj.multibody(BODIES, joints | meshes, LOADS), 0.0, q, v, PARAMS)
+    q, v = ({name: lj.bodies.Pose(*x[name][:2]) for name in x} for x in (TREE.poses(q), TREE.rates(q, v)))
+    _, multipliers = lj.accelerations(lj.bodies.multibody(BODIES, joints | meshes, LOADS), 0.0, q, v, PARAMS)
     np.testing.assert_allclose([multipliers[name] for name in meshes], expected()[1], rtol=1e-10)
 
 
@@ -109,23 +110,23 @@ def test_refused_gears():
     """What is no gear is said with its body or number, and how it is written."""
     a, b = sun.at(), planet.at()
     for given, error, words in (
-        ((a, b, 0), ValueError, "the ratio of lj.gear must be a number that is not 0"),
-        ((a, b, (1.0, 2.0)), ValueError, "the ratio of lj.gear must be a number"),
-        ((a, b, jnp.nan), ValueError, "the ratio of lj.gear must be a number"),
+        ((a, b, 0), ValueError, "the ratio of lj.bodies.gear must be a number that is not 0"),
+        ((a, b, (1.0, 2.0)), ValueError, "the ratio of lj.bodies.gear must be a number"),
+        ((a, b, jnp.nan), ValueError, "the ratio of lj.bodies.gear must be a number"),
         ((a, sun.at((1.0, 0.0, 0.0)), 2.0), ValueError, "both places are on 'sun'"),
         ((a, planet, 2.0), TypeError, "and Body is none"),
-        ((a, b, 2.0, arm.at()), TypeError, "the carrier of lj.gear is a body, and Marker is none"),
-        ((a, b, 2.0, sun), ValueError, "the carrier of lj.gear, 'sun', is one of the two bodies"),
+        ((a, b, 2.0, arm.at()), TypeError, "the carrier of lj.bodies.gear is a body, and Marker is none"),
+        ((a, b, 2.0, sun), ValueError, "the carrier of lj.bodies.gear, 'sun', is one of the two bodies"),
         ((a, b, lambda t, q, v, params: 2.0), TypeError, "ratio"),
     ):
         with pytest.raises(error, match=words):
-            lj.gear(*given)
-    with pytest.raises(ValueError, match="the radius of lj.rack_and_pinion must be a number that is not 0"):
-        lj.rack_and_pinion(a, b, 0.0)
-    assert jax.jit(lambda ratio: lj.gear(a, b, ratio).phi(0.0, *still(), None))(0.0) == 0.0
+            lj.bodies.gear(*given)
+    with pytest.raises(ValueError, match="the radius of lj.bodies.rack_and_pinion must be a number that is not 0"):
+        lj.bodies.rack_and_pinion(a, b, 0.0)
+    assert jax.jit(lambda ratio: lj.bodies.gear(a, b, ratio).phi(0.0, *still(), None))(0.0) == 0.0
 
 
 def still():
     """Sun and planet at rest."""
-    at = {name: lj.Pose.at() for name in ("sun", "planet")}
+    at = {name: lj.bodies.Pose.at() for name in ("sun", "planet")}
     return at, {name: pose.moving() for name, pose in at.items()}

@@ -20,7 +20,7 @@ FILE = """<robot name="slide"><link name="rail"/><link name="cart"><inertial><ma
 
 def turning(t, params):
     """The motion of a table."""
-    return lj.Pose.at(angle=0.5 * t)
+    return lj.bodies.Pose.at(angle=0.5 * t)
 
 
 def bowl(r, params):
@@ -30,47 +30,56 @@ def bowl(r, params):
 
 def loaded(torque: float = 0.5) -> lj.System:
     """A body on a pivot with a load of each kind."""
-    bob, ground = lj.Body("bob", 1.0, (0.1, 0.2, 0.2)), lj.ground.at()
+    bob, ground = lj.bodies.Body("bob", 1.0, (0.1, 0.2, 0.2)), lj.bodies.ground.at()
     loads = [
-        lj.weight([bob]),
-        lj.spring(lj.ground.at((1.0, 0.0, 0.0)), bob.at(), 3.0, length=0.5, damping=0.1),
-        lj.torsion(ground, bob.at(), 1.0, angle=0.2, damping=0.3),
-        lj.motor(ground, bob.at(), torque),
-        lj.applied(bob.at(), (0.1, 0.2, 0.3)),
+        lj.bodies.weight([bob]),
+        lj.bodies.spring(lj.bodies.ground.at((1.0, 0.0, 0.0)), bob.at(), 3.0, length=0.5, damping=0.1),
+        lj.bodies.torsion(ground, bob.at(), 1.0, angle=0.2, damping=0.3),
+        lj.bodies.motor(ground, bob.at(), torque),
+        lj.bodies.applied(bob.at(), (0.1, 0.2, 0.3)),
     ]
-    return lj.multibody([bob], {"pivot": lj.spherical(ground, bob.at(UP))}, loads)
+    return lj.bodies.multibody([bob], {"pivot": lj.bodies.spherical(ground, bob.at(UP))}, loads)
 
 
 def cases() -> dict:
     """Systems of each kind, with a state of each."""
-    ball, table = lj.Body("ball", 1.0, (0.4, 0.4, 0.4)), lj.Body("table", motion=turning)
-    bob, near, far = (lj.Pose.at((0.1, 0.2, z), ACROSS, 0.3) for z in (-1.0, 1.0, -4.0))
-    arm, hand = (lj.Body(name, 1.0, (0.1, 0.1, 0.01)) for name in ("arm", "hand"))
+    ball, table = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4)), lj.bodies.Body("table", motion=turning)
+    bob, near, far = (lj.bodies.Pose.at((0.1, 0.2, z), ACROSS, 0.3) for z in (-1.0, 1.0, -4.0))
+    arm, hand = (lj.bodies.Body(name, 1.0, (0.1, 0.1, 0.01)) for name in ("arm", "hand"))
     joints = {
-        "shoulder": lj.revolute(lj.ground.at(axis=ACROSS), arm.at((0.0, 0.0, 0.5), axis=ACROSS)),
-        "elbow": lj.revolute(arm.at((0.0, 0.0, -0.5), axis=ACROSS), hand.at((0.0, 0.0, 0.5), axis=ACROSS)),
+        "shoulder": lj.bodies.revolute(lj.bodies.ground.at(axis=ACROSS), arm.at((0.0, 0.0, 0.5), axis=ACROSS)),
+        "elbow": lj.bodies.revolute(arm.at((0.0, 0.0, -0.5), axis=ACROSS), hand.at((0.0, 0.0, 0.5), axis=ACROSS)),
     }
     closed = {
-        "end": lj.planar(lj.ground.at(), hand.at()),
-        "rolls": lj.rolling_sphere(hand.at(), lj.ground.at(), 1.0),
-        "gear": lj.gear(lj.ground.at(axis=ACROSS), hand.at(axis=ACROSS), 3.0, carrier=arm),
-        "rack": lj.rack_and_pinion(arm.at(axis=ACROSS), hand.at(), 0.5),
+        "end": lj.bodies.planar(lj.bodies.ground.at(), hand.at()),
+        "rolls": lj.bodies.rolling_sphere(hand.at(), lj.bodies.ground.at(), 1.0),
+        "gear": lj.bodies.gear(lj.bodies.ground.at(axis=ACROSS), hand.at(axis=ACROSS), 3.0, carrier=arm),
+        "rack": lj.bodies.rack_and_pinion(arm.at(axis=ACROSS), hand.at(), 0.5),
     }
-    touching = lj.rolling_sphere(ball.at(), lj.ground.at(), 1.0)["touches"].function
+    touching = lj.bodies.rolling_sphere(ball.at(), lj.bodies.ground.at(), 1.0)["touches"].function
     model = lj.read_urdf(FILE)
     still, spun = ({"ball": x.moving((0.3, 0.0, 0.0), (0.1, 0.2, 0.3))} for x in (near, far))
     angles = {"shoulder": jnp.asarray(0.3), "elbow": jnp.asarray(0.1)}
     return {
         "loads": (loaded(), {"bob": bob}, {"bob": bob.moving(spin=(0.1, 0.2, 0.3))}),
-        "driven": (lj.multibody([table, ball], lj.rolling_sphere(ball.at(), table.at(), 1.0)), {"ball": near}, still),
+        "driven": (
+            lj.bodies.multibody([table, ball], lj.bodies.rolling_sphere(ball.at(), table.at(), 1.0)),
+            {"ball": near}, still,
+        ),
         "surface": (
-            lj.multibody([ball], {"on": lj.rolling_sphere(ball.at(), lj.Surface(bowl), 1.0)}), {"ball": far}, spun
+            lj.bodies.multibody([ball], {"on": lj.bodies.rolling_sphere(ball.at(), lj.bodies.Surface(bowl), 1.0)}),
+            {"ball": far}, spun,
         ),
         "contact": (
-            lj.multibody([ball], elements={"floor": lj.Contact(touching, restitution=0.5)}), {"ball": near}, still
+            lj.bodies.multibody([ball], elements={"floor": lj.Contact(touching, restitution=0.5)}),
+            {"ball": near}, still,
         ),
-        "tree": (lj.Tree([arm, hand], joints).system([lj.weight([arm]), lj.motor(*ends(joints), 0.5)], closed),
-                 angles, angles),
+        "tree": (
+            lj.bodies.Tree([arm, hand], joints).system(
+                [lj.bodies.weight([arm]), lj.bodies.motor(*ends(joints), 0.5)], closed
+            ),
+            angles, angles,
+        ),
         "file": (model.system(), *model.state({"s": 0.5}, {"s": 3.0})),
         "joints of a file": (model.joint_system(), *model.joint_state({"s": 0.5}, {"s": 3.0})),
     }  # fmt: skip

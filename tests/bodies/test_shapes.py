@@ -8,14 +8,17 @@ import lagjax as lj
 from lagjax.display import CUBE, DISK, SPHERE, InSpace
 from lagjax.integrate.trajectory.subject import subject_of
 
-A, B = lj.Body("a", 2.0, (0.1, 0.2, 0.25)), lj.Body("b", lambda params: params["m"], lambda params: (1.0, 1.0, 0.0))
-# Turned by 0.7 about (1, 1, 0), as by `lj.Pose.at`, which would compute.
-POSE = lj.Pose(np.array([1.0, 2.0, 3.0]), np.array([np.cos(0.35), *np.sin(0.35) * np.sqrt([0.5, 0.5, 0.0])]))
+A, B = (
+    lj.bodies.Body("a", 2.0, (0.1, 0.2, 0.25)),
+    lj.bodies.Body("b", lambda params: params["m"], lambda params: (1.0, 1.0, 0.0)),
+)
+# Turned by 0.7 about (1, 1, 0), as by `lj.bodies.Pose.at`, which would compute.
+POSE = lj.bodies.Pose(np.array([1.0, 2.0, 3.0]), np.array([np.cos(0.35), *np.sin(0.35) * np.sqrt([0.5, 0.5, 0.0])]))
 
 
 def drawn(system, params=None, **poses):
     """What is drawn of a system at one state."""
-    q = {name: lj.Pose(*(x[None] for x in pose)) for name, pose in poses.items()}
+    q = {name: lj.bodies.Pose(*(x[None] for x in pose)) for name, pose in poses.items()}
     frame = subject_of(None, system, params).frames(np.zeros(1), q)
     assert isinstance(frame, InSpace)
     return frame
@@ -23,14 +26,14 @@ def drawn(system, params=None, **poses):
 
 def test_boxes_have_the_inertia():
     """Edges whose m (b² + c²)/12 are the moments, along principal axes. Twin: edges in another order are not."""
-    frame = drawn(lj.multibody([A]), a=POSE)
+    frame = drawn(lj.bodies.multibody([A]), a=POSE)
     (box,) = frame.shapes
     x, y, z = box.size**2
     np.testing.assert_allclose([2 * (y + z) / 12, 2 * (x + z) / 12, 2 * (x + y) / 12], A.inertia, rtol=1e-12)
     # With other axes of the body the box is turned in it: its second moments turn with the inertia.
     rows = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    tilted = lj.Body("a", 2.0, rows @ np.diag(A.inertia) @ rows.T)
-    (found,) = drawn(lj.multibody([tilted]), a=POSE).shapes
+    tilted = lj.bodies.Body("a", 2.0, rows @ np.diag(A.inertia) @ rows.T)
+    (found,) = drawn(lj.bodies.multibody([tilted]), a=POSE).shapes
     axes = np.asarray(found.anchors[0].axes)
     second = axes.T @ np.diag(found.size**2) @ axes
     np.testing.assert_allclose(second, rows @ np.diag(box.size**2) @ rows.T, atol=1e-12)
@@ -40,9 +43,9 @@ def test_boxes_have_the_inertia():
 
 def test_joints_springs_and_params():
     """A dot and arms at a joint, a line for a spring; mass and inertia by params; a thin rod keeps a thickness."""
-    joint = lj.spherical(A.at((0.0, 0.0, 1.0)), B.at((1.0, 0.0, 0.0)))
-    spring = lj.spring(lj.ground.at(), B.at(), stiffness=1.0)
-    frame = drawn(lj.multibody([A, B], {"joint": joint}, [spring]), {"m": 12.0}, a=POSE, b=POSE)
+    joint = lj.bodies.spherical(A.at((0.0, 0.0, 1.0)), B.at((1.0, 0.0, 0.0)))
+    spring = lj.bodies.spring(lj.bodies.ground.at(), B.at(), stiffness=1.0)
+    frame = drawn(lj.bodies.multibody([A, B], {"joint": joint}, [spring]), {"m": 12.0}, a=POSE, b=POSE)
     assert [shape.kind for shape in frame.shapes] == ["solid", "solid", "dot", "line", "line", "gap", "line"]
     np.testing.assert_allclose(frame.shapes[1].size, [0.04, 0.04, 1.0], rtol=1e-12)
     np.testing.assert_allclose(
@@ -52,21 +55,21 @@ def test_joints_springs_and_params():
 
 def test_wheels():
     """What rolls is drawn as a disk across its axis, or a sphere, in the place of a box."""
-    wheel = lj.rolling(A.at(axis=(0.0, 1.0, 0.0)), lj.ground.at(), radius=0.3)
-    (found,) = drawn(lj.multibody([A], {"wheel": wheel}), a=POSE).shapes
+    wheel = lj.bodies.rolling(A.at(axis=(0.0, 1.0, 0.0)), lj.bodies.ground.at(), radius=0.3)
+    (found,) = drawn(lj.bodies.multibody([A], {"wheel": wheel}), a=POSE).shapes
     assert found.surface is DISK and found.size[0] == 0.3 and found.anchors[0].axes[2] == (0.0, 1.0, 0.0)
-    ball = lj.rolling_sphere(B.at(), lj.ground.at(), radius=lambda params: params["m"])
-    shapes = drawn(lj.multibody([A, B], {"ball": ball}), {"m": 0.5}, a=POSE, b=POSE).shapes
+    ball = lj.bodies.rolling_sphere(B.at(), lj.bodies.ground.at(), radius=lambda params: params["m"])
+    shapes = drawn(lj.bodies.multibody([A, B], {"ball": ball}), {"m": 0.5}, a=POSE, b=POSE).shapes
     assert [shape.surface for shape in shapes] == [CUBE, SPHERE] and shapes[1].size[0] == 0.5
 
 
 def test_shapes_stand_where_bodies_are():
     """The corners of a box on a marker are the points of the body; a mesh's are those given."""
     marker = A.at((0.1, 0.2, 0.3), axis=(0.0, 1.0, 0.0))
-    box = lj.box(marker, (0.5, 0.6, 0.7))
-    mesh = lj.mesh(A, [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
-    frame = subject_of([box, mesh], lj.multibody([A]), None).frames(
-        np.zeros(1), {"a": lj.Pose(*(x[None] for x in POSE))}
+    box = lj.shapes.box(marker, (0.5, 0.6, 0.7))
+    mesh = lj.shapes.mesh(A, [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+    frame = subject_of([box, mesh], lj.bodies.multibody([A]), None).frames(
+        np.zeros(1), {"a": lj.bodies.Pose(*(x[None] for x in POSE))}
     )
     assert isinstance(frame, InSpace)
     corner = jnp.array([0.5, 0.6, 0.7]) / 2 @ jnp.array(marker.frame) + jnp.array([0.1, 0.2, 0.3])
@@ -80,10 +83,10 @@ def test_shapes_stand_where_bodies_are():
 
 def test_what_is_no_place():
     """Names in place of bodies, colours by name, and lines through nothing are refused."""
-    with pytest.raises(TypeError, match="(?s)not str.*Fix: lj.sphere"):
-        lj.sphere("a", 1.0)
+    with pytest.raises(TypeError, match="(?s)not str.*Fix: lj.shapes.sphere"):
+        lj.shapes.sphere("a", 1.0)
     with pytest.raises(ValueError, match="six hexadecimal digits, and is 'red'"):
-        lj.sphere(A, 1.0, color="red")
+        lj.shapes.sphere(A, 1.0, color="red")
     with pytest.raises(ValueError, match="needs places"):
-        lj.line()
-    assert repr(lj.line((0.0, 0.0, 1.0), A)) == "Shape(a line on the ground, 'a')"
+        lj.shapes.line()
+    assert repr(lj.shapes.line((0.0, 0.0, 1.0), A)) == "Shape(a line on the ground, 'a')"

@@ -20,7 +20,7 @@ def a_body(rng, name, mass=None):
     moments = rng.uniform(0.1, 1.0, 3)
     axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     inertia = axes @ np.diag(moments.sum() - moments) @ axes.T
-    return lj.Body(name, rng.uniform(0.5, 2.0) if mass is None else mass, (inertia + inertia.T) / 2)
+    return lj.bodies.Body(name, rng.uniform(0.5, 2.0) if mass is None else mass, (inertia + inertia.T) / 2)
 
 
 def a_place(rng, body):
@@ -37,30 +37,38 @@ def every_joint():
     """A tree with all kinds of joints, forks, a free body, functions of params, and all kinds of loads."""
     rng = np.random.default_rng(1)
     b = [a_body(rng, f"b{i}", mass=(lambda params: params["m"]) if i in (2, 5) else None) for i in range(10)]
-    frames = [lj.Body(name, 0.0, (0.0, 0.0, 0.0)) for name in ("mount", "sight")]
-    pairs = [(lj.ground, b[0]), (b[0], b[1]), (b[0], b[2]), (b[1], b[3]), (b[1], b[4]), (b[4], b[5]), (b[2], b[6])]
+    frames = [lj.bodies.Body(name, 0.0, (0.0, 0.0, 0.0)) for name in ("mount", "sight")]
+    pairs = [
+        (lj.bodies.ground, b[0]),
+        (b[0], b[1]),
+        (b[0], b[2]),
+        (b[1], b[3]),
+        (b[1], b[4]),
+        (b[4], b[5]),
+        (b[2], b[6]),
+    ]
     pairs += [(b[3], b[8]), (b[8], frames[0]), (frames[0], b[9]), (b[9], frames[1])]
     places = [(a_place(rng, x), a_place(rng, y)) for x, y in pairs]
     joints = {
-        "hinge": lj.revolute(*places[0]),
-        "slide": lj.prismatic(*places[1]),
-        "pair": [lj.revolute(*places[2]), lj.revolute(*places[3])],
-        "ball": lj.spherical(*places[4]),
-        "ring": lj.cylindrical(*places[5]),
-        "weld": lj.fixed(*places[6]),
-        "cross": lj.universal(*places[7]),
-        "plate": lj.planar(*places[8]),
-        "socket": lj.spherical(*places[9]),
-        "end": lj.fixed(*places[10]),
+        "hinge": lj.bodies.revolute(*places[0]),
+        "slide": lj.bodies.prismatic(*places[1]),
+        "pair": [lj.bodies.revolute(*places[2]), lj.bodies.revolute(*places[3])],
+        "ball": lj.bodies.spherical(*places[4]),
+        "ring": lj.bodies.cylindrical(*places[5]),
+        "weld": lj.bodies.fixed(*places[6]),
+        "cross": lj.bodies.universal(*places[7]),
+        "plate": lj.bodies.planar(*places[8]),
+        "socket": lj.bodies.spherical(*places[9]),
+        "end": lj.bodies.fixed(*places[10]),
     }
     rotors = {"hinge": 0.4, "pair": (0.2, 0.0), "ball": 0.3, "plate": lambda params: params["m"] * jnp.arange(3.0)}
-    tree = lj.Tree([*b, *frames], joints, rotors)
+    tree = lj.bodies.Tree([*b, *frames], joints, rotors)
     loads = [
-        lj.weight(b[:5], g=lambda params: jnp.array([0.0, 1.0, -params["g"]])),
-        lj.spring(a_place(rng, b[3]), a_place(rng, b[5]), 2.0, 0.5, damping=0.7),
-        lj.motor(a_place(rng, b[0]), a_place(rng, b[2]), lambda t, q, v, params: 1.3 - v["hinge"]),
-        lj.applied(a_place(rng, b[7]), (1.0, 2.0, 3.0)),
-        lj.spring(a_place(rng, lj.ground), a_place(rng, b[4]), 1.5, 0.2, damping=0.4),
+        lj.bodies.weight(b[:5], g=lambda params: jnp.array([0.0, 1.0, -params["g"]])),
+        lj.bodies.spring(a_place(rng, b[3]), a_place(rng, b[5]), 2.0, 0.5, damping=0.7),
+        lj.bodies.motor(a_place(rng, b[0]), a_place(rng, b[2]), lambda t, q, v, params: 1.3 - v["hinge"]),
+        lj.bodies.applied(a_place(rng, b[7]), (1.0, 2.0, 3.0)),
+        lj.bodies.spring(a_place(rng, lj.bodies.ground), a_place(rng, b[4]), 1.5, 0.2, damping=0.4),
     ]
     system = tree.system(loads, potential=lambda t, q, params: 2.0 * q["slide"] ** 2 + q["pair"][0] * q["ring"][1])
     return rng, tree, system, {"m": jnp.asarray(1.3), "g": jnp.asarray(9.81)}
@@ -72,7 +80,7 @@ def test_shapes_of_coordinates():
     shapes = {name: jax.tree.map(jnp.shape, x) for name, x in tree.reference().items()}
     assert shapes == {
         "hinge": (), "slide": (), "pair": (2,), "ball": (4,), "ring": (2,), "cross": (2,), "plate": (3,),
-        "socket": (4,), "b7": lj.Pose((3,), (4,)),
+        "socket": (4,), "b7": lj.bodies.Pose((3,), (4,)),
     }  # fmt: skip
     assert repr(tree) == "Tree(12 bodies; hinge, slide, pair, ball, ring, cross, plate, socket, b7)"
 
@@ -94,11 +102,13 @@ def test_poses_and_rates():
         residual = joint.g(0.0, poses, params)
         np.testing.assert_allclose(residual, 0.0, atol=1e-13, err_msg=name)
     a, b = tree.bodies[0].at((0.1, 0.2, 0.3), Y), tree.bodies[1].at((0.0, 0.0, 1.0), Y)
-    two = lj.Tree(tree.bodies[:2], {"a": lj.prismatic(lj.ground.at(axis=Y), a), "b": lj.revolute(a, b)})
+    two = lj.bodies.Tree(
+        tree.bodies[:2], {"a": lj.bodies.prismatic(lj.bodies.ground.at(axis=Y), a), "b": lj.bodies.revolute(a, b)}
+    )
     poses = two.poses({"a": 0.4, "b": 0.7})
     np.testing.assert_allclose(poses["b0"].position, [-0.1, 0.4 - 0.2, -0.3], atol=1e-15)
-    np.testing.assert_allclose(lj.revolute(a, b).g(0.0, poses, None), 0.0, atol=1e-15)
-    turned = [lj.torsion(a, b, stiffness=2.0, angle=angle).potential for angle in (0.7, -0.7)]
+    np.testing.assert_allclose(lj.bodies.revolute(a, b).g(0.0, poses, None), 0.0, atol=1e-15)
+    turned = [lj.bodies.torsion(a, b, stiffness=2.0, angle=angle).potential for angle in (0.7, -0.7)]
     assert turned[0] is not None and turned[1] is not None
     assert turned[0](0.0, poses, None, None) < 1e-30 < turned[1](0.0, poses, None, None)
 
@@ -138,9 +148,11 @@ def test_the_recursion_solves_lagranges_equations():
 def test_places_on_a_chain(count):
     """Where the end of a chain of rods is, how fast it moves and turns, by sums over its absolute angles; in both forms
     of a pose."""
-    rods = [lj.Body(f"rod {i}", 1.0, (1 / 12, 1 / 12, 0.0)) for i in range(count)]
-    above = [lj.ground.at(axis=Y), *(rod.at((0.0, 0.0, -0.5), Y) for rod in rods)]
-    tree = lj.Tree(rods, {"a": [lj.revolute(a, rod.at((0.0, 0.0, 0.5), Y)) for a, rod in zip(above, rods)]})
+    rods = [lj.bodies.Body(f"rod {i}", 1.0, (1 / 12, 1 / 12, 0.0)) for i in range(count)]
+    above = [lj.bodies.ground.at(axis=Y), *(rod.at((0.0, 0.0, -0.5), Y) for rod in rods)]
+    tree = lj.bodies.Tree(
+        rods, {"a": [lj.bodies.revolute(a, rod.at((0.0, 0.0, 0.5), Y)) for a, rod in zip(above, rods)]}
+    )
     tip, rng = rods[-1].at((0.0, 0.0, -0.5)), np.random.default_rng(2)
     relative, faster = rng.normal(size=(2, count))
     angle, rate = np.cumsum(relative), np.cumsum(faster)
@@ -148,7 +160,7 @@ def test_places_on_a_chain(count):
     @by_numpy
     def seen(q, v):
         poses, rates = tree.poses(q), tree.rates(q, v)
-        bare = [{name: lj.Pose(x.position, x.quaternion) for name, x in of.items()} for of in (poses, rates)]
+        bare = [{name: lj.bodies.Pose(x.position, x.quaternion) for name, x in of.items()} for of in (poses, rates)]
         return [
             [tip.position(q), tip.velocity(q, v), rods[-1].spin(q, v), rods[-1].spin_in_body(q, v)]
             for q, v in ((poses, rates), bare)
@@ -164,8 +176,8 @@ def test_places_on_a_chain(count):
 
 def test_a_gap_of_a_place_is_a_short_program():
     """What a contact differentiates twice has no quaternion, unless it reads one, and no loop where links are few."""
-    rod = lj.Body("rod", 1.0, (1 / 12, 1 / 12, 0.0))
-    tree = lj.Tree([rod], {"a": lj.revolute(lj.ground.at(axis=Y), rod.at((0.0, 0.0, 0.5), Y))})
+    rod = lj.bodies.Body("rod", 1.0, (1 / 12, 1 / 12, 0.0))
+    tree = lj.bodies.Tree([rod], {"a": lj.bodies.revolute(lj.bodies.ground.at(axis=Y), rod.at((0.0, 0.0, 0.5), Y))})
     tip = rod.at((0.0, 0.0, -0.5))
 
     def height(t, q, params):
@@ -196,30 +208,30 @@ def test_slots():
 
 def test_what_is_no_tree_is_refused():
     """Loops, rings, joints without coordinates, names given twice, by name and with the fix."""
-    a, b = (lj.Body(name, 1.0, (1.0, 1.0, 1.0)) for name in "ab")
-    hinge, back = lj.revolute(lj.ground.at(), a.at()), lj.revolute(b.at(), a.at((1.0, 0.0, 0.0)))
-    on = lj.revolute(a.at(), b.at())
+    a, b = (lj.bodies.Body(name, 1.0, (1.0, 1.0, 1.0)) for name in "ab")
+    hinge, back = lj.bodies.revolute(lj.bodies.ground.at(), a.at()), lj.bodies.revolute(b.at(), a.at((1.0, 0.0, 0.0)))
+    on = lj.bodies.revolute(a.at(), b.at())
     for bodies, joints, said in (
         ([a, b], {"x": hinge, "y": back}, "hangs on two joints, 'x' and 'y'"),
         ([a, b], {"x": on, "y": back}, "'a', 'b' hang on each other in a ring"),
         ([a], {"x": on}, "which is not among the bodies"),
-        ([a], {"x": lj.revolute(a.at(), lj.ground.at())}, "the parent's first"),
-        ([a, b], {"x": [hinge, lj.prismatic(a.at(), b.at())]}, "several kinds"),
+        ([a], {"x": lj.bodies.revolute(a.at(), lj.bodies.ground.at())}, "the parent's first"),
+        ([a, b], {"x": [hinge, lj.bodies.prismatic(a.at(), b.at())]}, "several kinds"),
         ([a, b], {"b": hinge}, "called 'b'"),
         ([a, a], {}, "two bodies are called 'a'"),
     ):
         with pytest.raises(ValueError, match=said):
-            lj.Tree(bodies, joints)
+            lj.bodies.Tree(bodies, joints)
     with pytest.raises(TypeError, match="none that a tree has coordinates for"):
-        lj.Tree([a], {"x": lj.Holonomic(lambda t, q, params: q["a"].position)})
-    with pytest.raises(TypeError, match="no lj.Load"):
-        lj.Tree([a], {"x": hinge}).system([hinge])
+        lj.bodies.Tree([a], {"x": lj.Holonomic(lambda t, q, params: q["a"].position)})
+    with pytest.raises(TypeError, match="no lj.bodies.Load"):
+        lj.bodies.Tree([a], {"x": hinge}).system([hinge])
 
 
 def test_armature_and_frames_that_are_none_are_refused():
     """Rotors of no joint or without an inertia, frames that carry nothing, moments without a mass."""
-    frame, rod = lj.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.Body("rod", 1.0, (1.0, 1.0, 1.0))
-    hinge, on = lj.revolute(lj.ground.at(), rod.at()), lj.revolute(rod.at(), frame.at())
+    frame, rod = lj.bodies.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.bodies.Body("rod", 1.0, (1.0, 1.0, 1.0))
+    hinge, on = lj.bodies.revolute(lj.bodies.ground.at(), rod.at()), lj.bodies.revolute(rod.at(), frame.at())
     for bodies, joints, armature, said in (
         ([rod], {"x": hinge}, {"y": 1.0}, "armature 'y' belongs to no joint"),
         ([rod], {}, {"rod": 1.0}, "armature 'rod' belongs to no joint"),
@@ -229,17 +241,17 @@ def test_armature_and_frames_that_are_none_are_refused():
         ([frame], {}, {}, "'frame' moves and has no mass"),
     ):
         with pytest.raises(ValueError, match=said):
-            lj.Tree(bodies, joints, armature)
+            lj.bodies.Tree(bodies, joints, armature)
     with pytest.raises(ValueError, match="the mass of 'x' must be a positive number"):
-        lj.Body("x", 0.0, (1.0, 1.0, 1.0))
+        lj.bodies.Body("x", 0.0, (1.0, 1.0, 1.0))
 
 
 @pytest.mark.exhaustive
 def test_a_singular_tree():
     """Two hinges about one axis with nothing between them are named as singular, not as a wrong recursion."""
-    frame, rod = lj.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.Body("rod", 1.0, (1.0, 1.0, 1.0))
-    last = lj.revolute(frame.at(), rod.at((1.0, 0.0, 0.0)))
-    twice = lj.Tree([frame, rod], {"x": lj.revolute(lj.ground.at(), frame.at()), "y": last})
+    frame, rod = lj.bodies.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.bodies.Body("rod", 1.0, (1.0, 1.0, 1.0))
+    last = lj.bodies.revolute(frame.at(), rod.at((1.0, 0.0, 0.0)))
+    twice = lj.bodies.Tree([frame, rod], {"x": lj.bodies.revolute(lj.bodies.ground.at(), frame.at()), "y": last})
     q = {"x": 0.1, "y": 0.2}
     with pytest.raises(ValueError, match="singular"):
         lj.accelerations(twice.system(), 0.0, q, q, None)
@@ -248,10 +260,12 @@ def test_a_singular_tree():
 def test_one_link_is_a_physical_pendulum():
     """a = -m g l sin φ/(I + m l²), by mass, inertia and place from params, and no warning of loops in Python, which the
     recursion has not. Twin: without I."""
-    rod = lj.Body("rod", lambda p: p["m"], lambda p: (p["I"], p["I"], 0.1 * p["I"]))
+    rod = lj.bodies.Body("rod", lambda p: p["m"], lambda p: (p["I"], p["I"], 0.1 * p["I"]))
     across = (0.0, 1.0, 0.0)
-    hinge = lj.revolute(lj.ground.at(axis=across), rod.at(lambda p: jnp.array([0.0, 0.0, p["l"]]), axis=across))
-    pendulum = lj.Tree([rod], {"hinge": hinge}).system([lj.weight([rod])])
+    hinge = lj.bodies.revolute(
+        lj.bodies.ground.at(axis=across), rod.at(lambda p: jnp.array([0.0, 0.0, p["l"]]), axis=across)
+    )
+    pendulum = lj.bodies.Tree([rod], {"hinge": hinge}).system([lj.bodies.weight([rod])])
     p = {"m": 2.0, "I": 0.3, "l": 0.75}
     a, _ = in_numpy(lambda q: lj.accelerations(pendulum, 0.0, q, {"hinge": 0.0}, p))({"hinge": 0.4})
     torque = -2.0 * 9.81 * 0.75 * np.sin(0.4)

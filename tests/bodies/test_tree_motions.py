@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.elements.laws_of_elements import check_linear
 from lagjax.integrate.jumps.find import found as jumps_found
 from lagjax.system import prepare
 
 Y, G = (0.0, 1.0, 0.0), 9.81
-UPPER, LOWER = RODS = [lj.Body(name, lambda params: params["m"], (1 / 12, 1 / 12, 0.0)) for name in ("upper", "lower")]
+UPPER, LOWER = RODS = [
+    lj.bodies.Body(name, lambda params: params["m"], (1 / 12, 1 / 12, 0.0)) for name in ("upper", "lower")
+]
 JOINTS = {
-    "a": lj.revolute(lj.ground.at(axis=Y), UPPER.at((0.0, 0.0, 0.5), Y)),
-    "b": lj.revolute(UPPER.at((0.0, 0.0, -0.5), Y), LOWER.at((0.0, 0.0, 0.5), Y)),
+    "a": lj.bodies.revolute(lj.bodies.ground.at(axis=Y), UPPER.at((0.0, 0.0, 0.5), Y)),
+    "b": lj.bodies.revolute(UPPER.at((0.0, 0.0, -0.5), Y), LOWER.at((0.0, 0.0, 0.5), Y)),
 }
-TREE, TIP = lj.Tree(RODS, JOINTS), LOWER.at((0.0, 0.0, -0.5))
+TREE, TIP = lj.bodies.Tree(RODS, JOINTS), LOWER.at((0.0, 0.0, -0.5))
 PARAMS = {"m": 1.3}
 Q, V = {"a": 0.9, "b": 0.3}, {"a": 0.0, "b": 0.0}
 
@@ -61,9 +64,9 @@ def test_sliding_of_a_place_on_a_tree():
 @pytest.mark.slow
 def test_forces_on_a_tree_have_no_jumps():
     """A motor and a damper, which read poses, are smooth; a motor that compares is not."""
-    damped = lj.spring(lj.ground.at((1.0, 0.0, 0.0)), TIP, 3.0, 0.1, damping=0.2)
+    damped = lj.bodies.spring(lj.bodies.ground.at((1.0, 0.0, 0.0)), TIP, 3.0, 0.1, damping=0.2)
     for torque, smooth in ((lambda t, q, v, params: -v["a"], True), (lambda t, q, v, params: -jnp.sign(v["a"]), False)):
-        driven = TREE.system([damped, lj.motor(LOWER.at(axis=Y), UPPER.at(axis=Y), torque)])
+        driven = TREE.system([damped, lj.bodies.motor(LOWER.at(axis=Y), UPPER.at(axis=Y), torque)])
         model, start = prepare(driven, 0.0, Q, V, PARAMS)
         assert (jumps_found(model, start) is None) == smooth
 
@@ -72,10 +75,10 @@ def test_forces_on_a_tree_have_no_jumps():
 def test_friction_in_a_joint():
     """Dry friction in a joint of a tree, as with L by hand; a wrong recursion is refused."""
     joint = {"joint": lj.Friction(lambda t, q, v, params: v["b"], 0.5, normal=1.0)}
-    tree, hand = TREE.system([lj.weight(RODS)], elements=joint), lj.System(by_hand, elements=joint)
+    tree, hand = TREE.system([lj.bodies.weight(RODS)], elements=joint), lj.System(by_hand, elements=joint)
     ts = jnp.linspace(0.0, 1.5, 7)
     ours, theirs = (lj.integrate(x, Q, V, PARAMS, ts=ts, rtol=1e-10, estimate_error=False) for x in (tree, hand))
-    assert isinstance(ours, lj.HybridTrajectory) and isinstance(theirs, lj.HybridTrajectory)
+    assert isinstance(ours, HybridTrajectory) and isinstance(theirs, HybridTrajectory)
     assert len(ours.switches) == len(theirs.switches) >= 1
     np.testing.assert_array_equal(ours.modes, theirs.modes)
     assert apart(ours, theirs) < 1e-8

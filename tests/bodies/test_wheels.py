@@ -22,9 +22,9 @@ def quadric(r, params):
 
 def rolling_ball():
     """A solid ball on a quadric, under its weight."""
-    ball = lj.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3)
-    contact = lj.rolling_sphere(ball.at(), lj.Surface(quadric), SMALL)
-    return lj.multibody([ball], {"wall": contact}, [lj.weight([ball])])
+    ball = lj.bodies.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3)
+    contact = lj.bodies.rolling_sphere(ball.at(), lj.bodies.Surface(quadric), SMALL)
+    return lj.bodies.multibody([ball], {"wall": contact}, [lj.bodies.weight([ball])])
 
 
 def numbers(c, b, d):
@@ -42,7 +42,7 @@ def in_the_cylinder(turning, upwards, about_radius):
         [[np.cos(angle), np.sin(angle), 0.0], [-np.sin(angle), np.cos(angle), 0.0], [0, 0, 1]]
     )
     spin = about_radius * radial + upwards / SMALL * across - path * turning / SMALL * up
-    pose = lj.Pose.at(path * radial, (1.0, 2.0, 0.0), 0.4)
+    pose = lj.bodies.Pose.at(path * radial, (1.0, 2.0, 0.0), 0.4)
     return {"ball": pose}, {"ball": pose.moving(path * turning * across + upwards * up, spin)}
 
 
@@ -76,7 +76,7 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
         place, along, velocity = on_a_slope(path, angle, speed)
         # v + ω × arm = 0: the point of contact lies outwards of the centre in a bowl, and inwards on a globe.
         spin = np.cross(velocity, side * place / path) / SMALL
-        pose = lj.Pose.at(place)
+        pose = lj.bodies.Pose.at(place)
         q, v = {"ball": pose}, {"ball": pose.moving(velocity, spin)}
         for residual in lj.constraint_residual(system, 0.0, q, v, params).values():
             np.testing.assert_allclose(residual, 0.0, atol=1e-14)
@@ -87,16 +87,16 @@ def test_a_ball_in_a_cylinder_in_a_bowl_on_a_globe_and_on_a_plane():
 
 def turntable():
     """A solid ball on a table that turns about the vertical, a given motion."""
-    ball = lj.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3)
-    table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=params["rate"] * t))
-    return lj.multibody([ball, table], {"table": lj.rolling_sphere(ball.at(), table.at(), SMALL)})
+    ball = lj.bodies.Body("ball", MASS, (SHARE * MASS * SMALL**2,) * 3)
+    table = lj.bodies.Body("table", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t))
+    return lj.bodies.multibody([ball, table], {"table": lj.bodies.rolling_sphere(ball.at(), table.at(), SMALL)})
 
 
 def on_the_table(rate, place, velocity):
     """A ball that rolls: v + ω × (-a e_z) = Ω e_z × r, without spin about the vertical."""
     slip = np.asarray(velocity) - rate * np.array([-place[1], place[0], 0.0])
     spin = np.array([-slip[1], slip[0], 0.0]) / SMALL
-    pose = lj.Pose.at((*place[:2], SMALL), (1.0, 2.0, 0.0), 0.4)
+    pose = lj.bodies.Pose.at((*place[:2], SMALL), (1.0, 2.0, 0.0), 0.4)
     return {"ball": pose}, {"ball": pose.moving(velocity, spin)}
 
 
@@ -122,14 +122,20 @@ def test_a_ball_on_a_turntable():
 def test_bad_motions():
     """What is no motion, and coordinates of a body whose motion is given, are refused with the fix."""
     with pytest.raises(TypeError, match="motion.t, params. of 'table' is called with 2 arguments"):
-        lj.Body("table", motion=lambda t: lj.Pose.at())
-    ball, q, v = lj.Body("ball", 1.0, (1.0, 1.0, 1.0)), {"ball": lj.Pose.at()}, {"ball": lj.Pose.at().moving()}
-    table = lj.Body("table", motion=lambda t, params: (0.0, 0.0, 0.0))
-    with pytest.raises(TypeError, match="must return a lj.Pose, and returned tuple"):
-        lj.accelerations(lj.multibody([ball, table]), 0.0, q, v, None)
-    table = lj.Body("table", motion=lambda t, params: lj.Pose.at(angle=t))
+        lj.bodies.Body("table", motion=lambda t: lj.bodies.Pose.at())
+    ball, q, v = (
+        lj.bodies.Body("ball", 1.0, (1.0, 1.0, 1.0)),
+        {"ball": lj.bodies.Pose.at()},
+        {"ball": lj.bodies.Pose.at().moving()},
+    )
+    table = lj.bodies.Body("table", motion=lambda t, params: (0.0, 0.0, 0.0))
+    with pytest.raises(TypeError, match="must return a lj.bodies.Pose, and returned tuple"):
+        lj.accelerations(lj.bodies.multibody([ball, table]), 0.0, q, v, None)
+    table = lj.bodies.Body("table", motion=lambda t, params: lj.bodies.Pose.at(angle=t))
     with pytest.raises(ValueError, match="'table' moves as given, and has no coordinates"):
-        lj.accelerations(lj.multibody([ball, table]), 0.0, q | {"table": q["ball"]}, v | {"table": v["ball"]}, None)
+        lj.accelerations(
+            lj.bodies.multibody([ball, table]), 0.0, q | {"table": q["ball"]}, v | {"table": v["ball"]}, None
+        )
     with pytest.raises(TypeError, match="'table' moves as given, and has no entry in q"):
         table.point(q, (1.0, 0.0, 0.0))
 
@@ -139,16 +145,16 @@ def test_the_point_of_contact():
     """In an ellipsoid balls, wheels and ellipsoids touch where f is least on them: g = 0 there, and grows as the
     distance."""
     squares = np.array([4.0, 2.0, 1.0])
-    inside = lj.Surface(lambda r, params: 1.0 - jnp.sum(r**2 / squares))
+    inside = lj.bodies.Surface(lambda r, params: 1.0 - jnp.sum(r**2 / squares))
     place = np.sqrt(squares) * np.array([0.48, 0.6, 0.64])
     normal = -place / squares / np.linalg.norm(place / squares)
-    body = lj.Body("wheel", 1.0, (1.0, 1.0, 1.0))
-    ball, wheel = lj.rolling_sphere(body.at(), inside, 0.1), lj.rolling(body.at(), inside, 0.1)
-    turned = lj.Pose.at(axis=(1.0, 2.0, 0.5), angle=0.8)
+    body = lj.bodies.Body("wheel", 1.0, (1.0, 1.0, 1.0))
+    ball, wheel = lj.bodies.rolling_sphere(body.at(), inside, 0.1), lj.bodies.rolling(body.at(), inside, 0.1)
+    turned = lj.bodies.Pose.at(axis=(1.0, 2.0, 0.5), angle=0.8)
     axis = np.asarray(body.direction({"wheel": turned}, (0.0, 0.0, 1.0)))
     to_rim = normal - (normal @ axis) * axis
     half_axes = 0.1 * np.array([1.0, 0.7, 0.4])
-    stone = lj.rolling_ellipsoid(body.at(), inside, half_axes)
+    stone = lj.bodies.rolling_ellipsoid(body.at(), inside, half_axes)
     stretched = np.asarray(turned.matrix) @ np.diag(half_axes**2) @ np.asarray(turned.matrix).T @ normal
     for contact, arm in (
         (ball, 0.1 * normal),
@@ -198,9 +204,9 @@ WHEEL, RIM, AXIAL, ACROSS = 0.8, 0.5, 0.11, 0.06
 
 def rolling_wheel():
     """A wheel on a quadric, under its weight."""
-    wheel = lj.Body("wheel", WHEEL, (ACROSS, ACROSS, AXIAL))
-    contact = lj.rolling(wheel.at(), lj.Surface(quadric), RIM)
-    return lj.multibody([wheel], {"rim": contact}, [lj.weight([wheel])])
+    wheel = lj.bodies.Body("wheel", WHEEL, (ACROSS, ACROSS, AXIAL))
+    contact = lj.bodies.rolling(wheel.at(), lj.bodies.Surface(quadric), RIM)
+    return lj.bodies.multibody([wheel], {"rim": contact}, [lj.bodies.weight([wheel])])
 
 
 IN_BOWL = numbers(LARGE**2, (0.0, 0.0, 0.0), (-1.0, -1.0, -1.0))
@@ -236,7 +242,7 @@ def in_a_bowl(place, axis, spin):
 
 def start_in_a_bowl(spin, aside=0.4):
     """A wheel that touches the bowl."""
-    pose = lj.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3)
+    pose = lj.bodies.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3)
     axis = np.asarray(pose.matrix)[:, 2]
     down = np.array([0.3, 0.2, -1.0])
     down = down - (down @ axis) * axis
@@ -283,13 +289,13 @@ def rattling(axes, spin):
 @pytest.mark.slow
 def test_a_rattleback():
     """An ellipsoid whose inertia is turned against its shape, as Newton and Euler have it. Twin: another half axis."""
-    stone = lj.Body("stone", STONE, INERTIA)
+    stone = lj.bodies.Body("stone", STONE, INERTIA)
     half_axes = tuple(lambda params, i=i: params[i] for i in range(3))
-    contact = lj.rolling_ellipsoid(stone.at(), lj.ground.at(), half_axes)
-    system = lj.multibody([stone], {"rolls": contact}, [lj.weight([stone])])
+    contact = lj.bodies.rolling_ellipsoid(stone.at(), lj.bodies.ground.at(), half_axes)
+    system = lj.bodies.multibody([stone], {"rolls": contact}, [lj.bodies.weight([stone])])
     found = lambda q, v, params: accelerations(system, 0.0, q, v, params)[0]["stone"].position
     for axis, angle, spin in (((1.0, 0.4, -0.3), 0.3, (0.3, -0.8, 4.0)), ((0.2, 1.0, 0.1), 1.2, (2.0, 1.0, -1.5))):
-        pose = lj.Pose.at(axis=axis, angle=angle)
+        pose = lj.bodies.Pose.at(axis=axis, angle=angle)
         r, velocity, expected = rattling(np.asarray(pose.matrix), np.asarray(spin))
         pose = pose._replace(position=jnp.array([0.7, -0.4, -r[2]]))
         q, v = {"stone": pose}, {"stone": pose.moving(velocity, spin)}
@@ -309,7 +315,7 @@ def derivatives(f):
 @pytest.mark.exhaustive
 def test_derivatives_of_the_point_of_contact():
     """In a spherical bowl it lies outwards, c/|c|, on a rim along c in its plane: derivatives up to the third."""
-    place, axes = jnp.array([0.5, -1.2, 0.9]), lj.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3).matrix.T
+    place, axes = jnp.array([0.5, -1.2, 0.9]), lj.bodies.Pose.at(axis=(1.0, 0.4, -0.3), angle=1.3).matrix.T
 
     def unit(x):
         return x / jnp.sqrt(jnp.sum(x**2))
@@ -332,11 +338,11 @@ def test_derivatives_of_the_point_of_contact():
 
 def test_distances():
     """Straight below its centre a ball touches as the search finds it; what is no distance has no gap."""
-    ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
-    q = {"ball": lj.Pose.at((1.0, -0.8, 0.3))}
+    ball = lj.bodies.Body("ball", 1.0, (1.0, 1.0, 1.0))
+    q = {"ball": lj.bodies.Pose.at((1.0, -0.8, 0.3))}
 
     def gap(f, is_distance):
-        touches = lj.rolling_sphere(ball.at(), lj.Surface(f, is_distance=is_distance), SMALL)["touches"]
+        touches = lj.bodies.rolling_sphere(ball.at(), lj.bodies.Surface(f, is_distance=is_distance), SMALL)["touches"]
         assert isinstance(touches, lj.Holonomic)
         return evaluated(lambda q: touches.g(0.0, q, None), q)[0]
 
@@ -350,14 +356,14 @@ def test_distances():
 
 def test_what_is_no_surface():
     """Surfaces that are none are refused with the way to write one."""
-    with pytest.raises(TypeError, match="takes a function f.r, params., not float.\nFix: lj.Surface"):
-        lj.Surface(1.0)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="of lj.Surface"):
-        lj.Surface(lambda x, y, z: z)
+    with pytest.raises(TypeError, match="takes a function f.r, params., not float.\nFix: lj.bodies.Surface"):
+        lj.bodies.Surface(1.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="of lj.bodies.Surface"):
+        lj.bodies.Surface(lambda x, y, z: z)
     with pytest.raises(TypeError, match="is on a marker, and Body is none"):
-        lj.Surface(lambda r, params: r[2], on=lj.Body("table", 1.0, (1.0, 1.0, 1.0)))
-    ball = lj.Body("ball", 1.0, (1.0, 1.0, 1.0))
+        lj.bodies.Surface(lambda r, params: r[2], on=lj.bodies.Body("table", 1.0, (1.0, 1.0, 1.0)))
+    ball = lj.bodies.Body("ball", 1.0, (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="both places are on 'ball'"):
-        lj.rolling_sphere(ball.at(), lj.Surface(lambda r, params: r[2], on=ball.at()), 1.0)
+        lj.bodies.rolling_sphere(ball.at(), lj.bodies.Surface(lambda r, params: r[2], on=ball.at()), 1.0)
     with pytest.raises(ValueError, match="three half axes, and was given 1.0"):
-        lj.rolling_ellipsoid(ball.at(), lj.ground.at(), 1.0)  # pyright: ignore[reportArgumentType]
+        lj.bodies.rolling_ellipsoid(ball.at(), lj.bodies.ground.at(), 1.0)  # pyright: ignore[reportArgumentType]

@@ -12,6 +12,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy as sp
+from sympy.codegen.cfunctions import Sqrt, log1p
 from sympy.physics import mechanics as me
 
 import lagjax as lj
@@ -98,6 +99,8 @@ EXPRESSIONS = [
     x * sp.Sum(k ** sp.Symbol("n"), (sp.Symbol("n"), 0, 3)), sp.Matrix([x, y]).norm(), sp.acosh(x + 3), -(x - y) / (-k),
     k / (l / x), (l * y**2) ** (-sp.Rational(1, 2)), -(x**2), (-x) ** 2, sp.re(x) + sp.conjugate(x), x**2.5 / x**0.5,
     sp.sinh(x) * sp.tanh(y), 1 / (1 + 1 / (3 + 1 / x)), sp.real_root(x, 3), sp.log(x**2, 2),
+    sp.loggamma(x + 2), sp.erfc(x), x * sp.frac(y / 3), sp.GoldenRatio * x - sp.Catalan, 1 / x + (x + y) ** -2,
+    Sqrt(sp.cosh(y)), sp.Piecewise((x, sp.Eq(x, y)), (y, sp.Ne(x, 1)), (k, True)), sp.Max(x, y, k, l), log1p(x**2),
 ]  # fmt: skip
 STATES = [(0.75, 1.625), (1.875, -0.625), (-0.6875, 0.5)]
 
@@ -135,9 +138,25 @@ def test_a_branch_that_is_not_taken_harms_nobody():
     of_x = lambda function: lambda x: function(0.0, {"x": x}, {"x": 0.0}, {"k": 1.0})
     slope = lambda function, value: by_numpy(jax.grad(of_x(function)))(value)
     assert slope(ours, -0.5) == 0.0 and slope(ours, 4.0) == 2.5 * 4.0**1.5
-    harmless = "jnp.where((x >= 0), x, 0.5)"
+    harmless = "jnp.where(jnp.greater_equal(x, 0), x, 0.5)"
     assert harmless in ours.source
     assert np.isnan(slope(dataclasses.replace(ours, source=ours.source.replace(harmless, "x")), -0.5))
+
+
+def test_what_jumps_is_chosen_by_a_comparison():
+    """A program of `where`s and whole powers; twin: SymPy's own for JAX, of the same values, is one of an index, with
+    powers of floats."""
+    a, b = sp.symbols("a b")
+    written = sp.Piecewise((a, sp.And(a > 0, b > 0)), (sp.Max(a, b, 2) ** -3, a < -1), (10**12 * a, True))
+    of_all: Any = lj.from_sympy(KINETIC, [x, y], [m], constraints={"one": written.subs({a: x, b: y})}).constraints
+    ours = lambda x, y: of_all["one"].function(0.0, {"x": x, "y": y}, {})
+    theirs = sp.lambdify((a, b), written, "jax")
+    programs = [str(jax.make_jaxpr(function)(2.0, 1.0)) for function in (ours, theirs)]
+    assert ["argmax" in program for program in programs] == [False, True]
+    assert ["integer_pow[y=-3]" in program for program in programs] == [True, False]
+    for state in (*STATES, (-2.0, 3.0)):
+        np.testing.assert_allclose(ours(*state), theirs(*state), rtol=1e-15)
+    assert "1000000000000.0*x" in str(of_all["one"].function)
 
 
 def test_copies_and_words():
@@ -179,6 +198,7 @@ REFUSED = {
     "no formula": (lambda: lj.from_sympy(L + sp.Function("V")(x), [x, y], [m, g]), "'V' is in L, but has no"),
     "nor this, of a known name": (lambda: lj.from_sympy(L + sp.Function("gamma")(x), [x, y], [m, g]), "'gamma' is in"),
     "a function of SymPy alone": (lambda: lj.from_sympy(L + sp.besselj(0, x), [x, y], [m, g]), "'besselj' is in L"),
+    "one of Python's alone": (lambda: lj.from_sympy(L + sp.factorial(x), [x, y], [m, g]), "'factorial' is in L"),
     "a complex number": (lambda: lj.from_sympy(L + sp.I * x, [x, y], [m, g]), "'I' is in L"),
     "symbols as coordinates": (lambda: lj.from_sympy(L, sp.symbols("x y"), [m, g]), "a coordinate is a function"),
     "velocities as coordinates": (lambda: lj.from_sympy(L, [x, x.diff()], [m, g]), "is a velocity"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import Snapshot
 from lagjax.integrate.diagnose_stop import Steps, _fast, _rounded_up, _singularity, stopped_early
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, pendulum
@@ -145,7 +146,7 @@ def test_each_cause_is_told_apart(case):
 def test_a_short_fixed_step():
     """It is said where a motion stopped; the number of fixed steps that it needs is known: 10,000 of 0.01."""
     ts, fixed = np.array([0.0, 100.0]), {"controller": diffrax.ConstantStepSize(), "method": None, "dt0": 0.01}
-    end = lj.Snapshot(*map(np.asarray, (2.0, 2.0, 1.0)), {})
+    end = Snapshot(*map(np.asarray, (2.0, 2.0, 1.0)), {})
     used_up = lj.RESULTS.max_steps_reached
     stopped = by_hand(lj.System(free), ts, ts, 0 * ts + 1, end=end, result=used_up, steps=200)
     said = stopped_early(stopped, SimpleNamespace(max_steps=200, **fixed), "")

@@ -197,7 +197,7 @@ def test_a_position_alone_and_a_velocity_alone():
 
 def test_names_to_hold():
     """A coordinate is held by its own name, and by that of each part of q it lies in."""
-    q = {"crank": lj.Pose.at(), "x": jnp.zeros(2)}
+    q = {"crank": lj.bodies.Pose.at(), "x": jnp.zeros(2)}
     for name, held in (
         ("crank", range(7)),
         ("crank.quaternion", range(3, 7)),

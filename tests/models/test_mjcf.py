@@ -64,18 +64,18 @@ class Theirs:
             name, at, first = self.m.joint(k).name, self.m.jnt_qposadr[k], self.m.jnt_dofadr[k]
             spin, velocity = rng.normal(size=3), rng.normal(size=3)
             if self.m.jnt_type[k] == mujoco.mjtJoint.mjJNT_BALL:
-                e = lj.Pose.at(axis=rng.normal(size=3), angle=1.2).quaternion
+                e = lj.bodies.Pose.at(axis=rng.normal(size=3), angle=1.2).quaternion
                 self.positions[name], self.data.qpos[at : at + 4] = e, e
                 self.rates[name] = product(e, jnp.concatenate([jnp.zeros(1), jnp.asarray(spin)])) / 2
                 self.data.qvel[first : first + 3] = spin
             elif self.m.jnt_type[k] == mujoco.mjtJoint.mjJNT_FREE:
                 # MuJoCo counts from the body's frame, and its spin along the body's axes.
                 pose, name = (
-                    lj.Pose.at(rng.normal(size=3), rng.normal(size=3), 0.8),
+                    lj.bodies.Pose.at(rng.normal(size=3), rng.normal(size=3), 0.8),
                     self.m.body(self.m.jnt_bodyid[k]).name,
                 )
                 self.positions[name], self.rates[name] = pose, pose.moving(velocity, spin)
-                body = lj.Body(name, 1.0, (1.0, 1.0, 1.0))
+                body = lj.bodies.Body(name, 1.0, (1.0, 1.0, 1.0))
                 q = {name: pose}
                 arm = -body.direction(q, self.m.body(name).ipos)
                 self.data.qpos[at : at + 7] = np.concatenate([pose.position + arm, pose.quaternion])
@@ -160,7 +160,7 @@ def test_loops():
     crank = 0.4
     rod = -np.arcsin(np.sin(crank) / 2) - crank
     slide = np.cos(crank) + 2 * np.cos(crank + rod) - 3
-    lid = lj.Pose.at((3.0 + slide, 0.0, 2.0), (0.0, 1.0, 0.0), np.pi / 2)
+    lid = lj.bodies.Pose.at((3.0 + slide, 0.0, 2.0), (0.0, 1.0, 0.0), np.pi / 2)
     positions = {"joint 0": crank, "joint 1": rod, "joint 2": slide, "lid": lid}
     for name, residual in residuals(model.joint_system(), model.joint_state(positions)[0]).items():
         np.testing.assert_allclose(residual, 0.0, atol=1e-14, err_msg=name)
@@ -181,6 +181,12 @@ def test_files(tmp_path):
         lj.read_mjcf("<mujoco><worldbody>\n<bdy/></worldbody></mujoco>")
     with pytest.raises(FileNotFoundError, match="there is no file 'nowhere.xml'"):
         lj.read_mjcf("nowhere.xml")
+
+
+def test_a_loop_that_is_nowhere():
+    """An anchor that is no finite number is refused by line and name."""
+    with pytest.raises(ValueError, match="line 10: .* place of 'pin', .* are beyond the largest number"):
+        lj.read_mjcf(LOOP.format("").replace('anchor="2 0 0"', 'anchor="inf 0 0"'))
 
 
 def welded_beside(name):

@@ -182,9 +182,12 @@ def two_links(joint="", link=BODY, kind="revolute", beside=""):
     )
 
 
-def also(parent, child, name="x"):
+def also(parent, child, name="x", inside=""):
     """A further joint."""
-    return f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/></joint>'
+    return f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+
+
+FAR = '<origin xyz="1.7e308 0 0"/>'
 
 
 @pytest.mark.parametrize(
@@ -209,6 +212,18 @@ def also(parent, child, name="x"):
         (
             two_links(link=LARGEST, beside=f'<link name="hand">{LARGEST}</link>' + also("rod", "hand")),
             "line 3: .* of 'rod', with what is fixed to it, are beyond the largest number",
+        ),
+        (
+            two_links(
+                '<origin xyz="1.7e308 0 0"/>',
+                beside='<link name="palm"/><link name="tip"/>'
+                + also("post", "palm", "x", FAR)
+                + "\n"
+                + also("palm", "tip", "y", FAR)
+                + f'<link name="end">{BODY}</link>'
+                + also("tip", "end", "grip").replace("fixed", "revolute"),
+            ),
+            "line 7: .* place of 'grip', with what is fixed to it, are beyond the largest number",
         ),
         (two_links('<origin quat_xyzw="0 0 0 0"/>'), "line 5: quat_xyzw= of <origin> is zero"),
         (two_links(beside='<link name="other"/>'), "no joint holds 'post' .line 2., 'other' .line 6."),
@@ -266,6 +281,12 @@ def test_files_and_texts(tmp_path):
         lj.read_urdf(5000 * "x")
     with pytest.raises(FileNotFoundError, match="there is no file 'nowhere.urdf'"):
         lj.read_urdf("nowhere.urdf")
+    for name in ("a\0b", "\udc80"):
+        with pytest.raises(FileNotFoundError, match="there is no file"):
+            lj.read_urdf(name)
+    for read, text in ((lj.read_urdf, PENDULUM), (lj.read_mjcf, "<mujoco>\n<worldbody/></mujoco>")):
+        with pytest.raises(ValueError, match=r"line 2 of the text has the character '\\udc80', which no file can have"):
+            read(text.replace("\n", "\n\udc80", 1))
     with pytest.raises(TypeError, match="takes the path of a file or its text, not int"):
         lj.read_urdf(3)
     with pytest.raises(ValueError, match='base= must be "fixed" or "free"'):
@@ -301,7 +322,7 @@ def test_a_free_base():
     text = two_links().replace('<link name="post"/>', f'<link name="post">{BODY}</link>')
     model = lj.read_urdf(text, base="free")
     assert model.joints["post"].kind == "floating" and list(model.bodies) == ["post", "rod"]
-    pose = lj.Pose.at((1.0, 2.0, 3.0), (0.0, 0.0, 1.0), np.pi / 2)
+    pose = lj.bodies.Pose.at((1.0, 2.0, 3.0), (0.0, 0.0, 1.0), np.pi / 2)
     q, v = model.state({"post": pose}, {"post": pose.moving((1.0, 0.0, 0.0))})
     np.testing.assert_allclose(q["rod"].position, [1.0, 2.0, 3.0], atol=1e-15)
     np.testing.assert_allclose(v["rod"].position, [1.0, 0.0, 0.0], atol=1e-15)

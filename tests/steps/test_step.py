@@ -138,7 +138,7 @@ def test_float32_stays_and_late_steps_are_as_long():
 
 def test_refused():
     """A hybrid, an implicit method, a class, and a step that is no number, in words."""
-    wall = lj.touches(lambda t, q, params: q, restitution=0.5)
+    wall = lj.guards.touches(lambda t, q, params: q, restitution=0.5)
     bouncing = lj.Hybrid({"flying": pendulum}, [lj.Switch("flying", to="flying", when=wall)])
     with pytest.raises(TypeError, match="has one for each of its phases"):
         lj.step(bouncing, 0.0, 1.0, 0.0, PARAMS, 0.1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import Trajectory
 
 TS = np.linspace(0.0, 2.0, 5)
 AXES = {"k": np.array([1.0, 2.0, 3.0]), "x": np.array([0.5, 1.0])}
@@ -97,7 +98,7 @@ def test_a_store_opened(store):
     """Trajectories equal those of the sweep bit for bit; they print, plot and animate without their system."""
     swept, opened = quiet(run, store=store), lj.open_sweep(store, classes=[Pair])
     motions = opened.values["motion"]
-    assert swept.ran == 0 and isinstance(motions, lj.Trajectory) and isinstance(opened.values["pair"], Pair)
+    assert swept.ran == 0 and isinstance(motions, Trajectory) and isinstance(opened.values["pair"], Pair)
     np.testing.assert_allclose(motions.q["x"], EXACT, atol=1e-8)
     for name in ("t", "q", "v", "end", "stats", "scaled_error", "result"):
         same = jax.tree.map(np.array_equal, getattr(motions, name), getattr(swept.values["motion"], name))
@@ -162,7 +163,7 @@ def test_times_of_their_own(tmp_path):
     np.testing.assert_allclose(data["times"], TS * AXES["k"][:, None], rtol=1e-15)
     np.testing.assert_allclose(data["q.x"], np.cos(AXES["k"][:, None] ** 2 * TS), atol=1e-7)
     xarray.testing.assert_equal(data, swept.to_xarray())
-    assert isinstance(lj.open_sweep(tmp_path / "own").values, lj.Trajectory)
+    assert isinstance(lj.open_sweep(tmp_path / "own").values, Trajectory)
 
 
 class Stiff(eqx.Module):

@@ -69,9 +69,16 @@ def test_loops_in_python():
     prepare(lj.System(chain_in_loops), *state)
     prepare(lj.System(chain_at_once), *state)
     # Nor of the library's own recursion, a method.
-    bodies = [lj.Body(f"{i}", 1.0, (1.0, 1.0, 1.0)) for i in range(6)]
-    hinges = {"a": [lj.revolute(x.at(), y.at((0.0, 0.0, 1.0))) for x, y in zip([lj.ground, *bodies], bodies)]}
-    prepare(lj.Tree(bodies, hinges).system([lj.weight(bodies)]), 0.0, *[{"a": x[:6]} for x in state[1:3]], None)
+    bodies = [lj.bodies.Body(f"{i}", 1.0, (1.0, 1.0, 1.0)) for i in range(6)]
+    hinges = {
+        "a": [lj.bodies.revolute(x.at(), y.at((0.0, 0.0, 1.0))) for x, y in zip([lj.bodies.ground, *bodies], bodies)]
+    }
+    prepare(
+        lj.bodies.Tree(bodies, hinges).system([lj.bodies.weight(bodies)]),
+        0.0,
+        *[{"a": x[:6]} for x in state[1:3]],
+        None,
+    )
     prepare(lj.System(chain_in_loops), 0.0, state[1][:8], state[2][:8], state[3])
     short = 0.0, state[1][:5], state[2][:5], state[3]
     in_loops, at_once = (evaluated(chain, *short) for chain in (chain_in_loops, chain_at_once))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate import failure
+from lagjax.integrate import HybridTrajectory, failure
 from lagjax.integrate.trajectory.hybrid_trajectory import Switches
 from lagjax.system import State
 
@@ -30,10 +30,10 @@ bouncing = lj.Hybrid({"flying": ball}, [bounce], most_switches=4)
 PARAMS = {"g": G, "e": 0.5}
 
 
-def in_phases(*args, **options) -> lj.HybridTrajectory:
+def in_phases(*args, **options) -> HybridTrajectory:
     """Call `lj.integrate` with a hybrid system."""
     traj = lj.integrate(*args, **options)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     return traj
 
 
@@ -130,7 +130,9 @@ def test_said_by_name(call, error, words):
 @pytest.mark.exhaustive
 def test_it_comes_to_rest():
     """Infinitely many bounces end in the phase of rest, at the time in closed form, √(2h/g)(1+e)/(1-e)."""
-    fall = lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.5), rest="lying", slower_than=1e-8)
+    fall = lj.Switch(
+        "flying", to="flying", when=lj.guards.touches(height, restitution=0.5), rest="lying", slower_than=1e-8
+    )
     both = lj.Hybrid({"flying": ball, "lying": lying}, [fall], most_switches=60)
     traj = in_phases(both, 1.0, 0.0, {"g": G}, ts=np.linspace(0.0, 3.0, 7))
     assert len(traj.switches) == 29 and traj.named_phases()[-1] == "lying"
@@ -144,7 +146,7 @@ def test_it_comes_to_rest():
 def test_between_walls():
     """Without gravity dz_end/dz₀ = -1 after one elastic bounce, 1 after two; a thousand lanes have the closed form."""
     free = lj.System(lambda t, q, v, p: 0.5 * v**2)
-    left, right = (lj.touches(gap, restitution=1.0) for gap in (height, lambda t, q, p: p["width"] - q))
+    left, right = (lj.guards.touches(gap, restitution=1.0) for gap in (height, lambda t, q, p: p["width"] - q))
     walls = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in (left, right)])
     end = lambda z, v: lj.integrate(walls, z, v, {"width": 1.0}, ts=np.array([0.0, 1.0]), estimate_error=False).q[-1]
     # Batched derivatives, of lanes that bounce once and of lanes that bounce twice.
@@ -159,7 +161,7 @@ def test_between_walls():
 def test_two_balls_collide():
     """The impulse is that of the metric of M."""
     balls = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(p["m"] * v**2))
-    apart = lj.touches(lambda t, q, p: q[1] - q[0], restitution=lambda speed: 0.5 + 0.0 * speed)
+    apart = lj.guards.touches(lambda t, q, p: q[1] - q[0], restitution=lambda speed: 0.5 + 0.0 * speed)
     hybrid = lj.Hybrid({"apart": balls}, [lj.Switch("apart", to="apart", when=apart)])
     m, v0 = np.array([1.0, 3.0]), np.array([2.0, -1.0])
 
@@ -175,7 +177,9 @@ def test_two_balls_collide():
 @pytest.mark.slow
 def test_a_body_that_rests_is_not_taken_to_fly():
     """A body in a flying phase that rests on its support would fall through it: this is refused."""
-    touching = lj.Hybrid({"flying": ball}, [lj.Switch("flying", to="flying", when=lj.touches(height, restitution=0.0))])
+    touching = lj.Hybrid(
+        {"flying": ball}, [lj.Switch("flying", to="flying", when=lj.guards.touches(height, restitution=0.0))]
+    )
     for v0 in (0.0, 1e-18):
         with pytest.raises(RuntimeError, match="No phase lasts"):
             lj.integrate(touching, 0.0, v0, {"g": G}, ts=np.array([0.0, 1.0]))
@@ -185,7 +189,7 @@ def test_a_body_that_rests_is_not_taken_to_fly():
 def test_two_guards_at_once():
     """A ball that hits a corner switches at both walls at one time, one after the other."""
     free = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2))
-    walls = [lj.touches(lambda t, q, p, i=i: q[i], restitution=1.0) for i in (0, 1)]
+    walls = [lj.guards.touches(lambda t, q, p, i=i: q[i], restitution=1.0) for i in (0, 1)]
     corner = lj.Hybrid({"free": free}, [lj.Switch("free", to="free", when=wall) for wall in walls])
     traj = in_phases(corner, np.ones(2), -np.ones(2), ts=np.array([0.0, 3.0]))
     np.testing.assert_allclose(traj.q[-1], 2.0, rtol=1e-13)

@@ -115,12 +115,14 @@ def test_what_stays_alone():
 
 def chain(count):
     """Bodies that hang on each other by balls in sockets."""
-    bodies = [lj.Body(f"b{i}", 1.0 + 0.1 * i, (0.1, 0.11, 0.02)) for i in range(count)]
-    above = [lj.ground.at(), *(body.at((0.0, 0.0, -0.5)) for body in bodies)]
-    joints = {f"j{i}": lj.spherical(a, body.at((0.0, 0.0, 0.5))) for i, (a, body) in enumerate(zip(above, bodies))}
-    q = {body.name: lj.Pose.at((0.0, 0.0, -0.5 - i)) for i, body in enumerate(bodies)}
+    bodies = [lj.bodies.Body(f"b{i}", 1.0 + 0.1 * i, (0.1, 0.11, 0.02)) for i in range(count)]
+    above = [lj.bodies.ground.at(), *(body.at((0.0, 0.0, -0.5)) for body in bodies)]
+    joints = {
+        f"j{i}": lj.bodies.spherical(a, body.at((0.0, 0.0, 0.5))) for i, (a, body) in enumerate(zip(above, bodies))
+    }
+    q = {body.name: lj.bodies.Pose.at((0.0, 0.0, -0.5 - i)) for i, body in enumerate(bodies)}
     v = {name: pose.moving() for name, pose in q.items()}
-    return prepare(lj.multibody(bodies, joints, [lj.weight(bodies)]), 0.0, q, v, None)
+    return prepare(lj.bodies.multibody(bodies, joints, [lj.bodies.weight(bodies)]), 0.0, q, v, None)
 
 
 @pytest.mark.parametrize("what", ["L", "forcing and mass", "constraints", "A and gamma"])

@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import solve_continuous_are
 
 import lagjax as lj
+from lagjax.two_points import LQR
 
 mass = lj.System(
     lambda t, q, v, p: 0.5 * p["m"] * v**2 - 0.5 * p["k"] * q**2, force=lambda t, q, v, p: p["push"] + 0.0 * v
@@ -21,7 +22,7 @@ def test_a_mass():
     """Riccati's equation of a mass on a spring, with a cost of position times push, is solved."""
     m, k = 2.0, -5.0
     found = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": k})
-    assert isinstance(found, lj.LQR)
+    assert isinstance(found, LQR)
     a, b = np.array([[0.0, 1.0], [-k / m, 0.0]]), np.array([[0.0], [1 / m]])
     cross, s = np.array([[0.4], [0.0]]), np.asarray(found.cost_to_go)
     residual = a.T @ s + s @ a - (s @ b + cross) @ (b.T @ s + cross.T) / 2.0 + np.diag([3.0, 0.5])
@@ -30,7 +31,7 @@ def test_a_mass():
     assert np.max(np.real(found.eigenvalues)) < 0 and np.all(np.linalg.eigvalsh(s) > 0)
     # Twin: the sign of the spring changes the gain.
     other = lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, {"m": m, "k": -k})
-    assert isinstance(other, lj.LQR) and np.max(np.abs(other.gain - found.gain)) > 1.0
+    assert isinstance(other, LQR) and np.max(np.abs(other.gain - found.gain)) > 1.0
     assert abs(found.control(1.0, 2.0)["push"] + found.gain[0, 0] + 2 * found.gain[0, 1]) < 1e-12
 
 
@@ -66,7 +67,7 @@ def test_a_cost_that_slopes_across_a_constraint():
             pendulum, {"u": 0.0}, at,
             lambda t, q, v, u, p, sign=sign: 10 * (1 + sign * q["y"]) + v["x"] ** 2 + v["y"] ** 2 + u["u"] ** 2,
         )  # fmt: skip
-        assert isinstance(found, lj.LQR)
+        assert isinstance(found, LQR)
         a, b = np.array([[0.0, 1.0], [-sign * 9.81, 0.0]]), np.array([[0.0], [1.0]])
         s, bare = (solve_continuous_are(a, b, np.diag([w, 1.0]), np.eye(1)) for w in (5.0, 0.0))
         np.testing.assert_allclose(np.abs(found.gain[0, [0, 2]]), s[1], rtol=1e-9)

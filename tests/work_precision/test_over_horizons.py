@@ -7,6 +7,7 @@ import pytest
 from scipy import special
 
 import lagjax as lj
+from lagjax.work_precision import Horizons
 from lagjax.work_precision.work_precision import STEPS, Needed
 from tests.by_hand import swing
 from tests.systems import PARAMS, pendulum
@@ -48,7 +49,7 @@ def made(adapting, equal):
     rows = {
         10.0**k: {"Dopri8": needed(a), "Gauss(4)": needed(b)} for k, (a, b) in enumerate(zip(adapting, equal), start=1)
     }
-    return lj.Horizons(solvers, rows, 1e-3)
+    return Horizons(solvers, rows, 1e-3)
 
 
 def test_from_when_on_equal_steps_win():
@@ -62,7 +63,7 @@ def test_from_when_on_equal_steps_win():
     assert late.win is not None and not late.win.measured and late.win.periods == pytest.approx(1000 * 2.0**8)
     assert "up to about 3e+05; from there on" in repr(late)
     assert made((1.0, 10.0, 100.0), (np.inf, np.inf, np.inf)).win is None
-    assert lj.Horizons({"Gauss(4)": lj.Gauss(4)}, {1.0: {"Gauss(4)": Needed(0.1, 1e-4, 1.0, 10)}}, 1e-3).win is None
+    assert Horizons({"Gauss(4)": lj.Gauss(4)}, {1.0: {"Gauss(4)": Needed(0.1, 1e-4, 1.0, 10)}}, 1e-3).win is None
     assert "do not win" in repr(made((1.0, 10.0, 100.0), (np.inf, np.inf, np.inf)))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import lagjax as lj
+from lagjax.work_precision import WorkPrecision
 from lagjax.work_precision.result import Curve, Point
 
 
@@ -16,7 +16,7 @@ def point(method, tolerance, error, steps, **others):
 ERRORS = {tolerance: 1.2345678901234567 * tolerance for tolerance in (1e-3, 1e-5, 1e-7)}
 ALL = tuple(point("A", tolerance, error, round(tolerance**-0.25)) for tolerance, error in ERRORS.items())
 SOME = (point("B", 1e-3, np.inf, None, seconds=np.nan, least=np.nan, trusted=False, result="failed"),)
-found = lj.WorkPrecision({"A": Curve("A", None, 2.5, ALL), "B": Curve("B", None, np.nan, SOME)}, None, "as given", 1e-5)
+found = WorkPrecision({"A": Curve("A", None, 2.5, ALL), "B": Curve("B", None, np.nan, SOME)}, None, "as given", 1e-5)
 
 
 def test_pandas():

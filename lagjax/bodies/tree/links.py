@@ -100,7 +100,7 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
                     f"body '{child.name}' hangs on two joints, '{held_by[child.name][0]}' and '{name}'.\n"
                     "Usual cause: a closed loop; or the places of one of them in the wrong order, which is the "
                     "parent's first.\n"
-                    f"Fix: lj.revolute(parent.at(...), child.at(...)); a joint that closes a loop goes into "
+                    f"Fix: lj.bodies.revolute(parent.at(...), child.at(...)); a joint that closes a loop goes into "
                     f"tree.system(closures={{'{name}': ...}})."
                 )
             at = quaternions if kinds == ("ball",) else numbers
@@ -146,20 +146,20 @@ def _joint(name: str, joint: Holonomic, bodies: Set[Body]) -> tuple[Joined, tupl
     kinds = FREEDOMS.get(joined.rows) if isinstance(joined, Joined) else None
     if kinds is None or not isinstance(joined, Joined):
         raise TypeError(
-            f"joint '{name}' is none that a tree has coordinates for: lj.revolute, lj.prismatic, lj.cylindrical, "
-            "lj.spherical, lj.universal, lj.planar, lj.fixed, or a list of some of one kind.\n"
+            f"joint '{name}' is none that a tree has coordinates for: revolute, prismatic, cylindrical, spherical, "
+            "universal, planar or fixed of lj.bodies, or a list of some of one kind.\n"
             "Fix: a constraint of another kind goes into tree.system(closures={...})."
         )
     for marker in (joined.a, joined.b):
         if marker.body not in bodies and not isinstance(marker.body, Ground):
             raise ValueError(
                 f"joint '{name}' holds on to '{marker.body.name}', which is not among the bodies of the tree.\n"
-                "Fix: lj.Tree([..., body], joints)."
+                "Fix: lj.bodies.Tree([..., body], joints)."
             )
     if isinstance(joined.b.body, Ground):
         raise ValueError(
             f"the second place of joint '{name}' is on the ground, and must be on the body that hangs there.\n"
-            "Fix: lj.revolute(lj.ground.at(...), body.at(...)), the parent's first."
+            "Fix: lj.bodies.revolute(lj.bodies.ground.at(...), body.at(...)), the parent's first."
         )
     return joined, kinds
 
@@ -185,7 +185,7 @@ def _check_masses(body: Body, kinds: tuple[str, ...], mass: bool):
     if kinds not in (("held",), ("driven",)) and not mass:
         raise ValueError(
             f"the body '{body.name}' moves and has no mass, and nothing that has some hangs on it.\n"
-            "Usual cause: a frame that should be fixed.\nFix: its mass and inertia, or lj.fixed(parent, child)."
+            "Usual cause: a frame that should be fixed.\nFix: its mass and inertia, or lj.bodies.fixed(parent, child)."
         )
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from lagjax.bodies.assemble import usual_shapes
 from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies, floats
 from lagjax.bodies.driven import OfPlaced
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.bodies.rotation import product
-from lagjax.bodies.shapes import usual_shapes
 from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
 from lagjax.bodies.tree.links import check_armature, links_of
 from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, wrenches
@@ -46,27 +46,28 @@ class Tree:
     >>> import jax
     >>> import jax.numpy as jnp
     >>> import lagjax as lj
-    >>> rod = lj.Body("rod", mass=1.0, inertia=(1 / 12, 1 / 12, 0.0))
-    >>> hinge = lj.revolute(lj.ground.at(axis=(0.0, 1.0, 0.0)), rod.at((0.0, 0.0, 0.5), axis=(0.0, 1.0, 0.0)))
+    >>> rod = lj.bodies.Body("rod", mass=1.0, inertia=(1 / 12, 1 / 12, 0.0))
+    >>> y = (0.0, 1.0, 0.0)
+    >>> hinge = lj.bodies.revolute(lj.bodies.ground.at(axis=y), rod.at((0.0, 0.0, 0.5), axis=y))
     >>> pendulum = Tree([rod], {"hinge": hinge})
     >>> print(jax.jit(pendulum.poses)({"hinge": jnp.pi / 2})["rod"].position.round(6) + 0.0)
     [-0.5  0.   0. ]
-    >>> system = pendulum.system([lj.weight([rod])])
+    >>> system = pendulum.system([lj.bodies.weight([rod])])
     >>> a, _ = lj.accelerations(system, 0.0, {"hinge": jnp.pi / 2}, {"hinge": 0.0}, None)
     >>> print(a["hinge"].round(6))
     -14.715
 
     **Arguments:**
 
-    - `bodies`: `lj.Body`s of different names.
-    - `joints`: by name, `lj.revolute`, `lj.prismatic`, `lj.cylindrical`, `lj.universal`, `lj.planar`, `lj.spherical` or
-      `lj.fixed`, from a place on the parent (or `lj.ground`) to one on the body that hangs there; or a list of joints
-      of one kind.
+    - `bodies`: `lj.bodies.Body`s of different names.
+    - `joints`: by name, `lj.bodies.revolute`, `lj.bodies.prismatic`, `lj.bodies.cylindrical`, `lj.bodies.universal`,
+      `lj.bodies.planar`, `lj.bodies.spherical` or `lj.bodies.fixed`, from a place on the parent (or `lj.bodies.ground`)
+      to one on the body that hangs there; or a list of joints of one kind.
     - `armature`: by the name of a joint, the inertia of rotors that turn with it, behind gears by the square of their
       ratio: it adds ½ armature v² to the kinetic energy, `[L] [t]²/[q]²`. A number, or an array with one for each
       number of q (for each quaternion), or a function of params.
 
-    Coordinates, zero where the two frames (`lj.Marker`) are alike:
+    Coordinates, zero where the two frames (`lj.bodies.Marker`) are alike:
 
     | joint | `q[name]` |
     |---|---|
@@ -77,13 +78,13 @@ class Tree:
     | spherical | a quaternion (4,), then (1, 0, 0, 0), of any length: read as e / abs(e), and no constraint holds it |
     | fixed | none |
 
-    An array of these for a list. A body on which no joint ends is free, and `q[body.name]` its `lj.Pose`.
+    An array of these for a list. A body on which no joint ends is free, and `q[body.name]` its `lj.bodies.Pose`.
 
     Bodies without mass and inertia are frames, for joints that follow on each other at one place. A body with a
     `motion` moves as given and has no coordinates; what hangs on it is carried along. No joint ends on it.
 
-    >>> turning = lj.Body("turning", motion=lambda t, params: lj.Pose.at(angle=3.0 * t))
-    >>> slide = lj.prismatic(turning.at(axis=(1.0, 0.0, 0.0)), rod.at(axis=(1.0, 0.0, 0.0)))
+    >>> turning = lj.bodies.Body("turning", motion=lambda t, params: lj.bodies.Pose.at(angle=3.0 * t))
+    >>> slide = lj.bodies.prismatic(turning.at(axis=(1.0, 0.0, 0.0)), rod.at(axis=(1.0, 0.0, 0.0)))
     >>> away = Tree([turning, rod], {"slide": slide})
     >>> print(jax.jit(away.rates)({"slide": 0.5}, {"slide": 2.0}, None, 0.0)["rod"].position)
     [2.  1.5 0. ]
@@ -103,15 +104,15 @@ class Tree:
         joints: Mapping[str, Holonomic | Sequence[Holonomic]] | None = None,
         armature: Mapping[str, ArrayLike | Callable] | None = None,
     ):
-        bodies = check_bodies("lj.Tree", bodies)
+        bodies = check_bodies("lj.bodies.Tree", bodies)
         names = [body.name for body in bodies]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise ValueError(f"two bodies are called '{twice}'.\nFix: a name for each.")
         if not isinstance(joints or {}, Mapping):
             raise TypeError(
-                f"the joints of lj.Tree are a dict by name, and {type(joints).__name__} was given.\n"
-                "Fix: {'hinge': lj.revolute(lj.ground.at(), door.at())}, or {'links': [...]} for a list."
+                f"the joints of lj.bodies.Tree are a dict by name, and {type(joints).__name__} was given.\n"
+                "Fix: {'hinge': lj.bodies.revolute(lj.bodies.ground.at(), door.at())}, or {'links': [...]} for a list."
             )
         self.bodies = bodies
         links, entries = links_of(bodies, joints or {})
@@ -160,15 +161,16 @@ class Tree:
         """Return the system of these bodies in joint coordinates, whose accelerations come by the recursion.
 
         >>> import lagjax as lj
-        >>> cart, rail = lj.Body("cart", 2.0, (1.0, 1.0, 1.0)), lj.ground.at(axis=(1.0, 0.0, 0.0))
-        >>> tree = Tree([cart], {"slide": lj.prismatic(rail, cart.at(axis=(1.0, 0.0, 0.0)))})
+        >>> cart, rail = lj.bodies.Body("cart", 2.0, (1.0, 1.0, 1.0)), lj.bodies.ground.at(axis=(1.0, 0.0, 0.0))
+        >>> tree = Tree([cart], {"slide": lj.bodies.prismatic(rail, cart.at(axis=(1.0, 0.0, 0.0)))})
         >>> system = tree.system(potential=lambda t, q, params: 4.0 * q["slide"] ** 2)
         >>> print(lj.accelerations(system, 0.0, {"slide": 1.0}, {"slide": 0.0}, None)[0]["slide"])
         -4.0
 
         **Arguments:**
 
-        - `loads`: `lj.weight`, `lj.spring`, `lj.motor`, `lj.applied`, as for `lj.multibody`.
+        - `loads`: `lj.bodies.weight`, `lj.bodies.spring`, `lj.bodies.motor`, `lj.bodies.applied`, as for
+          `lj.bodies.multibody`.
         - `closures`: joints, or constraints written by hand, that close loops; they read `q[body.name]` as a pose.
         - `potential`: what V has besides, a function V(t, q, params) of the joint coordinates.
         - `others`: `force`, `dissipation`, `states` and `elements` of `lj.System`, in joint coordinates.

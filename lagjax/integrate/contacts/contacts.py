@@ -62,8 +62,8 @@ def touches(
       that metric, that the constraints of the *next* phase allow (a perfectly plastic impact, which sticks if they do).
     - `friction`: the coefficient of friction in the impact, a number or a function of `params`; without one it is
       smooth. The contact sticks, or slides with the impulse of friction on the cone; see `impacts.py`. The guards of
-      the phases decide between these: let the switch go to the phase that slides; its own guard, `lj.sticks`, ends that
-      at once if the contact does not slide in its direction.
+      the phases decide between these: let the switch go to the phase that slides; its own guard, `lj.guards.sticks`,
+      ends that at once if the contact does not slide in its direction.
     - `sliding`: `sliding(t, q, v, params)`, the velocity at which the contact slides, linear in v.
 
     **Raises:** `TypeError` for a gap, or a sliding velocity, that is not a function; `ValueError` for friction without
@@ -75,7 +75,7 @@ def touches(
     if not callable(gap):
         raise TypeError(
             f"a gap must be a function of (t, q, params), not {type(gap).__name__}.\n"
-            'Fix: lj.touches(lambda t, q, params: q["y"]).'
+            'Fix: lj.guards.touches(lambda t, q, params: q["y"]).'
         )
     if friction is None and sliding is None:
         return Touches(gap, Plastic() if restitution is None else Impact(gap, _number(restitution)))
@@ -83,7 +83,7 @@ def touches(
         given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
         raise ValueError(
             f"{given} is given, but {missing} is not: friction in an impact needs a coefficient and a velocity.\n"
-            'Fix: lj.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
+            'Fix: lj.guards.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
         )
     if not callable(sliding):
         raise TypeError(
@@ -93,7 +93,8 @@ def touches(
     if restitution is None:
         raise ValueError(
             "friction in an impact needs a restitution: without one, the constraints of the next phase fix the "
-            "velocities after the impact, whatever the friction.\nFix: lj.touches(gap, restitution=0.0, friction=...)."
+            "velocities after the impact, whatever the friction.\n"
+            "Fix: lj.guards.touches(gap, restitution=0.0, friction=...)."
         )
     return Touches(gap, Impact(gap, _number(restitution), _number(friction), sliding))
 
@@ -123,7 +124,7 @@ def releases(contact: str) -> Releases:
     long as it pushes: written as a gap, since λ > 0 pushes along +∂g/∂q.
 
     The reset opens the contact with a speed of a few round-offs: otherwise its gap would leave zero without speed and
-    acceleration, and for a guard of the next phase, `lj.touches` of the same gap, it would stay closed for ever.
+    acceleration, and for a guard of the next phase, `lj.guards.touches` of the same gap, it would stay closed for ever.
 
     **Raises:** `ValueError`, by `lj.integrate`, if the phase has no such constraint, or if that has several equations.
     """
@@ -191,7 +192,7 @@ def sticks(sliding: Callable) -> Sticks:
 
     **Arguments:** `sliding`: `sliding(t, q, v, params)`, the sliding velocity in the direction in which its phase
     slides, above zero there. If friction cannot hold the contact then, the next phase ends at once by its own
-    `lj.slips(..., side=...)`, and the contact slides on, or the other way.
+    `lj.guards.slips(..., side=...)`, and the contact slides on, or the other way.
 
     **Raises:** as `lj.Switch`, if it does not return one number.
     """

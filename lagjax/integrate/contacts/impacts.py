@@ -54,7 +54,7 @@ OPENS = 64
 
 
 class Impact(OfPhases):
-    """An impact with a restitution, and with friction if it has a coefficient: see `lj.touches`."""
+    """An impact with a restitution, and with friction if it has a coefficient: see `lj.guards.touches`."""
 
     gap: Callable
     restitution: Callable | ArrayLike

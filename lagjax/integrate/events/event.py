@@ -280,12 +280,16 @@ def left_to_diffrax(event: diffrax.Event | None) -> diffrax.Event | None:
     return diffrax.Event(asking) if asking else None
 
 
-def guards_of(crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False) -> Guards:
-    """Return the guards of one or more crossings, called once on shapes. `start`: the first state."""
+def guards_of(
+    crossings: Mapping[str, Crossing], system: System, start: State, holds: bool = False, given: Any = None
+) -> Guards:
+    """Return the guards of one or more crossings, called once on shapes. `start`: the first state; `given`: what the
+    functions of the system take as `params`, where guards take less."""
     functions, of_guards = [], []
-    given = dict(zip(OF_STATE, start)) | {"multipliers": model_of(system, *start).zero_multipliers()}
+    model = model_of(system, *start[:3], start.params if given is None else given)
+    arguments = dict(zip(OF_STATE, start)) | {"multipliers": model.zero_multipliers()}
     for name, crossing in crossings.items():
-        guard = traced_guard(name, crossing.guard, given)
+        guard = traced_guard(name, crossing.guard, arguments)
         takes_multipliers = guard.takes == WITH_MULTIPLIERS
         # Multipliers require the equations, which take long to compile.
         long = takes_multipliers or length(guard.program.jaxpr) > LONG

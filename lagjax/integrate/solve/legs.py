@@ -100,7 +100,8 @@ class Then(NamedTuple):
     on from where the leg ended, by that, a jump or a pause; or whether the leg is done `again`, and does not count.
 
     `end`: of the leg; `q`, `v`: after it; `mode`: after it, also where it is done again; `record`: with this change;
-    `rows`: of the leg, with those of its mode; `before`: which of the outputs up to its start are its own.
+    `rows`: of the leg, with those of its mode; `before`: which of the outputs up to its start are its own; `begins`:
+    whether the mode that fits is still to be found where the next leg starts.
     """
 
     onward: Bool[Array, ""]
@@ -115,6 +116,7 @@ class Then(NamedTuple):
     events: dict[str, Crossings]
     rows: dict[str, Any]
     before: Bool[Array, ""]
+    begins: Bool[Array, ""] | bool = False
 
 
 class Location:
@@ -122,7 +124,6 @@ class Location:
 
     system: System
     guards: Guards | None
-    forced: Any = None
 
     def has(self, mode: Any) -> Bool[Array, ""] | bool:
         """Whether a mode is one of these."""
@@ -171,7 +172,7 @@ def over_legs(
 
 def before_any(
     start: Snapshot, end: Snapshot, mode: Any, sizes: Array, settings: Settings, rows: dict[str, Any],
-    events: dict[str, Crossings], record: Any = None, begins: bool = False,
+    events: dict[str, Crossings], record: Any = None, begins: Bool[Array, ""] | bool = False,
 ) -> Way:  # fmt: skip
     """The way before the first leg; `end`: of the motion, if there is none."""
     zero, yes, dtype = jnp.asarray(0), jnp.asarray(True), start.t.dtype
@@ -194,7 +195,6 @@ def _after(
     times = jnp.where(here & ~begins, location.until(ahead, way), way.t)
     found = apart(
         solved, location.system, way.q, way.v, given, times, location.guards, settings, adjoint, way.sizes_so_far,
-        location.forced,
     )  # fmt: skip
     rows = {name: found[name] for name in ROWS}
     then = location.then(Leg(here, begins, way, given, times, found["end"], found["result"], found["events"], rows))
@@ -205,7 +205,7 @@ def _after(
     known = known & reached(rows["q"])
     # Nothing is known from a leg of no length, but for the mode and the velocities that fit the start.
     sizes = jnp.maximum(way.sizes_so_far, sizes_of(end.q, end.v))
-    sizes = jnp.where(begins, sizes_of(then.q, then.v), sizes)
+    sizes = jnp.where(begins & (way.count == 0), sizes_of(then.q, then.v), sizes)
     least = way.least if not settings.by_size else jnp.maximum(way.least, stop_gradient(found["tolerance"][1]))
     error = jnp.where(ended_well(result), jnp.maximum(way.scaled_error, found["scaled_error"]), jnp.inf)
     stats = {name: n + found["stats"][name] for name, n in way.stats.items()}
@@ -214,7 +214,7 @@ def _after(
     events = events if then.again is False else where(then.again, way.events, events)
     further = Way(
         t=jnp.where(then.moves, end.t, way.t), q=where(then.moves, then.q, way.q), v=where(then.moves, then.v, way.v),
-        mode=then.mode, begins=way.begins & ~begins, continues=again | then.moves & (end.t < ts[-1]),
+        mode=then.mode, begins=jnp.asarray(then.begins), continues=again | then.moves & (end.t < ts[-1]),
         count=way.count + (then.onward & ~begins), record=then.record,
         rows=filled(way.rows, known, rows), events=events,
         end=where(then.onward, end._replace(q=then.q, v=then.v), where(counts, end, way.end)), stats=stats,

@@ -32,7 +32,6 @@ from lagjax.integrate.stepping.projected_solver import FastField, Field, Project
 from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
 from lagjax.integrate.stepping.tolerances import (
     AsNothing,
-    Forced,
     PerCoordinateTolerance,
     Scales,
     Tolerances,
@@ -93,12 +92,10 @@ TRANSLATED = {
 def solved(
     system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Float[Array, " T"], guards: Guards | None,
     settings: Settings, adjoint: diffrax.AbstractAdjoint, sizes_so_far: Float[Array, "2 n"] | None = None,
-    forced: Forced | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fields of the trajectory of one system by name, with `settled`: whether the robust solve would agree.
 
-    `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one;
-    `forced`: the accelerations of forces that may cancel.
+    `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
     """
     ours = isinstance(settings.method, (ExplicitRungeKutta, Nystrom, EqualSteps))
     # A condition for diffrax evaluates the vector field at the state that it gets, which is the user's.
@@ -111,7 +108,7 @@ def solved(
         settings = replace(settings, drift="project")
     if guards is not None and equations.users is not None:
         guards = guards.in_numbers(equations.users.tree)
-    start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings, sizes_so_far, forced)
+    start = _start(equations, equations.inside(q0), equations.inside(v0), ts, settings, sizes_so_far)
     settings = replace(settings, atol=start.atol)
     if settings.dt0 is not None:
         # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
@@ -153,7 +150,7 @@ class Start(NamedTuple):
     scales: Scales | None
 
 
-def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Settings, sizes_so_far, forced) -> Start:
+def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Settings, sizes_so_far) -> Start:
     """Prepare the start; of the reasons to refuse it, the last one that holds becomes the result."""
     t, given, off_constraints = ts[0], State(ts[0], q, v, equations.model.params), jnp.asarray(False)
     project = settings.drift == "project"
@@ -161,10 +158,10 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
         (q, v), verdict = equations.begin(t, q, v, project)
     else:
         if project:
-            q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far, forced=forced))
+            q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
         verdict = equations.verdict(t, q, v)
     a, _, finite, singular, contradictory, mass, known = stop_gradient(verdict)
-    tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a, forced)
+    tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol, known)
         if project and not equations.are_taken_for_regular:
@@ -172,7 +169,9 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
     first_order = equations.model.form.first_order
     without_mass = np.zeros(equations.model.n, bool) if first_order is None else first_order.mask(equations.model.n)
     at_start = mass, *stop_gradient((q, v)), a, stop_gradient(span_of(ts))
-    scales = scales_of(*at_start, without_mass & ~without_mass.all(), forced) if settings.by_size else None
+    scales = None
+    if settings.by_size:
+        scales = scales_of(*at_start, without_mass & ~without_mass.all(), settings.forced)
     if scales is not None and sizes_so_far is not None:
         scales = scales._replace(first=jnp.maximum(scales.first, sizes_so_far))
     too_small = settings.controller is None and settings.rtol[0] < ROUND_OFFS * jnp.finfo(ts.dtype).eps

@@ -202,7 +202,6 @@ class OverJumps(Location):
         self.piecewise = None if jumps is None else piecewise_of(jumps, inner.system, small)
         self.system = inner.system if self.piecewise is None else self.piecewise.smooth
         self.guards = inner.guards if self.piecewise is None else _together(self.piecewise, inner.guards)
-        self.forced = inner.forced
 
     def has(self, mode: Jumping) -> Bool[Array, ""] | bool:
         return self.inner.has(mode.inner)
@@ -261,7 +260,8 @@ class OverJumps(Location):
         )
         mode = Jumping(inner, outcomes, onward, free, count)
         moves, before = jnp.where(mine, by_jump, then.moves | paused), then.before & (leg.way.t <= self.ts[0])
-        return Then(onward, moves, again, end, q, v, mode, record, result, events, then.rows | {"q": rows_q}, before)
+        rows, begins = then.rows | {"q": rows_q}, then.begins if then.begins is False else then.begins & ~mine
+        return Then(onward, moves, again, end, q, v, mode, record, result, events, rows, before, begins)
 
 
 def _inside(way: Way) -> Way:

@@ -12,8 +12,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.events.event import Crossing, Guards, guards_of, left_to_diffrax, traced_guard
-from lagjax.integrate.solve.assembly import InElements, assembled, only_phase
+from lagjax.integrate.elements.in_modes import OneGuard
+from lagjax.integrate.elements.meeting import Meeting
+from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of, left_to_diffrax, traced_guard
+from lagjax.integrate.jumps.find import OfParams
+from lagjax.integrate.solve.assembly import InElements, assembled
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.segments import Phase
 from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES
@@ -32,6 +35,9 @@ from lagjax.system import (
     traced_call,
     traced_system,
 )
+
+# The guard of all modes of the elements of a phase.
+MODES = EventKind("modes", -1, terminal=True, most=1, takes_multipliers=True, long=True, holds=True)
 
 
 class Reset(eqx.Module):
@@ -81,10 +87,13 @@ def traced_phases(system: System | Hybrid, start: State, ts: Array | np.ndarray 
     `ts`: the times of the motion, so that there is room for the instants of sampled controls.
     """
     if isinstance(system, InElements):
-        return assembled(system.user, start, ts)
-    if not system.in_phases:
-        return traced_system(system, start) if system.elements is None else assembled(system, start, ts)
-    hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))
+        return traced_phases(system.user, start, ts)
+    if not system.in_phases and system.elements is None:
+        return traced_system(system, start)
+    if system.elements is not None:
+        hybrid: Any = assembled(system, start, ts)
+    else:
+        hybrid = replace_fields(system, systems=tuple(traced_system(phase, start) for phase in system.phases))
     return replace_fields(hybrid, switches=tuple(_traced_switch(hybrid, k, start) for k in range(len(hybrid.switches))))
 
 
@@ -126,52 +135,68 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
         if takes_of(crossing.guard) != OF_STATE:
             raise ValueError(
                 f"event '{name}' takes multipliers, which differ from phase to phase.\n"
-                "Fix: lj.Switch(..., when=lj.releases(name)) if a contact lets go; or traj.multipliers at outputs."
+                "Fix: lj.Switch(..., when=lj.guards.releases(name)) if a contact lets go; or traj.multipliers at "
+                "outputs."
             )
     if SWITCHES in events:
         raise ValueError(
             f"an event in events= is named '{SWITCHES}', the name of the switches in traj.events.\nFix: another name."
         )
-    if isinstance(hybrid, InElements):
-        return (only_phase(hybrid, start, events),)
     return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
 
 def _phase(hybrid: Hybrid, i: int, start: State, events: Mapping[str, Crossing]):
     numbers, system = hybrid.leaving(i), hybrid.systems[i]
+    laws = hybrid.laws[i] if isinstance(hybrid, InElements) else None
     names = {_name(hybrid, k): hybrid.switches[k] for k in numbers}
     crossings = {name: Crossing(switch.when, direction=-1) for name, switch in names.items()}
-    both = (crossings, True), (events, False)
-    given = [guards_of(named, system, start, holds) for named, holds in both if named]
-    guards = Guards(*(sum((getattr(g, name) for g in given), ()) for name in ("functions", "kinds"))) if given else None
-    resets = tuple(_reset(hybrid.switches[k], hybrid, system) for k in numbers)
-    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events))
+    parts = [guards_of(crossings, system, start, True, hybrid.given(start.params, phase=i))] if crossings else []
+    if laws is not None and laws.guarded:
+        parts.append(Guards((OneGuard(laws),), (MODES,)))
+    if events:
+        parts.append(guards_of(events, system if laws is None else system_alone(hybrid, i, start), start))
+    functions = tuple(
+        f if laws is None or isinstance(f, OneGuard) else OfParams(f) for part in parts for f in part.functions
+    )
+    guards = Guards(functions, tuple(kind for part in parts for kind in part.kinds)) if parts else None
+    meeting = None if laws is None else Meeting(system, laws)
+    places = hybrid.places[i] if isinstance(hybrid, InElements) else (0, 0)
+    resets = tuple(_reset(hybrid.switches[k], hybrid, i, start) for k in numbers)
+    return Phase(guards, tuple(numbers), hybrid.targets[numbers], resets, tuple(events), meeting, places)
+
+
+def system_alone(hybrid: Hybrid, i: int, start: State) -> System:
+    """The system of a phase without its elements, with its functions as programs."""
+    if not isinstance(hybrid, InElements) or hybrid.laws[i] is None:
+        return hybrid.systems[i]
+    return traced_system(hybrid.user.phases[i].first_phase, start)
 
 
 def _name(hybrid: Hybrid, k: int):
     return f"{hybrid.switches[k].in_words()}, number {k}"
 
 
-def _reset(switch: Switch, hybrid: Hybrid, system: System) -> Reset:
-    function = switch.reset
+def _reset(switch: Switch, hybrid: Hybrid, i: int, start: State) -> Reset:
+    function, before = switch.reset, system_alone(hybrid, i, start)
     if isinstance(function, OfPhases):
-        function = function.between(system, hybrid.systems[hybrid.names.index(switch.to)])
+        function = function.between(before, system_alone(hybrid, hybrid.names.index(switch.to), start))
     takes = OF_STATE if function is None else takes_of(function)
     if switch.rest is None:
         return Reset(function, takes)
     if takes_of(switch.when) != OF_STATE:
         raise ValueError(
             f"the switch {switch.in_words()} has rest=, and its guard takes multipliers: velocities do not tell how "
-            "fast it opens.\nFix: rest= only with lj.touches(gap)."
+            "fast it opens.\nFix: rest= only with lj.guards.touches(gap)."
         )
-    settle = Plastic().between(system, hybrid.systems[hybrid.names.index(switch.rest)])
+    settle = Plastic().between(before, system_alone(hybrid, hybrid.names.index(switch.rest), start))
     return Reset(function, takes, settle, switch.when, switch.slower_than)
 
 
 def _traced_switch(hybrid: Hybrid, k: int, start: State):
     switch = hybrid.switches[k]
     system = hybrid.systems[hybrid.names.index(switch.phase)]
-    multipliers = model_of(system, *start).zero_multipliers()
+    here = hybrid.given(start.params, phase=hybrid.names.index(switch.phase))
+    multipliers = model_of(system, *start[:3], here).zero_multipliers()
     given: dict[str, Any] = start._asdict() | {"multipliers": multipliers, "speed": start.t}
     when, reset = traced_guard(_name(hybrid, k), switch.when, given), switch.reset
     of_switch = f" of the switch {switch.in_words()}"

@@ -103,8 +103,9 @@ def _inside(problem: Problem) -> Trajectory:
 
 def _may_hold_too_much(problem: Problem) -> bool:
     """Whether contacts and constraints may be more than coordinates, and so depend on each other."""
-    laws = problem.system.laws if isinstance(problem.system, InElements) else None
-    return laws is not None and laws.equations > sum(map(np.size, jtu.tree_leaves(problem.q)))
+    laws = problem.system.laws if isinstance(problem.system, InElements) else ()
+    most = sum(map(np.size, jtu.tree_leaves(problem.q)))
+    return any(of_phase is not None and of_phase.equations > most for of_phase in laws)
 
 
 class _Programs:

@@ -93,9 +93,7 @@ class Scales(NamedTuple):
     forced: Forced | None = None
 
 
-def tolerances_at(
-    start, ts: Array, settings: Settings, sizes_so_far=None, a=None, forced: Forced | None = None
-) -> Tolerances:
+def tolerances_at(start, ts: Array, settings: Settings, sizes_so_far=None, a=None) -> Tolerances:
     """The tolerances of the whole state, as given or from the start's size; for constraints, which mix coordinates.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities before it; `a`: the accelerations there, which are its
@@ -105,7 +103,7 @@ def tolerances_at(
         return Tolerances(settings.rtol, settings.atol)
     sizes, span = jnp.abs(_rows(start.q, start.v)), span_of(ts)
     of_q, of_v = jnp.max(sizes if sizes_so_far is None else jnp.maximum(sizes, sizes_so_far), axis=1)
-    if forced is not None:
+    if (forced := settings.forced) is not None:
         # Below this it is round-off, however it is told apart.
         of_q = jnp.maximum(of_q, FROM_NOTHING[0] * jnp.max(forced.a) * span**2)
     of_a = 0.0 if a is None else jnp.max(jnp.abs(jnp.nan_to_num(_rows(a), posinf=0.0, neginf=0.0)))

@@ -19,11 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
+from lagjax.integrate.stepping.tolerances import Forced, rounded, span_of
 from lagjax.integrate.trajectory.parts import HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions
 from lagjax.integrate.trajectory.results import ENDED_WELL, in_words
 from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of, to_jax
@@ -48,14 +49,14 @@ IN_PHASES = (
 class Instants(NamedTuple):
     """The instants from which a motion can be continued, in the order of its run: outputs and states after switches.
 
-    `phase`: the number of the phase that begins or goes on there; None for a motion without phases. `given`: likewise
-    the modes of elements, as functions take them.
+    `phase`: the number of the phase that begins or goes on there; None for a motion without phases. `modes`: likewise
+    those of elements.
     """
 
     at: Snapshot
     is_output: np.ndarray | None = None
     phase: Int[Array, " N"] | None = None
-    given: InModes | None = None
+    modes: Int[Array, "N k"] | None = None
 
 
 def at(trajectory, t: ArrayLike) -> Snapshot:
@@ -72,20 +73,21 @@ def at(trajectory, t: ArrayLike) -> Snapshot:
     times = t.ravel()
     known = _known_of(trajectory)
     index = _before(known, times, trajectory.static.how.backward)
-    nodes, given = jax.tree.map(lambda x: np.asarray(x)[index], (known.at, known.given))
+    nodes, modes = jax.tree.map(lambda x: np.asarray(x)[index], (known.at, known.modes))
     found = jax.tree.map(np.array, nodes._replace(t=times))
     between = np.flatnonzero(nodes.t != times)
     for phase in [None] if known.phase is None else np.unique(np.asarray(known.phase)[index[between]]):
         rows = between if phase is None else between[np.asarray(known.phase)[index[between]] == phase]
         if rows.size:
-            here = jax.tree.map(lambda x, rows=rows: x[rows], (nodes, given))
+            here = jax.tree.map(lambda x, rows=rows: x[rows], (nodes, modes))
             _fill(found, rows, trajectory, phase, *here, times[rows])
     return jax.tree.map(lambda x: to_jax(x.reshape(t.shape + x.shape[1:])), found)
 
 
-def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None, times):
+def _fill(found, rows, trajectory, phase, nodes: Snapshot, modes: Int[Array, "N k"] | None, times):
     """Write the motion at `times`, all in one phase, into the rows `rows` of `found`."""
     system = trajectory.system if phase is None else trajectory.system.systems[phase]
+    given = None if modes is None else trajectory.system.given(None, modes, phase)
     multipliers = {name: x for name, x in nodes.multipliers.items() if name in system.constraints}
     # Padded to one of a few sizes, since a program is compiled for each size.
     count = filled_up(len(times)) if len(times) <= LANES else LANES * filled_up(-(-len(times) // LANES))
@@ -93,9 +95,10 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
     nodes = nodes._replace(multipliers=multipliers)
     nodes, given, times = jax.tree.map(lambda x: x[fill], (nodes, given, times))
     of_system = system, trajectory.params, trajectory.asked, trajectory.tolerance
-    new, result = _continue_all(*of_system, nodes, given, times, trajectory.static.integrate)
+    ends = np.asarray(trajectory.t)[[0, -1]]
+    new, result = _continue_all(*of_system, nodes, given, times, ends, trajectory.static.integrate)
     # Padded as well, for the same reason.
-    acting = {} if given is None else of_elements(trajectory, times, *new[1:], given.modes)
+    acting = {} if given is None else of_elements(trajectory, phase, times, *new[1:], given.modes)
     new, result, acting = jax.tree.map(lambda x: np.asarray(x)[: rows.size], (new, result, acting))
     # Not `ended_well`, which would compile a comparison for each number of times.
     well = np.isin(result._value, [int(good._value) for good in ENDED_WELL])
@@ -107,7 +110,7 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         for name, x in acting.items():
             found.multipliers[name][rows] = x
         # Where others hold what would slide, the direction of its friction is known at outputs alone.
-        slips = np.char.startswith(np.array(trajectory.switches.kinds, str), "sliding velocity")
+        slips = np.char.startswith(np.array(trajectory.system.laws[phase].kinds, str), "sliding velocity")
         held = np.any((np.asarray(given.modes)[: rows.size] == HELD_BY_OTHERS) & slips, axis=1)
         for x in found.multipliers.values():
             x[rows[held]] = np.nan
@@ -115,17 +118,17 @@ def _fill(found, rows, trajectory, phase, nodes: Snapshot, given: InModes | None
         old[rows] = x
 
 
-def of_elements(trajectory, times, q: PyTree, v: PyTree, multipliers: dict, modes) -> dict[str, Array]:
-    """The forces of compliant contacts, and of friction, at these states, by name."""
-    laws = trajectory.system.laws
+def of_elements(trajectory, phase: int, times, q: PyTree, v: PyTree, multipliers: dict, modes) -> dict[str, Array]:
+    """The forces of compliant contacts, and of friction, at these states of a phase, by name; `modes`: its own."""
+    laws = trajectory.system.laws[phase]
     known = laws.compliant or laws.tangents
-    return _acting(trajectory.system, trajectory.params, times, q, v, multipliers, modes) if known else {}
+    return _acting(laws, trajectory.params, times, q, v, multipliers, modes) if known else {}
 
 
 @compiled
-def _acting(system, params: PyTree, times: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array):
+def _acting(laws, params: PyTree, times: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array):
     def forces(t: Array, q: PyTree, v: PyTree, multipliers: dict, modes: Array) -> dict[str, Array]:
-        return system.laws.acting(t, q, v, multipliers, system.laws.given(params, modes))
+        return laws.acting(t, q, v, multipliers, laws.given(params, modes))
 
     return jax.vmap(forces)(times, q, v, multipliers, modes)
 
@@ -146,11 +149,10 @@ def _known_of(trajectory) -> Instants:
     is_output = np.arange(len(phase)) < reached.sum()
     # An output at the time of a switch comes before it.
     order = np.lexsort((np.arange(len(phase)), both.t))
-    given = None
+    modes = None
     if trajectory.modes is not None:
-        modes = np.concatenate([np.asarray(trajectory.modes)[reached], np.asarray(s.modes)[:count]])
-        given = trajectory.system.given(None, modes[order])
-    return Instants(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order], given)
+        modes = np.concatenate([np.asarray(trajectory.modes)[reached], np.asarray(s.modes)[:count]])[order]
+    return Instants(jax.tree.map(lambda x: x[order], both), is_output[order], phase[order], modes)
 
 
 def _before(known: Instants, t, backward: bool):
@@ -205,9 +207,12 @@ def _at_one(trajectory, t):
     return chosen._replace(t=t)
 
 
-def _continued(system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, t, integrate: Callable):
+def _continued(
+    system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, t, integrate: Callable,
+    forced: Forced | None = None,
+):  # fmt: skip
     """Continue the motion from a node to t; return it there, and the result."""
-    found, result = _solved_from(system, params, asked, tolerance, node, t[None], integrate)
+    found, result = _solved_from(system, params, asked, tolerance, node, t[None], integrate, forced)
     return jax.tree.map(lambda x: x[-1], found)._replace(t=t), result
 
 
@@ -226,9 +231,13 @@ def in_one_solve(trajectory, t):
 
 
 def _solved_from(
-    system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, ts, integrate: Callable
-):
-    """Integrate from a node to the times ts, (N,); return the motion at the node and at these, and the result."""
+    system: System, params: PyTree, asked: SolveOptions, tolerance, node: Snapshot, ts, integrate: Callable,
+    forced: Forced | None = None,
+):  # fmt: skip
+    """Integrate from a node to the times ts, (N,); return the motion at the node and at these, and the result.
+
+    `forced`: the accelerations of forces that may cancel.
+    """
     rtol, atol = tolerance
     by_size = atol.ndim == 2
     settings = Settings(
@@ -249,6 +258,7 @@ def _solved_from(
         drift=asked.drift if system.constraints else "none",
         progress=False,
         jumps=asked.jumps,
+        forced=forced,
     )
     ts = jnp.append(node.t, ts)
     found = integrate(Problem(system, node.q, node.v, params, ts, None, settings))
@@ -257,14 +267,25 @@ def _solved_from(
 
 @partial(compiled, in_numpy=True)
 def _continue_all(
-    system: System, params: PyTree, asked: SolveOptions, tolerance, nodes: Snapshot, given: InModes | None, times,
+    system: System, params: PyTree, asked: SolveOptions, tolerance, nodes: Snapshot, given: InModes | None, times, ends,
     integrate: Callable,
 ):  # fmt: skip
+    forced = None if given is None else _forced(tolerance, ends)
+
     def one(each: tuple):
         node, row, t = each
-        return _continued(system, given_in(row, params), asked, tolerance, node, t, integrate)
+        return _continued(system, given_in(row, params), asked, tolerance, node, t, integrate, forced)
 
     return lax.map(one, (nodes, given, times), batch_size=min(LANES, len(times)))
+
+
+def _forced(tolerance, ends: Float[Array, " 2"]) -> Forced | None:
+    """The accelerations of forces that may cancel in a motion between these times, as its tolerance knows them."""
+    _, nothing = tolerance
+    if nothing.ndim < 2:
+        return None
+    a = rounded(nothing[1]) / span_of(ends)
+    return Forced(ends, jnp.stack([a, a]))
 
 
 def _of_length_zero(system: System, params: PyTree, node: Snapshot, t):

@@ -1,6 +1,6 @@
 """A motion in phases: a trajectory that knows the phase of each output, and its switches."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from lagjax.display import plots as plot
 from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.stepping.tolerances import rounded
 from lagjax.integrate.trajectory.error_report import columns
-from lagjax.integrate.trajectory.parts import mode_in_words
+from lagjax.integrate.trajectory.parts import NO_PHASE, mode_in_words
 from lagjax.integrate.trajectory.trajectory import Trajectory, jacobi_and_scale
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import worst_residual
@@ -25,8 +25,8 @@ from lagjax.system import Hybrid, InModes, Model, UnknownSystem, known_system, m
 
 # What is struck jumps by more than so many round-offs of the velocities in the motion.
 STRUCK = 1000
-# The name under which switches are among the events of a motion.
-SWITCHES = "switches"
+# The name under which switches are among the events of a motion; of what kind those of phases are.
+SWITCHES, OF_PHASES = "switches", "switch"
 
 
 class Switches(eqx.Module):
@@ -37,9 +37,9 @@ class Switches(eqx.Module):
       last one. `names`: the names of all phases; `ways`: for each of the hybrid's switches, the phase it leaves.
     - `q`, `v`: the states before them, each leaf with a leading axis S; `q_after`, `v_after`: those after them.
     - `impulse`: the jump of the momentum, like v, `[L] [t]/[q]`; zero where nothing jumps.
-    - `modes` (S, k): for a system with elements, the modes after each (see `HybridTrajectory`); `ways` are their names,
-      and `kinds` what they are modes of: a "gap", a "sliding velocity" (or one "in a plane"), a "spring", a "side" from
-      which a normal force presses, or a "control".
+    - `modes` (S, k): with elements, their modes after each (see `HybridTrajectory`). The last k of `ways` are then
+      their names, and `kinds` what each of the `ways` is: a "switch" of phases, or the mode of a "gap", a "sliding
+      velocity" (or one "in a plane"), a "spring", a "side" from which a normal force presses, or a "control".
     - `count`: how many there were.
     - `uncertain`: whether some may be missing: a guard touched zero within round-off, or changed too fast to be
       followed.
@@ -87,33 +87,39 @@ class Switches(eqx.Module):
         return found[:most] + (["..."] if len(found) > most else [])
 
     def _rows(self):
-        times, ways, to = map(np.asarray, (self.t, self.way, self.to))
-        if self.modes is not None:
-            return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} {self._happened(k)}" for k in range(int(self.count))]
-        return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} -> {self.names[to[k]]}" for k in range(int(self.count))]
+        times, ways = np.asarray(self.t), np.asarray(self.way)
+        return [f"  t = {times[k]:<12.9g} {self.ways[ways[k]]} {self._happened(k)}" for k in range(int(self.count))]
+
+    @property
+    def of_phases(self) -> int:
+        """How many of the `ways` lead out of phases: the others are modes of elements."""
+        return len(self.ways) - (0 if self.modes is None else np.shape(self.modes)[-1])
+
+    @property
+    def of_modes(self) -> list[tuple[str, str]]:
+        """The name and the kind of each mode of elements."""
+        return list(zip(self.ways[self.of_phases :], self.kinds[self.of_phases :]))
 
     def _happened(self, k: int) -> str:
-        """What a mode does where it ends at switch k."""
+        """What follows at switch k: the next phase, or what a mode does where it ends."""
         way = int(self.way[k])
+        if way < self.of_phases:
+            return f"-> {self.names[int(self.to[k])]}"
         if self.kinds[way] == "control":
             return "acts"
-        mode = int(np.asarray(self.modes)[k, way])
-        after = self.mode_in_words(way, mode)
+        mode = int(np.asarray(self.modes)[k, way - self.of_phases])
+        after = mode_in_words(self.kinds[way], mode)
         if self.kinds[way] == "sliding velocity" and abs(mode) == 1:
             after += " forward" if mode > 0 else " back"
         return f"is struck, then {after}" if self.kinds[way] == "gap" and self._strikes(k, way) else after
 
     def _strikes(self, k: int, way: int) -> bool:
         """Whether velocities jump by more than round-off at switch k, where a gap that was open ends its mode."""
-        if k and int(np.asarray(self.modes)[k - 1, way]):
+        if k and int(np.asarray(self.modes)[k - 1, way - self.of_phases]) > 0:
             return False
         before, after = (columns(np, x, rows=np.size(self.t))[: int(self.count)] for x in (self.v, self.v_after))
         jump, size = np.max(np.abs(after[k] - before[k])), np.max(np.abs([before, after]))
         return bool(jump > STRUCK * np.finfo(before.dtype).eps * size)
-
-    def mode_in_words(self, way: int, mode: int) -> str:
-        """A mode in a word; `way`: its place among the modes."""
-        return mode_in_words(self.kinds[way], mode)
 
 
 class HybridTrajectory(Trajectory):
@@ -122,10 +128,11 @@ class HybridTrajectory(Trajectory):
     - `phase` (T,): the number of the phase at each output, in the order of `system.names`; -1 where none was reached.
       An output at the very time of a switch has the state and the phase before it.
     - `switches`: the `Switches`.
-    - `modes` (T, k): for a system with elements, the mode of each of them at each output, in the order of
+    - `modes` (T, k): with elements, the mode of each of them at each output, in the order of the last k of
       `switches.ways`: of a gap 0 (open) or 1 (closed); of a sliding velocity 1 or -1 (slides), 2 (sticks), or 0 (its
       gap is open), or 3 (others hold it); of a spring 0 (apart) or 1 (pressed); of a normal force of either sign 1 or
-      -1, the side from which it presses; of a sampled control the number of its next instant.
+      -1, the side from which it presses; of a sampled control the number of its next instant. In a phase that does not
+      have the element it is -1.
     - `multipliers`: of all phases by constraint name; NaN where the phase has no such constraint, and of `at(t)`
       between outputs while others hold what would slide (mode 3): which friction is at its bound is known at outputs.
     - `end`: the last instant; where the motion ended on a switch, the state after it.
@@ -145,11 +152,11 @@ class HybridTrajectory(Trajectory):
     @property
     def model(self) -> Model:
         first = jax.tree.map(lambda x: x[0], (self.t, self.q, self.v))
-        return model_of(self.system, *first, self.system.given(self.params))
+        return model_of(self.system, *first, self.params)
 
-    def given(self) -> InModes | None:
-        """The modes of elements at each output as the functions of the system take them; None without elements."""
-        return None if self.modes is None else self.system.given(None, self.modes)
+    def given(self, phase: int) -> InModes | None:
+        """The modes of elements at each output as the functions of a phase take them; None without elements."""
+        return None if self.modes is None else self.system.given(None, self.modes, phase)
 
     def named_phases(self) -> np.ndarray:
         """The name of the phase at each output; an empty one where none was reached. Not while JAX is tracing."""
@@ -176,8 +183,7 @@ class HybridTrajectory(Trajectory):
 
     def residual(self) -> Float[Array, ""]:
         """The worst constraint residual over all outputs, but not between them, each in its own phase, relative."""
-        given = self.given()
-        worst = [_residual_in(model, i, self, given) for i, model in enumerate(self.model.phases) if model.m]
+        worst = [_residual_in(model, i, self) for i, model in enumerate(self.model.phases) if model.m]
         return jnp.max(jnp.stack([*worst, jnp.zeros_like(self.scaled_error)]))
 
     def plot(self, charges: Any = False):
@@ -197,12 +203,11 @@ class HybridTrajectory(Trajectory):
     def _strips(self) -> dict[str, list[tuple[float, float, str]]]:
         s = self.switches
         edges = np.array([self.t[0], *np.asarray(s.t)[: len(s)], self.end.t])
-        if self.modes is None:
-            first = np.asarray(self.phase)[0]
-            rows = {"phase": [s.names[i] for i in (first, *np.asarray(s.to)[: len(s)])]}
-        else:
-            rows = {name: [s.mode_in_words(i, int(mode)) for mode in self.modes_entered()[:, i]]
-                    for i, name in enumerate(s.ways)}  # fmt: skip
+        first, rows = np.asarray(self.phase)[0], {}
+        if s.of_phases or self.modes is None:
+            rows["phase"] = [s.names[i] for i in (first, *np.asarray(s.to)[: len(s)])]
+        for i, (name, kind) in enumerate(s.of_modes):
+            rows[name] = [mode_in_words(kind, int(mode)) for mode in self.modes_entered()[:, i]]
         return {name: _merged(edges, words) for name, words in rows.items()}
 
     def rows(self) -> dict:
@@ -217,19 +222,20 @@ class HybridTrajectory(Trajectory):
             lines = []
         return [
             *lines,
-            self._of_phases(),
+            *self._of_phases(),
             ("switches", self.switches.in_words()),
             *(("", row) for row in self.switches.in_rows()),
             *((f"event '{name}'", found.in_words()) for name, found in self.events.items() if name != SWITCHES),
         ]
 
-    def _of_phases(self) -> tuple[str, str]:
+    def _of_phases(self) -> Iterator[tuple[str, str]]:
+        if self.switches.of_phases or self.modes is None:
+            names, counts = np.unique(self.named_phases(), return_counts=True)
+            yield "phases", "outputs: " + ", ".join(f"{n} in {name}" for name, n in zip(names, counts) if name)
         if self.modes is not None:
-            s, last = self.switches, self.modes_entered()[-1]
-            words = [f"{name} {s.mode_in_words(i, int(mode))}" for i, (name, mode) in enumerate(zip(s.ways, last))]
-            return "modes", f"at the end: {', '.join(words)}"
-        names, counts = np.unique(self.named_phases(), return_counts=True)
-        return "phases", "outputs: " + ", ".join(f"{count} in {name}" for name, count in zip(names, counts) if name)
+            last = zip(self.switches.of_modes, self.modes_entered()[-1])
+            words = [f"{name} {mode_in_words(kind, int(mode))}" for (name, kind), mode in last if mode != NO_PHASE]
+            yield "modes", f"at the end: {', '.join(words) or 'none'}"
 
 
 def _merged(edges: np.ndarray, words: list[str]) -> list[tuple[float, float, str]]:
@@ -255,7 +261,8 @@ def _of_phases(function: Callable, trajectory):
     return found
 
 
-def _residual_in(model: Model, i: int, trajectory, given: InModes | None):
+def _residual_in(model: Model, i: int, trajectory):
+    given = trajectory.given(i)
     motion = trajectory.phase, trajectory.t, trajectory.q, trajectory.v
     nothing = trajectory.tolerance[1]
     # What rests at zero has the size of which its round-off is that of the forces that hold it.

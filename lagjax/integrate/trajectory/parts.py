@@ -28,7 +28,9 @@ MODES = {
 
 
 def mode_in_words(kind: str, mode: int) -> str:
-    """A mode in a word."""
+    """A mode in a word; nothing of a mode that its phase does not have."""
+    if mode == NO_PHASE and kind not in ("sliding velocity", "side"):
+        return ""
     return "holds its output" if kind == "control" else MODES[kind][mode]
 
 

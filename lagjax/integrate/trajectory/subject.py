@@ -70,20 +70,20 @@ def _pose_of(name: str, poses: Any) -> tuple[Any, Any]:
         raise ValueError(
             f"it is not known where the body '{name}' is.\n"
             "Usual cause: a body of another system, or coordinates that are not poses.\n"
-            "Fix: lj.Drawing(shapes, poses), with poses(t, q, params) -> {name: (position, quaternion)}."
+            "Fix: lj.shapes.Drawing(shapes, poses), with poses(t, q, params) -> {name: (position, quaternion)}."
         ) from error
     return position, quaternion
 
 
 def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
-    """The subject that a user asks for: None, a function, a shape, several of them, or a `lj.Drawing`."""
+    """The subject that a user asks for: None, a function, a shape, several of them, or a `lj.shapes.Drawing`."""
     if what is None:
         what = known_drawing(system)
         if what is None:
             raise ValueError(
                 "nothing says how this system is drawn.\n"
                 "Fix: give a function that gives points, lambda t, q, params: (q[0], q[1]), or shapes, "
-                "[lj.box(body, (1.0, 0.2, 0.2))]."
+                "[lj.shapes.box(body, (1.0, 0.2, 0.2))]."
             )
     # Where its bodies are is known of a system whatever is drawn of it.
     poses = (what if isinstance(what, Drawing) else known_drawing(system) or Drawing(())).poses
@@ -95,7 +95,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
         raise TypeError(
             f"what is drawn must be a function positions(t, q, params) or shapes, not {type(parts).__name__}"
             f"{' of ' + type(parts[0]).__name__ if isinstance(parts, Sequence) and len(parts) else ''}.\n"
-            "Usual cause: bodies in place of their shapes.\nFix: [lj.box(body, (1.0, 0.2, 0.2))]."
+            "Usual cause: bodies in place of their shapes.\nFix: [lj.shapes.box(body, (1.0, 0.2, 0.2))]."
         )
     functions = tuple(x for x in parts if not isinstance(x, Shape))
     for function in functions:
@@ -104,7 +104,7 @@ def subject_of(what: Any, system: Any, params: PyTree) -> Subject:
     if not functions and all(shape.owner is None for shape in shapes):
         raise ValueError(
             "nothing of what is drawn moves: all shapes are fixed in space.\n"
-            "Fix: give the bodies, too, [lj.sphere(body, 0.1), lj.line(lj.ground, body)]."
+            "Fix: give the bodies, too, [lj.shapes.sphere(body, 0.1), lj.shapes.line(lj.bodies.ground, body)]."
         )
     return Subject(functions, shapes, poses, params)
 
@@ -187,8 +187,8 @@ def draw(
 
     **Arguments:** `system`, of which `q` is a state, `params` its parameters.
 
-    - `what`: as in `traj.animate`, a function `positions(t, q, params)`, shapes, or a `lj.Drawing`; nothing for systems
-      of `lj.multibody`, `lj.Tree` and models from files.
+    - `what`: as in `traj.animate`, a function `positions(t, q, params)`, shapes, or a `lj.shapes.Drawing`; nothing for
+      systems of `lj.bodies.multibody`, `lj.bodies.Tree` and models from files.
     - `t`: the time that `positions` is given.
     - `frames`: whether each body's axes are drawn from its centre of mass (x red, y green, z blue), and the axes of
       joints in black.
@@ -197,7 +197,7 @@ def draw(
     Two points that a joint should hold together and that are apart in this state are joined by a magenta line, and
     `print` says how far they are apart: so a drawing is checked before `lj.consistent_state` mends it.
 
-    **Returns:** a `lj.Still`.
+    **Returns:** a `Still`.
 
     **Raises:** `TypeError` for what cannot be drawn, and inside of a JAX transformation; `ValueError` for positions
     that are not points, and bodies whose pose is not known.

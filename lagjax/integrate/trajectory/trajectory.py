@@ -227,8 +227,9 @@ class Trajectory(eqx.Module):
 
         - `positions`: `positions(t, q, params)` -> a point `(x, y)` or `(x, y, z)`; or points (k, 2) or (k, 3), linked
           by lines in order; or a dictionary of these, each name in its own colour. The last point of each leaves a
-          trail. Plain NumPy works. Or shapes, `[lj.box(body, size), lj.trail(body)]`, functions among them; a
-          `lj.Drawing`; or nothing for `lj.multibody`, whose bodies are drawn as boxes with their inertia.
+          trail. Plain NumPy works. Or shapes, `[lj.shapes.box(body, size), lj.shapes.trail(body)]`, functions among
+          them; a `lj.shapes.Drawing`; or nothing for `lj.bodies.multibody`, whose bodies are drawn as boxes with their
+          inertia.
         - `seconds`: how long it plays; by default as long as the motion takes in units of t, but 2 to 20 s.
         - `rate`: frames per second. Between outputs q is interpolated, cubically, with v as its slope: an impact or a
           pulse between two of them is smoothed away.

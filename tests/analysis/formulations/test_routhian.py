@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis.formulations import Routhian
 
 
 def top(t, q, v, params):
@@ -40,7 +41,7 @@ def test_the_top_without_its_cyclic_angles():
     np.testing.assert_allclose(found, full, rtol=1e-13)
     wrong = params | {"momenta": {name: 1.01 * p for name, p in params["momenta"].items()}}
     assert abs(lj.accelerations(reduced, 0.0, *state, wrong)[0]["theta"] - full) > 1e-2
-    assert isinstance(reduced.lagrangian, lj.Routhian)
+    assert isinstance(reduced.lagrangian, Routhian)
     back = reduced.lagrangian.velocities(0.0, *state, params)
     np.testing.assert_allclose([back[name] for name in ("phi", "psi")], [1.0, 20.0], rtol=1e-13)
     # The effective potential of Goldstein, Eq. (5.60), for the rest of the motion.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.analysis.normal_modes import NormalModes
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
 from tests.analysis.steady_systems import DISK, TOP, UPRIGHT, UPRIGHT_DISK, disk, straight_on, top
@@ -65,7 +66,7 @@ def test_verdicts_in_a_program():
     """Stable below the critical speed and beside, else divergent; off equilibrium and of NaN codes, and never NaN."""
     _, modes = beads()
     assert all(np.isfinite(x).all() for x in (modes.roots, modes.shapes, modes.code))
-    assert [lj.NormalModes.VERDICTS[code] for code in modes.code] == VERDICTS
+    assert [NormalModes.VERDICTS[code] for code in modes.code] == VERDICTS
     assert np.all(modes.linearisation.residual[:8] < 1e-12) and modes.linearisation.residual[8] > 0.1
     assert modes.stable.tolist() == [verdict == "stable" for verdict in VERDICTS]
 

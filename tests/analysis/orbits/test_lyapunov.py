@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.exponents import _estimates
+from lagjax.analysis.exponents import LyapunovExponents, _estimates
 from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, PERIOD, E, block, bounce, bouncing, stick_slip
 from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, pendulum, rod_pendulum
@@ -41,7 +41,7 @@ def test_linear(c):
 def by_hand(ts, growth, volume):
     """The exponents of given growth from time to time."""
     exponents, uncertainty = by_numpy(_estimates)(ts, growth)
-    return lj.LyapunovExponents(exponents, uncertainty, ts, growth, volume, ts[len(ts) // 4], np.asarray(True), True)
+    return LyapunovExponents(exponents, uncertainty, ts, growth, volume, ts[len(ts) // 4], np.asarray(True), True)
 
 
 def test_what_growth_says():

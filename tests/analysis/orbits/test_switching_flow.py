@@ -7,6 +7,7 @@ import pytest
 from scipy import integrate
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 
 G = 9.8125
 
@@ -160,7 +161,7 @@ def test_stick_slip():
         np.testing.assert_allclose(found.multipliers, [1.0, 0.0], atol=1e-9)
         assert found.trivial.tolist() == [True, False] and bool(found.attracts)
         assert "belt sticks" in repr(orbit) and "0 within the errors of M, as after sticking" in repr(found)
-        assert isinstance(orbit.trajectory, lj.HybridTrajectory)
+        assert isinstance(orbit.trajectory, HybridTrajectory)
 
 
 # A rimless wheel that walks down a slope.

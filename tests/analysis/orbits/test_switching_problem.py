@@ -31,7 +31,9 @@ def slope(t, q, p):
 
 def on_touch(gap):
     """A ball that falls on a surface."""
-    return lj.Hybrid({"flies": lj.System(flat_lagrangian)}, [lj.Switch("flies", to="flies", when=lj.touches(gap, 0.5))])
+    return lj.Hybrid(
+        {"flies": lj.System(flat_lagrangian)}, [lj.Switch("flies", to="flies", when=lj.guards.touches(gap, 0.5))]
+    )
 
 
 @pytest.mark.parametrize(

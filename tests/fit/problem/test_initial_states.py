@@ -50,13 +50,15 @@ def test_a_start_is_read_off_without_wild_values(wild):
 def test_coordinates_of_several_shapes_that_are_not_measured_start_at_rest():
     """A record of the pose of one body gives its velocity too, and another one starts at rest."""
     t = np.linspace(0.0, 1.0, 11)
-    pose = lj.Pose(np.stack([3.0 * t, 0 * t, t**2], axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (11, 1)))
-    body = lj.Body("body", 1.0, (1.0, 1.0, 1.0))
+    pose = lj.bodies.Pose(np.stack([3.0 * t, 0 * t, t**2], axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (11, 1)))
+    body = lj.bodies.Body("body", 1.0, (1.0, 1.0, 1.0))
     record = lj.Record(t, q={"body": pose}, v={})
-    guess = _guess(lj.multibody([body]), record, 0, None)
+    guess = _guess(lj.bodies.multibody([body]), record, 0, None)
     np.testing.assert_allclose(guess.v["body"].position, [3.0, 0.0, 0.0], atol=1e-12)
-    at_rest = _guess(lj.multibody([body]), lj.Record(t, q={"body": pose}, q0={"body": lj.Pose.at()}), 0, None)
-    assert jax.tree.map(np.shape, at_rest.v) == {"body": lj.Pose((3,), (4,))}
+    at_rest = _guess(
+        lj.bodies.multibody([body]), lj.Record(t, q={"body": pose}, q0={"body": lj.bodies.Pose.at()}), 0, None
+    )
+    assert jax.tree.map(np.shape, at_rest.v) == {"body": lj.bodies.Pose((3,), (4,))}
 
 
 @cache

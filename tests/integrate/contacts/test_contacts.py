@@ -32,18 +32,18 @@ def test_what_holds_goes_by_any_name():
 def test_said_by_name():
     """Invalid friction is refused by name."""
     with pytest.raises(ValueError, match="friction is given, but sliding is not"):
-        lj.touches(above, 0.5, friction=0.2)
+        lj.guards.touches(above, 0.5, friction=0.2)
     with pytest.raises(ValueError, match="sliding is given, but friction is not"):
-        lj.touches(above, 0.5, sliding=sliding)
+        lj.guards.touches(above, 0.5, sliding=sliding)
     with pytest.raises(ValueError, match="(?s)needs a restitution.*restitution=0.0"):
-        lj.touches(above, friction=0.2, sliding=sliding)
+        lj.guards.touches(above, friction=0.2, sliding=sliding)
     with pytest.raises(TypeError, match="sliding must be a function"):
-        lj.touches(above, 0.5, friction=0.2, sliding=1.0)  # pyright: ignore
+        lj.guards.touches(above, 0.5, friction=0.2, sliding=1.0)  # pyright: ignore
     q, v = {"x": 0.0, "y": R, "phi": 0.0}, {"x": 1.0, "y": -1.0, "phi": 0.0}
     for wrong, said in (
         (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, but returned \(2,\)"),
         (lambda t, q, v, p: jnp.abs(v["x"]), "linear in v, but its slope depends on v"),
     ):
-        guard = lj.touches(above, 0.5, friction=0.2, sliding=wrong)
+        guard = lj.guards.touches(above, 0.5, friction=0.2, sliding=wrong)
         with pytest.raises(ValueError, match=said):
             jax.eval_shape(partial(after_impact, guard, flying), q, v, PARAMS)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from tests.system.test_hybrid import G, in_phases
 
 R = 0.25
@@ -28,7 +29,7 @@ flying = lj.System(ball)
 
 def bounce(friction: Any = coefficient, restitution=0.5):
     """The guard of a floor with friction."""
-    return lj.touches(above, restitution, friction=friction, sliding=sliding)
+    return lj.guards.touches(above, restitution, friction=friction, sliding=sliding)
 
 
 def impacts(guard, system):
@@ -79,7 +80,7 @@ ANY = lj.System(lambda t, q, v, p: 0.5 * v @ p["M"] @ v, {"held": lj.Nonholonomi
 along = lambda t, q, v, p: p["along"] @ v
 # The restitution as a function of the closing speed.
 any_impacts = impacts(
-    lambda e: lj.touches(lambda t, q, p: p["normal"] @ q, lambda speed: e + 0.0 * speed, coefficient, along), ANY
+    lambda e: lj.guards.touches(lambda t, q, p: p["normal"] @ q, lambda speed: e + 0.0 * speed, coefficient, along), ANY
 )
 MANY = 200
 
@@ -151,7 +152,7 @@ def test_sliding_that_is_settled():
     assert np.all(np.max(np.abs(fixed - smooth), axis=1) < 1e-9 * np.linalg.cond(p["M"]))
     # γ_T' = 2 γ_N' > 0 pulls with 2 μ of what pushes.
     rising = impacts(
-        lambda e: lj.touches(lambda t, q, p: q, e, lambda mu: mu, lambda t, q, v, p: 2.0 * v),
+        lambda e: lj.guards.touches(lambda t, q, p: q, e, lambda mu: mu, lambda t, q, v, p: 2.0 * v),
         lj.System(lambda t, q, v, p: 0.5 * v**2),
     )
     found = rising(np.zeros(2), -np.ones(2), np.array([0.4, 0.6]), np.full(2, 0.5))
@@ -163,7 +164,7 @@ def on_wire(name):
     falls = lj.System(
         lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 9.81 * q[1], {name: lj.Holonomic(lambda t, q, p: q[0] - 2.0 * q[1])}
     )
-    floor = lj.touches(lambda t, q, p: q[1], 0.5, coefficient, lambda t, q, v, p: v[0])
+    floor = lj.guards.touches(lambda t, q, p: q[1], 0.5, coefficient, lambda t, q, v, p: v[0])
     return lj.Hybrid({"falls": falls}, [lj.Switch("falls", to="falls", when=floor)])
 
 
@@ -183,7 +184,7 @@ HEIGHT, UNTIL = 0.8, 0.6
 FALL, SPEED = np.sqrt(2 * HEIGHT / G), np.sqrt(2 * HEIGHT * G)
 
 
-def thrown(system, x, phi, mu=0.2, ts=(0.0, UNTIL), **options) -> lj.HybridTrajectory:
+def thrown(system, x, phi, mu=0.2, ts=(0.0, UNTIL), **options) -> HybridTrajectory:
     """A ball thrown from a height with given x and φ velocities and friction."""
     q0, v0 = {"x": 0.0, "y": R + HEIGHT, "phi": 0.0}, {"x": x, "y": 0.0, "phi": phi}
     return in_phases(system, q0, v0, PARAMS | {"mu": mu}, ts=np.array(ts), **options)
@@ -229,8 +230,8 @@ landing = lj.Hybrid(
     {"flying": flying, "slides": slides, "rolls": rolls},
     [
         lj.Switch("flying", to="slides", when=bounce(restitution=0.0)),
-        lj.Switch("slides", to="rolls", when=lj.sticks(sliding)),
-        lj.Switch("rolls", to="slides", when=lj.slips("grip", on="floor", coefficient=coefficient, side=-1)),
+        lj.Switch("slides", to="rolls", when=lj.guards.sticks(sliding)),
+        lj.Switch("rolls", to="slides", when=lj.guards.slips("grip", on="floor", coefficient=coefficient, side=-1)),
     ],
     most_switches=4,
 )

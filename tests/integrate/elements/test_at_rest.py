@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.elements.in_modes import OneGuard, in_modes
 from lagjax.integrate.trajectory.hybrid_trajectory import Switches
 from lagjax.system import State
@@ -58,7 +59,7 @@ def test_squeezed_at_rest():
     slips = 2 - m * G / (2 * mu) / 6
     fallen = -G * np.maximum(np.asarray(traj.t) - slips, 0.0) ** 3 / (6 * (2 - slips))
     np.testing.assert_allclose(traj.q["z"], fallen, rtol=1e-9, atol=1e-15)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     np.testing.assert_allclose(traj.switches.t[0], slips, atol=1e-9)
 
 

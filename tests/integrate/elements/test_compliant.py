@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import gamma
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from tests.integrate.elements.test_motions import moved
 
 K, G, MU = 1000.0, 9.81, 0.2
@@ -168,7 +169,7 @@ def test_a_block_that_stops_in_a_long_motion(sliding, v0, ends, steps):
     places = {mu: np.linalg.norm(v0) / (2 * mu * G) * np.array(v0) for mu in (0.3, 0.31)}
     for mu, T in product(places, ends):
         traj = lj.integrate(system, np.zeros(3), np.array(v0), mu, ts=np.array([0.0, T / 2, T]), rtol=1e-11)
-        assert isinstance(traj, lj.HybridTrajectory) and int(traj.stats["num_steps"]) < steps
+        assert isinstance(traj, HybridTrajectory) and int(traj.stats["num_steps"]) < steps
         np.testing.assert_allclose(traj.q[1:], 2 * [places[mu]], rtol=1e-10, atol=1e-11)
         assert len(traj.switches) == 1 or np.size(traj.modes[0]) > 2
     assert np.linalg.norm(places[0.31] - places[0.3]) > 1e-5

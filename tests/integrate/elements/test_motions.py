@@ -6,6 +6,7 @@ import pytest
 from scipy import optimize
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from tests.system.test_hybrid import G, in_phases
 
 K, MU = 100.0, 0.3
@@ -13,10 +14,10 @@ K, MU = 100.0, 0.3
 REST, WHEN, BY_MU = 0.5 - 16 * MU * 9.81 / K, 8 * np.pi / 10, -16 * 9.81 / K
 
 
-def moved(*motion, **options) -> lj.HybridTrajectory:
+def moved(*motion, **options) -> HybridTrajectory:
     """A motion with elements, without estimates of its errors."""
     traj = lj.integrate(*motion, estimate_error=False, **options)
-    assert isinstance(traj, lj.HybridTrajectory) and traj.modes is not None
+    assert isinstance(traj, HybridTrajectory) and traj.modes is not None
     return traj
 
 
@@ -65,7 +66,7 @@ body = lambda t, q, v, p: 0.5 * v**2 - p["g"] * q
 on_table = lj.System(body, {"table": lj.Holonomic(over)})
 
 
-def shaken(system, **options) -> lj.HybridTrajectory:
+def shaken(system, **options) -> HybridTrajectory:
     """A body on a shaken table."""
     ts = np.array([0.0, 0.1, 0.2])
     return in_phases(system, 0.0, 0.6, SHAKEN, ts=ts, rtol=1e-11, estimate_error=False, **options)
@@ -73,8 +74,8 @@ def shaken(system, **options) -> lj.HybridTrajectory:
 
 def in_two_phases(**options) -> lj.Hybrid:
     """A body that lies on the table or flies."""
-    leave = lj.Switch("lies", to="flies", when=lj.releases("table"), **options)
-    land = lj.Switch("flies", to="lies", when=lj.touches(over))
+    leave = lj.Switch("lies", to="flies", when=lj.guards.releases("table"), **options)
+    land = lj.Switch("flies", to="lies", when=lj.guards.touches(over))
     return lj.Hybrid({"lies": on_table, "flies": lj.System(body)}, [leave, land], most_switches=4)
 
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.elements.complementarity import ContactProblem, solved
 from tests.integrate.elements.test_motions import moved
 
@@ -71,7 +72,7 @@ def by_scipy(v0, mu, tan, falls=0.0):
     return found.y[:2, -1]
 
 
-def thrown(v0, mu, tan, *, falls=0.0, static=0.5, dtype=float, rtol=1e-11) -> lj.HybridTrajectory:
+def thrown(v0, mu, tan, *, falls=0.0, static=0.5, dtype=float, rtol=1e-11) -> HybridTrajectory:
     """The block thrown at the origin."""
     given = {name: jnp.asarray(x, dtype) for name, x in zip(("mu", "tan", "falls", "static"), (mu, tan, falls, static))}
     return moved(on_a_tilt, np.zeros(2, dtype), np.asarray(v0, dtype), given, ts=np.asarray(TS, dtype), rtol=rtol)

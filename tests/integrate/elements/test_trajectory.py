@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.elements.meeting import Met
 
 # The package hands out a function of this name.
@@ -27,11 +28,11 @@ floor = lj.Contact(
 block = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2) - p["g"] * q[1], elements={"floor": floor})
 
 
-def thrown(mu=MU, ts=(0.0, 1.0, 5.0), **options) -> lj.HybridTrajectory:
+def thrown(mu=MU, ts=(0.0, 1.0, 5.0), **options) -> HybridTrajectory:
     """The block thrown from height 1."""
     start = np.array([0.0, 1.0]), np.array([THROWN, 0.0])
     traj = lj.integrate(block, *start, PARAMS | {"mu": mu}, ts=np.array(ts), estimate_error=False, **options)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     return traj
 
 
@@ -111,7 +112,7 @@ def test_energy_of_what_moves():
     ):
         system = lj.System(lambda t, q, v, p, V=potential: 0.5 * v**2 - V(q), elements={name: element})
         traj = lj.integrate(system, 0.0, v0, ts=np.array([0.0, 1.0]), estimate_error=False)
-        assert isinstance(traj, lj.HybridTrajectory) and np.asarray(traj.modes)[:, 0].tolist() == modes
+        assert isinstance(traj, HybridTrajectory) and np.asarray(traj.modes)[:, 0].tolist() == modes
         work, energy = lj.energy_ledger(traj).elements[name].total[-1], 0.5 * traj.v**2 + potential(traj.q)
         np.testing.assert_allclose(work, energy[-1] - energy[0], rtol=1e-8)
         if name == "table":
@@ -194,7 +195,7 @@ def test_switches_of_lanes(tmp_path):
     released = lambda q0: lj.integrate(system, q0, 0.0, ts=[0.0, 2.0], rtol=1e-10, estimate_error=False)
     starts, counts, stops = np.array([1.0, 2.0, 3.0, 5.0]) * 2 * lost, [1, 2, 3, 5], np.arange(1, 6)
     lanes = jax.vmap(released)(jnp.asarray(starts))
-    assert isinstance(lanes, lj.HybridTrajectory)
+    assert isinstance(lanes, HybridTrajectory)
     found, expected = lanes.switches, (-1.0) ** stops * (starts[:, None] - 2 * stops * lost)
     assert found.count.tolist() == counts
     for lane, count in enumerate(counts):

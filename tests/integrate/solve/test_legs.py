@@ -25,7 +25,7 @@ def downdraft(t, q, v, p):
 
 floor = {"floor": lj.Contact(lambda t, q, p: q, restitution=E)}
 in_elements = lj.System(falling, force=downdraft, elements=floor)
-bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, E))
+bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, p: q, E))
 in_a_phase = lj.Hybrid({"flying": lj.System(falling, force=downdraft)}, [bounce], most_switches=3)
 
 

@@ -13,7 +13,7 @@ from lagjax.system import coordinates
 
 ball = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q)
 lying = lj.System(lambda t, q, v, p: 0.5 * v**2 - p["g"] * q, {"floor": lj.Holonomic(lambda t, q, p: q)})
-bounce = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, p: q, restitution=0.5))
+bounce = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, p: q, restitution=0.5))
 hybrid = lj.Hybrid({"flying": ball, "lying": lying}, [bounce])
 TS = np.array([0.0, 0.5])
 
@@ -32,7 +32,7 @@ def test_a_number_that_no_phase_has():
     def begin(q, start):
         state = coordinates.state(0.0, q, 0.0, {"g": 10.0})
         system = traced_phases(hybrid.starting(start), state)
-        way = _first(system, *state[1:], TS, phases_in(system, state, {})[0], settings)
+        way = _first(system, *state[1:], TS, phases_in(system, state, {}), settings)
         return way.mode.phase, way.continues, way.result._value, way.end.q, way.q
 
     phase, continues, result, end, _ = begin(np.array([5.0, 0.0, 5.0, 5.0]), np.array([0, 1, 7, -1]))

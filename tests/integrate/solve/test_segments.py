@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import HybridTrajectory
 
 G = 9.81
 FALL, SPEED = np.sqrt(2 / G), 0.5 * np.sqrt(2 * G)
@@ -17,7 +18,7 @@ def falling(t, q, v, params):
     return 0.5 * v**2 - G * q
 
 
-floor = lj.Switch("flying", to="flying", when=lj.touches(lambda t, q, params: q, 0.5))
+floor = lj.Switch("flying", to="flying", when=lj.guards.touches(lambda t, q, params: q, 0.5))
 bouncing = lj.Hybrid({"flying": lj.System(falling)}, [floor], most_switches=3)
 
 
@@ -25,7 +26,7 @@ def bounced(height, **options):
     """Two bounces, of a ball that falls from rest."""
     ts = np.array([0.0, 1.1])
     traj = lj.integrate(bouncing, height, 0.0, ts=ts, estimate_error=False, **options)
-    assert isinstance(traj, lj.HybridTrajectory)
+    assert isinstance(traj, HybridTrajectory)
     return traj
 
 

@@ -68,7 +68,7 @@ def test_given_tolerances_stay():
     start = SimpleNamespace(q=np.array([3.0, -4.0]), v=np.array([0.0, 7.0]))
     kept = tolerances_at(start, np.array([0.0, 2.0]), settings)
     assert kept.rtol is settings.rtol and kept.atol is settings.atol
-    settings = SimpleNamespace(by_size=True, rtol=np.full(2, 1e-9))
+    settings = SimpleNamespace(by_size=True, forced=None, rtol=np.full(2, 1e-9))
     by_size = by_numpy(lambda q, v, ts: tolerances_at(SimpleNamespace(q=q, v=v), ts, settings).atol)
     np.testing.assert_allclose(by_size(start.q, start.v, np.array([0.0, 2.0])), [4e-9, 7e-9])
 

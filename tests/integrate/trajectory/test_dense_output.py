@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import Snapshot
 from tests.by_hand import ASKED, HOW, by_hand, with_problem
 from tests.by_hand import swing as exact_swing
 from tests.counting import compiles
@@ -45,7 +46,7 @@ def test_times_of_any_shape():
     traj = swing()
     for t in (BETWEEN, BETWEEN.reshape(2, 2), 1.25, 2, [0.5, 0.75], np.zeros((0, 3))):
         found, (q, v) = traj.at(t), exact(t)
-        assert isinstance(found, lj.Snapshot) and found.t.shape == found.q.shape == np.shape(t)
+        assert isinstance(found, Snapshot) and found.t.shape == found.q.shape == np.shape(t)
         np.testing.assert_allclose(found.q, q, atol=1e-9)
         np.testing.assert_allclose(found.v, v, atol=1e-9)
     np.testing.assert_array_equal(traj.at(TS[::-1]).q, np.asarray(traj.q)[::-1])
@@ -106,7 +107,7 @@ def test_continued_as_it_was_asked_for():
 
 def test_where_there_is_no_motion():
     """Times outside, or after an event, are refused with the reason; the event itself is known."""
-    end = lj.Snapshot(2.5, 23.0, 2.0, {})
+    end = Snapshot(2.5, 23.0, 2.0, {})
     ended = of_nodes(end=end, result=lj.RESULTS.event_occurred)
     np.testing.assert_array_equal(ended.at([end.t, 2.0]).q, [end.q, 22.0])
     for t, words in ((2.6, "ended by its event"), (-0.1, "outside of the motion"), (np.nan, "outside of the motion")):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.integrate import Snapshot
 from lagjax.integrate.trajectory.films import hermite
 from tests.by_hand import by_hand, swing
 from tests.systems import PARAMS, pendulum
@@ -79,7 +80,7 @@ def test_a_backward_motion_is_drawn(traj):
 
 def ended(at, result):
     """The motion until some time, with NaN after it."""
-    (q, v), end = swing(DENSE, 1.0, RATE), lj.Snapshot(np.asarray(at), *map(np.asarray, swing(at, 1.0, RATE)), {})
+    (q, v), end = swing(DENSE, 1.0, RATE), Snapshot(np.asarray(at), *map(np.asarray, swing(at, 1.0, RATE)), {})
     q, v = (np.where(at >= DENSE, x, np.nan) for x in (q, v))
     return by_hand(pendulum, DENSE, q, v, PARAMS, end=end, result=result)
 
@@ -106,13 +107,17 @@ def test_a_batch_is_animated_lane_by_lane():
     assert len(jax.tree.map(lambda x: x[0], lanes).animate(lambda t, q, params: (q, 0.0)).t) == 51
 
 
-ROD = lj.Body("rod", 1.0, (0.1, 0.1, 0.01))
-SHAPES = [lj.box(ROD, (0.1, 0.1, 1.0)), lj.trail(ROD.at((0.0, 0.0, -0.5))), lj.line(lj.ground, ROD)]
+ROD = lj.bodies.Body("rod", 1.0, (0.1, 0.1, 0.01))
+SHAPES = [
+    lj.shapes.box(ROD, (0.1, 0.1, 1.0)),
+    lj.shapes.trail(ROD.at((0.0, 0.0, -0.5))),
+    lj.shapes.line(lj.bodies.ground, ROD),
+]
 
 
 def swung(t, q, params):
     """The rod of a pendulum in the plane y = 0: down at q = 0, turned about -y."""
-    return {"rod": lj.Pose.at((0.5 * jnp.sin(q), 0.0, -0.5 * jnp.cos(q)), axis=(0.0, -1.0, 0.0), angle=q)}
+    return {"rod": lj.bodies.Pose.at((0.5 * jnp.sin(q), 0.0, -0.5 * jnp.cos(q)), axis=(0.0, -1.0, 0.0), angle=q)}
 
 
 WRONG_POINTS = {
@@ -125,18 +130,20 @@ WRONG_POINTS = {
     "none": (lambda t, q, params: {}, "the same points"),
     "not finite": (
         lambda t, q, params: {"bob": (jnp.sqrt(q), q)}, "NaN or infinity for 'bob' at t = ", "Usual cause"),
-    "unknown poses": (SHAPES, "where the body 'rod' is", "lj.Drawing"),
+    "unknown poses": (SHAPES, "where the body 'rod' is", "lj.shapes.Drawing"),
     "nothing": (None, "nothing says how this system is drawn"),
-    "what does not move": (lj.sphere(lj.ground, 1.0), "fixed in space"),
-    "the plane beside space": (lj.Drawing([*SHAPES, bob], swung), "some in space"),
+    "what does not move": (lj.shapes.sphere(lj.bodies.ground, 1.0), "fixed in space"),
+    "the plane beside space": (lj.shapes.Drawing([*SHAPES, bob], swung), "some in space"),
 }  # fmt: skip
 WRONG_SHAPES = {
-    "NaN": (ValueError, lj.Drawing(SHAPES, lambda t, q, params: {"rod": lj.Pose.at((jnp.nan * q, 0.0, 0.0))}),
+    "NaN": (ValueError,
+            lj.shapes.Drawing(SHAPES, lambda t, q, params: {"rod": lj.bodies.Pose.at((jnp.nan * q, 0.0, 0.0))}),
             "'rod' is NaN or infinite at t = 0"),
-    "no pose": (ValueError, lj.Drawing(SHAPES, lambda t, q, params: {"rod": (q, q)}), r"has the shapes \(\) and \(\)"),
-    "one size": (ValueError, lj.Drawing([lj.box(ROD, 0.3)], swung),
+    "no pose": (ValueError, lj.shapes.Drawing(SHAPES, lambda t, q, params: {"rod": (q, q)}),
+                r"has the shapes \(\) and \(\)"),
+    "one size": (ValueError, lj.shapes.Drawing([lj.shapes.box(ROD, 0.3)], swung),
                  "the size of a shape must be three finite numbers, and is 0.3"),
-    "a negative size": (ValueError, lj.Drawing([lj.sphere(ROD, -0.3)], swung), "is negative"),
+    "a negative size": (ValueError, lj.shapes.Drawing([lj.shapes.sphere(ROD, -0.3)], swung), "is negative"),
     "a body": (TypeError, ROD, "not Body"),
     "bodies": (TypeError, [ROD], "list of Body"),
     "an empty list": (TypeError, [], "not list"),
@@ -178,27 +185,27 @@ def test_no_time_to_play(traj):
 def test_bodies_by_their_poses(traj):
     """Poses are those of the interpolated angle, in the order of shapes; the rod's end is where the function says."""
     tip = lambda t, q, params: {"tip": (np.sin(q), 0.0, -np.cos(q))}
-    film = traj.animate(lj.Drawing([*SHAPES, tip], swung), seconds=4.0, rate=20.0)
+    film = traj.animate(lj.shapes.Drawing([*SHAPES, tip], swung), seconds=4.0, rate=20.0)
     drawn = film.points
     assert len(drawn.shapes) == 3 and list(drawn.poses) == ["rod"] and drawn.poses["rod"].shape == (81, 7)
     end = drawn.place(drawn.shapes[1].anchors[0])
     np.testing.assert_allclose(end, drawn.points["tip"][:, 0], atol=1e-12)
     # Twin: turned the other way it is elsewhere.
-    other = traj.animate(lj.Drawing(SHAPES, lambda t, q, params: swung(t, -q, params)), seconds=4.0, rate=20.0)
+    other = traj.animate(lj.shapes.Drawing(SHAPES, lambda t, q, params: swung(t, -q, params)), seconds=4.0, rate=20.0)
     assert np.abs(other.points.place(drawn.shapes[1].anchors[0]) - drawn.points["tip"][:, 0]).max() > 0.1
 
 
 def test_sizes_by_params(traj):
     """Lengths and points that are functions of params have their values."""
-    disk = lj.disk(ROD.at(lambda params: (0.0, 0.0, -params["l"])), radius=lambda params: 0.1 * params["l"])
-    drawn = traj.animate(lj.Drawing(lambda params: [disk], swung)).points
+    disk = lj.shapes.disk(ROD.at(lambda params: (0.0, 0.0, -params["l"])), radius=lambda params: 0.1 * params["l"])
+    drawn = traj.animate(lj.shapes.Drawing(lambda params: [disk], swung)).points
     np.testing.assert_allclose(drawn.shapes[0].size, 0.1 * PARAMS["l"])
     np.testing.assert_allclose(drawn.shapes[0].anchors[0].point, [0.0, 0.0, -PARAMS["l"]])
 
 
 def test_figures(traj):
     """Instants by number or by time, in the plane and in space, of one state too; times outside are refused."""
-    for what in (bob, lj.Drawing(SHAPES, swung), lambda t, q, params: (q, q, q)):
+    for what in (bob, lj.shapes.Drawing(SHAPES, swung), lambda t, q, params: (q, q, q)):
         assert len(traj.draw(what, times=[0.0, 0.7]).axes) == 1
     (axis,) = traj.draw(bob, times=4).axes
     drawn = [line.get_xydata() for line in axis.lines[1:]]

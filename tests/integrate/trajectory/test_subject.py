@@ -10,15 +10,15 @@ from lagjax.display import Anchor, InSpace, Shape
 from tests.systems import PARAMS, pendulum
 
 Y = (0.0, 1.0, 0.0)
-CRANK, ROD = lj.Body("crank", 1.0, (0.1, 0.1, 0.01)), lj.Body("rod", 1.0, (0.3, 0.3, 0.01))
+CRANK, ROD = lj.bodies.Body("crank", 1.0, (0.1, 0.1, 0.01)), lj.bodies.Body("rod", 1.0, (0.3, 0.3, 0.01))
 JOINTS = {
-    "axle": lj.revolute(lj.ground.at(axis=Y), CRANK.at((0.0, 0.0, -0.5), Y)),
-    "pin": lj.spherical(CRANK.at((0.0, 0.0, 0.5)), ROD.at((0.0, 0.0, 0.0))),
-    "slide": lj.cylindrical(lj.ground.at(axis=(1.0, 0.0, 0.0)), ROD.at((0.0, 0.0, 1.0), axis=Y)),
+    "axle": lj.bodies.revolute(lj.bodies.ground.at(axis=Y), CRANK.at((0.0, 0.0, -0.5), Y)),
+    "pin": lj.bodies.spherical(CRANK.at((0.0, 0.0, 0.5)), ROD.at((0.0, 0.0, 0.0))),
+    "slide": lj.bodies.cylindrical(lj.bodies.ground.at(axis=(1.0, 0.0, 0.0)), ROD.at((0.0, 0.0, 1.0), axis=Y)),
 }
-LINKAGE = lj.multibody([CRANK, ROD], JOINTS, [lj.weight([CRANK, ROD])])
+LINKAGE = lj.bodies.multibody([CRANK, ROD], JOINTS, [lj.bodies.weight([CRANK, ROD])])
 # The crank upright with its pin at z = 1, where the rod's end is 0.3 to the side.
-ROUGH = {"crank": lj.Pose.at((0.0, 0.0, 0.5)), "rod": lj.Pose.at((0.0, 0.3, 1.0))}
+ROUGH = {"crank": lj.bodies.Pose.at((0.0, 0.0, 0.5)), "rod": lj.bodies.Pose.at((0.0, 0.3, 1.0))}
 
 
 def kinds(picture, kind):
@@ -40,13 +40,13 @@ def test_open_joints_are_seen_and_said():
     (gap,) = kinds(picture, "gap")
     assert gap.color == "#E6007E"
     np.testing.assert_allclose([where(picture, x) for x in gap.anchors], [[0, 0, 1], [0, 0.3, 1]], atol=1e-15)
-    closed = lj.draw(LINKAGE, ROUGH | {"rod": lj.Pose.at((0.0, 0.0, 1.0))})
+    closed = lj.draw(LINKAGE, ROUGH | {"rod": lj.bodies.Pose.at((0.0, 0.0, 1.0))})
     assert not closed.apart() and not kinds(closed, "gap") and "apart" not in str(closed)
 
 
 def test_frames_of_bodies_and_axes_of_joints():
     """Three marks along each body's axes from its centre, two for each axis of a joint, through its points."""
-    turned = lj.Pose.at((0.0, 0.3, 1.0), axis=(1.0, 0.0, 0.0), angle=np.pi / 2)
+    turned = lj.bodies.Pose.at((0.0, 0.3, 1.0), axis=(1.0, 0.0, 0.0), angle=np.pi / 2)
     picture = lj.draw(LINKAGE, ROUGH | {"rod": turned}, frames=True)
     marks = kinds(picture, "mark")
     assert len(marks) == 2 * 3 + 2 * 2 and not kinds(picture, "axis")
@@ -69,11 +69,11 @@ def test_a_ball_in_its_bowl():
 
     Twin: with other parameters it is elsewhere.
     """
-    bowl = lj.Surface(lambda r, params: r[2] - params["bend"] * (r[0] ** 2 + r[1] ** 2))
-    balls = [lj.Body(name, 1.0, (0.004, 0.004, 0.004)) for name in "ab"]
-    joints = {ball.name: lj.rolling_sphere(ball.at(), bowl, radius=0.1) for ball in balls}
-    q = {"a": lj.Pose.at((0.0, 0.0, 0.1)), "b": lj.Pose.at((0.5, 0.0, 0.3))}
-    picture = lj.draw(lj.multibody(balls, joints), q, {"bend": 1.0})
+    bowl = lj.bodies.Surface(lambda r, params: r[2] - params["bend"] * (r[0] ** 2 + r[1] ** 2))
+    balls = [lj.bodies.Body(name, 1.0, (0.004, 0.004, 0.004)) for name in "ab"]
+    joints = {ball.name: lj.bodies.rolling_sphere(ball.at(), bowl, radius=0.1) for ball in balls}
+    q = {"a": lj.bodies.Pose.at((0.0, 0.0, 0.1)), "b": lj.bodies.Pose.at((0.5, 0.0, 0.3))}
+    picture = lj.draw(lj.bodies.multibody(balls, joints), q, {"bend": 1.0})
     ground, *solids = sorted(kinds(picture, "solid"), key=lambda shape: shape.owner is not None)
     assert [shape.owner for shape in solids] == ["a", "b"] and ground.surface is not None and ground.surface.closed
     x, y, z = ground.surface.vertices.T
@@ -85,11 +85,11 @@ def test_a_ball_in_its_bowl():
 
 def test_a_surface_on_a_body_that_moved():
     """A table's surface is where the table is, turned as it is."""
-    table = lj.Body("table", 1.0, (1.0, 1.0, 1.0))
-    ball = lj.Body("ball", 1.0, (0.004, 0.004, 0.004))
-    plane = lj.Surface(lambda r, params: r[2] + 0.1 * r[0], on=table.at((0.0, 0.0, 0.5)))
-    system = lj.multibody([table, ball], {"rolls": lj.rolling_sphere(ball.at(), plane, radius=0.1)})
-    q = {"table": lj.Pose.at((1.0, 2.0, 0.0), angle=np.pi / 2), "ball": lj.Pose.at((1.0, 2.1, 0.6))}
+    table = lj.bodies.Body("table", 1.0, (1.0, 1.0, 1.0))
+    ball = lj.bodies.Body("ball", 1.0, (0.004, 0.004, 0.004))
+    plane = lj.bodies.Surface(lambda r, params: r[2] + 0.1 * r[0], on=table.at((0.0, 0.0, 0.5)))
+    system = lj.bodies.multibody([table, ball], {"rolls": lj.bodies.rolling_sphere(ball.at(), plane, radius=0.1)})
+    q = {"table": lj.bodies.Pose.at((1.0, 2.0, 0.0), angle=np.pi / 2), "ball": lj.bodies.Pose.at((1.0, 2.1, 0.6))}
     picture = lj.draw(system, q)
     (ground,) = (shape for shape in kinds(picture, "solid") if shape.color == "#B8B8B8")
     # The table's x axis is y in space.
@@ -105,7 +105,7 @@ def test_a_surface_under_a_whole_motion():
     path = np.stack([np.linspace(0.0, 3.0, 5), np.zeros(5), np.linspace(0.1, 0.4, 5)], axis=1)
     poses = {"ball": np.concatenate([path, np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))], axis=1)}
     shapes = [
-        lj.sphere(lj.Body("ball", 1.0, (0.1, 0.1, 0.1)), 0.1),
+        lj.shapes.sphere(lj.bodies.Body("ball", 1.0, (0.1, 0.1, 0.1)), 0.1),
         Shape("level", (Anchor(None, np.zeros(3)),), level=f),
     ]
     motion = InSpace(tuple(shape.with_params(None) for shape in shapes), poses, {}).finished()
@@ -117,10 +117,12 @@ def test_a_surface_under_a_whole_motion():
 
 def test_trees_and_their_closures():
     """A tree is drawn by its joints' positions, an open closure with its gap."""
-    links = [lj.Body(f"link {i}", 1.0, (1 / 12, 1 / 12, 0.0)) for i in range(2)]
-    tops = [lj.ground.at(axis=Y), links[0].at((0.0, 0.0, -0.5), Y)]
-    tree = lj.Tree(links, {"angles": [lj.revolute(a, x.at((0.0, 0.0, 0.5), Y)) for a, x in zip(tops, links)]})
-    end = lj.spherical(lj.ground.at((0.0, 0.0, -1.5)), links[1].at((0.0, 0.0, -0.5)))
+    links = [lj.bodies.Body(f"link {i}", 1.0, (1 / 12, 1 / 12, 0.0)) for i in range(2)]
+    tops = [lj.bodies.ground.at(axis=Y), links[0].at((0.0, 0.0, -0.5), Y)]
+    tree = lj.bodies.Tree(
+        links, {"angles": [lj.bodies.revolute(a, x.at((0.0, 0.0, 0.5), Y)) for a, x in zip(tops, links)]}
+    )
+    end = lj.bodies.spherical(lj.bodies.ground.at((0.0, 0.0, -1.5)), links[1].at((0.0, 0.0, -0.5)))
     picture = lj.draw(tree.system(closures={"end": end}), {"angles": np.zeros(2)})
     assert picture.apart() == {("'link 1'", "the ground"): pytest.approx(0.5, abs=1e-12)}
 

@@ -1,14 +1,24 @@
-"""Joint positions, counted from the file's drawing, and the way back to them from the markers that joints join.
+"""Links and joints as numbers, whichever file they come from; links fixed to each other are one; positions of joints.
+
+A joint is at the origin of its child link and has its axes: where all joint positions are zero, the child's frame in
+that of its parent is the joint's `Placement`, as in URDF. Links fixed to each other are one body, whose inertia is
+the sum by the parallel-axis theorem,
+
+    c = Σ m_i c_i / m,      I = Σ R_i I_i R_iᵀ + m_i (|d_i|² 1 - d_i d_iᵀ),      d_i = c_i - c.
+
+Joint positions are counted from the file's drawing, and are read off the markers that joints join:
 
     revolute     an angle about the axis
     prismatic    a length along the axis
     planar       two lengths along the first two vectors of the joint's frame and the angle about its axis
     spherical    the unit quaternion of the child's axes in the joint's
 
-The position of a floating joint is the `lj.Pose` of its body in space, as in q.
+The position of a floating joint is the `lj.bodies.Pose` of its body in space, as in q.
+
+Source: Featherstone, *Rigid Body Dynamics Algorithms* (2008), §2.13 and Ch. 4.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -18,11 +28,163 @@ from jaxtyping import Array, Float, PyTree
 from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix
-from lagjax.models.parts import Placement, RobotJoint
 
+# By how much of their sum principal moments may miss the triangle inequality, as in `lj.bodies.Body`.
+ROUNDED = 1e-9
 UNTURNED = (1.0, 0.0, 0.0, 0.0)
 # Axes that are meant to be parallel, at right angles, or to meet.
 ALIKE = 1e-9
+
+
+class Placement(NamedTuple):
+    """A frame inside another: its origin there, and the matrix whose columns are its axes there."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+
+    def point(self, r) -> np.ndarray:
+        """A point of the inner frame, in the outer one."""
+        # The largest numbers overflow; `RobotModel.of` looks for that.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.origin + self.axes @ np.asarray(r, float)
+
+    def then(self, inner: "Placement") -> "Placement":
+        """A frame inside this one, in the outer one."""
+        return Placement(self.point(inner.origin), self.axes @ inner.axes)
+
+
+def unmoved() -> Placement:
+    """The frame itself."""
+    return Placement(np.zeros(3), np.eye(3))
+
+
+class RobotLink(NamedTuple):
+    """A rigid part: its mass, its centre in its frame, its inertia about the centre along the frame's axes."""
+
+    name: str
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+    line: str
+
+    @classmethod
+    def frame(cls, name: str, line: str) -> "RobotLink":
+        """One that has no mass."""
+        return cls(name, 0.0, np.zeros(3), np.zeros((3, 3)), line)
+
+
+class RobotJoint(NamedTuple):
+    """How a link moves in its parent (None: the ground).
+
+    `kind` is one of `KINDS`, or "fixed" before links are merged; `axis` a unit vector of the child's frame. A torque
+    `-stiffness (s - rest) - damping s'` acts along the joint's position s, and its rotor adds `armature s'²/2` to the
+    kinetic energy.
+    """
+
+    name: str
+    kind: str
+    parent: str | None
+    child: str
+    placement: Placement
+    axis: np.ndarray
+    line: str
+    damping: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+
+
+KINDS = ("revolute", "prismatic", "planar", "spherical", "floating")
+
+
+class Loop(NamedTuple):
+    """Two places that are held together besides the tree of joints: "spherical" (a point) or "fixed"."""
+
+    name: str
+    kind: str
+    places: tuple[tuple[str | None, Placement], tuple[str | None, Placement]]
+    line: str
+
+
+class MergedLinks(NamedTuple):
+    """Moving links by name, each with its joint to a link before it, and where the file's links are on them."""
+
+    links: dict[str, RobotLink]
+    joints: dict[str, RobotJoint]
+    frames: dict[str, tuple[str | None, Placement]]
+
+
+def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> MergedLinks:
+    """Make one link of those that are fixed to each other; joints come parents first.
+
+    `frames` has, by the name of each link of the file, the moving link that it is part of (None: the ground), and where
+    its frame is in that.
+    """
+    frames: dict[str, tuple[str | None, Placement]] = {}
+    moving, parts = {}, {}
+    for joint in joints:
+        head, frame = (None, unmoved()) if joint.parent is None else frames[joint.parent]
+        here = frame.then(joint.placement)
+        if joint.kind == "fixed":
+            frames[joint.child] = head, here
+        else:
+            # A floating joint holds nothing: its position is the pose of its body, and goes by the body's name.
+            name = joint.child if joint.kind == "floating" else joint.name
+            if name in moving:
+                raise ValueError(f"{joint.line}: a joint and a free body are both called '{name}'.\nFix: rename one.")
+            moving[name] = joint._replace(name=name, parent=head, placement=here)
+            head = joint.child
+            frames[head] = head, unmoved()
+        parts.setdefault(head, []).append(joint.child)
+    heads = {joint.child: links[joint.child] for joint in moving.values()}
+    summed = {name: _sum(link, [(links[x], frames[x][1]) for x in parts[name]]) for name, link in heads.items()}
+    return MergedLinks(summed, moving, frames)
+
+
+def _sum(head: RobotLink, parts: list[tuple[RobotLink, Placement]]) -> RobotLink:
+    if len(parts) == 1:
+        return head
+    # The largest numbers overflow.
+    with np.errstate(over="ignore", invalid="ignore"):
+        mass = sum(link.mass for link, _ in parts)
+        moment = sum(link.mass * frame.point(link.centre) for link, frame in parts)
+        centre = moment / mass if mass else np.zeros(3)
+        inertia = np.zeros((3, 3))
+        for link, frame in parts:
+            d = frame.point(link.centre) - centre
+            inertia += inertia_along(frame.axes, link.inertia) + link.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return head._replace(mass=mass, centre=centre, inertia=inertia)
+
+
+def inertia_along(axes: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+    """An inertia along the axes of a frame, along those in which the frame's axes are the columns."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = axes @ inertia @ axes.T
+    return found / 2 + found.T / 2
+
+
+def fault_of_inertia(link: RobotLink) -> str:
+    """Why no body has these numbers, "" where one has."""
+    if link.mass < 0:
+        return f"has the mass {link.mass:.6g}"
+    # Sums of the largest numbers overflow, those of the moments by the largest do not.
+    size = np.abs(link.inertia).max() or 1.0
+    if not np.isfinite(size):
+        return "has moments of inertia beyond the largest number"
+    moments = np.linalg.eigvalsh(link.inertia / size)
+    if moments[0] < -ROUNDED * np.abs(moments).max():
+        return f"has a negative principal moment of inertia, {moments[0] * size:.6g}"
+    if moments[2] > (moments[0] + moments[1]) * (1 + ROUNDED):
+        listed = ", ".join(f"{x:.6g}" for x in moments * size)
+        return f"has the principal moments {listed}, of which the last is more than the sum of the others"
+    return ""
+
+
+def made_up(name: str, known: Container[str]) -> str:
+    """A name for what has none in the file, that nothing there has."""
+    while name in known:
+        name += "'"
+    return name
 
 
 def drawn(joint: RobotJoint, centre: np.ndarray) -> PyTree:
@@ -47,7 +209,7 @@ def moved(joint: RobotJoint, s: PyTree, centre: np.ndarray) -> Placement:
 
 
 def frame_of(axis: np.ndarray) -> np.ndarray:
-    """Three unit vectors as rows, the last of which is the axis: those of `lj.Marker`."""
+    """Three unit vectors as rows, the last of which is the axis: those of `lj.bodies.Marker`."""
     return np.array(Marker.on(Ground(), (0.0, 0.0, 0.0), axis if axis.any() else (0.0, 0.0, 1.0)).frame)
 
 

@@ -1,12 +1,17 @@
-"""What bodies look like, for `traj.animate` and `traj.draw`, and how a system of bodies is drawn by itself.
+"""What bodies look like in pictures, `traj.animate`, `traj.draw` and `lj.draw`; what has mass is in `lj.bodies`.
 
-A place is a body, a marker `body.at(point, axis)`, whose axis is the z axis of what sits there, `lj.ground`, or a point
-of space. Lengths, sizes and points may be functions of params.
+>>> import lagjax as lj
+>>> bob = lj.bodies.Body("bob", 1.0, (0.1, 0.1, 0.1))
+>>> [lj.shapes.sphere(bob, radius=0.2), lj.shapes.rod(lj.bodies.ground, bob, radius=0.02)]
+[Shape(a solid on 'bob'), Shape(a rod on the ground, 'bob')]
+
+A place is a body, a marker `body.at(point, axis)`, whose axis is the z axis of what sits there, `lj.bodies.ground`, or
+a point of space. Lengths, sizes and points may be functions of params.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,23 +19,33 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from lagjax.bodies.body import Body, Ground, Marker, valued
-from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Shape, surface
+from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Drawing, Shape, surface
 from lagjax.jaxtools import compiled
 
-Place = Body | Ground | Marker | ArrayLike
-# The least thickness of a body's box beside its length.
-THIN = 0.04
+__all__ = ["Drawing", "Shape", "box", "cylinder", "disk", "ellipsoid", "line", "mesh", "rod", "sphere", "trail"]
+
 # The colours of what a joint leaves open, and of surfaces to roll on.
 OPEN, GROUND = "#E6007E", "#B8B8B8"
+
+
+class Anchored(Protocol):
+    """What shapes hold on to: a body, a marker on one, the ground."""
+
+    @property
+    def anchor(self) -> Anchor:
+        """The place, in the words of pictures."""
+        ...
+
+
+Place = Anchored | ArrayLike
 
 
 def box(place: Place, size: Any, color: str | None = None) -> Shape:
     """A box about a place, with its edges `size` (3,) along the body's axes (for a marker, along its own).
 
     >>> import lagjax as lj
-    >>> door = lj.Body("door", 20.0, (1.0, 2.0, 1.0))
-    >>> lj.box(door, (1.0, 0.05, 2.0))
+    >>> door = lj.bodies.Body("door", 20.0, (1.0, 2.0, 1.0))
+    >>> lj.shapes.box(door, (1.0, 0.05, 2.0))
     Shape(a solid on 'door')
 
     **Raises:** `TypeError` for a place that is none; `ValueError` for a color that is not "#rrggbb", and, when it is
@@ -43,11 +58,11 @@ def cylinder(place: Place, radius: Any, length: Any, color: str | None = None) -
     """A cylinder about the z axis of a place, half of it on either side. Its sectors show its turning.
 
     >>> import lagjax as lj
-    >>> wheel = lj.Body("wheel", 1.0, (0.3, 0.5, 0.3))
-    >>> lj.cylinder(wheel.at(axis=(0.0, 1.0, 0.0)), radius=1.0, length=0.1)
+    >>> wheel = lj.bodies.Body("wheel", 1.0, (0.3, 0.5, 0.3))
+    >>> lj.shapes.cylinder(wheel.at(axis=(0.0, 1.0, 0.0)), radius=1.0, length=0.1)
     Shape(a solid on 'wheel')
 
-    **Raises:** as `lj.box` does.
+    **Raises:** as `lj.shapes.box` does.
     """
     return Shape("solid", (_anchor(place),), CYLINDER, _sizes(radius, radius, length), color)
 
@@ -56,17 +71,25 @@ def sphere(place: Place, radius: Any, color: str | None = None) -> Shape:
     """A sphere about a place, in eight light and dark parts that show its turning.
 
     >>> import lagjax as lj
-    >>> ball = lj.Body("ball", 1.0, (0.4, 0.4, 0.4))
-    >>> lj.sphere(ball, radius=1.0)
+    >>> ball = lj.bodies.Body("ball", 1.0, (0.4, 0.4, 0.4))
+    >>> lj.shapes.sphere(ball, radius=1.0)
     Shape(a solid on 'ball')
 
-    **Raises:** as `lj.box` does.
+    **Raises:** as `lj.shapes.box` does.
     """
     return ellipsoid(place, (radius, radius, radius), color)
 
 
 def ellipsoid(place: Place, half_axes: Sequence, color: str | None = None) -> Shape:
-    """An ellipsoid about a place, its axes along those of the place."""
+    """An ellipsoid about a place, its axes along those of the place.
+
+    >>> import lagjax as lj
+    >>> egg = lj.bodies.Body("egg", 1.0, (0.3, 0.4, 0.4))
+    >>> lj.shapes.ellipsoid(egg, half_axes=(1.0, 0.7, 0.7))
+    Shape(a solid on 'egg')
+
+    **Raises:** as `lj.shapes.box` does.
+    """
     return Shape("solid", (_anchor(place),), SPHERE, _sizes(*half_axes), color)
 
 
@@ -74,11 +97,11 @@ def disk(place: Place, radius: Any, color: str | None = None) -> Shape:
     """A thin disk at a place, at right angles to its z axis.
 
     >>> import lagjax as lj
-    >>> coin = lj.Body("coin", 1.0, (1.0, 1.0, 2.0))
-    >>> lj.disk(coin, radius=2.0)
+    >>> coin = lj.bodies.Body("coin", 1.0, (1.0, 1.0, 2.0))
+    >>> lj.shapes.disk(coin, radius=2.0)
     Shape(a solid on 'coin')
 
-    **Raises:** as `lj.box` does.
+    **Raises:** as `lj.shapes.box` does.
     """
     return Shape("solid", (_anchor(place),), DISK, _sizes(radius, radius, radius), color)
 
@@ -87,8 +110,8 @@ def mesh(place: Place, vertices: ArrayLike, faces: Sequence[Sequence[int]], colo
     """Faces fixed in a body: `vertices` (n, 3) from the place, and for each face the indices of its corners in order.
 
     >>> import lagjax as lj
-    >>> fin = lj.Body("fin", 1.0, (1.0, 1.0, 1.0))
-    >>> lj.mesh(fin, [(0, 0, 0), (1, 0, 0), (0, 0, 1)], [(0, 1, 2)])
+    >>> fin = lj.bodies.Body("fin", 1.0, (1.0, 1.0, 1.0))
+    >>> lj.shapes.mesh(fin, [(0, 0, 0), (1, 0, 0), (0, 0, 1)], [(0, 1, 2)])
     Shape(a solid on 'fin')
 
     **Raises:** `ValueError` for indices that `vertices` lacks, vertices that are not points of space, and a color that
@@ -101,11 +124,11 @@ def rod(a: Place, b: Place, radius: Any, color: str | None = None) -> Shape:
     """A round rod from one place to another, of the same body or of two.
 
     >>> import lagjax as lj
-    >>> bob = lj.Body("bob", 1.0, (0.1, 0.1, 0.1))
-    >>> lj.rod(lj.ground, bob, radius=0.02)
+    >>> bob = lj.bodies.Body("bob", 1.0, (0.1, 0.1, 0.1))
+    >>> lj.shapes.rod(lj.bodies.ground, bob, radius=0.02)
     Shape(a rod on the ground, 'bob')
 
-    **Raises:** as `lj.box` does.
+    **Raises:** as `lj.shapes.box` does.
     """
     return Shape("rod", (_anchor(a), _anchor(b)), TUBE, _sizes(radius, radius, 1.0), color)
 
@@ -114,14 +137,14 @@ def line(*places: Place, color: str | None = None) -> Shape:
     """A line through places; with a single one, a dot.
 
     >>> import lagjax as lj
-    >>> kite = lj.Body("kite", 1.0, (0.1, 0.1, 0.1))
-    >>> lj.line((0.0, 0.0, 0.0), kite.at((0.0, 0.0, -0.5)))
+    >>> kite = lj.bodies.Body("kite", 1.0, (0.1, 0.1, 0.1))
+    >>> lj.shapes.line((0.0, 0.0, 0.0), kite.at((0.0, 0.0, -0.5)))
     Shape(a line on the ground, 'kite')
 
     **Raises:** `ValueError` for no places and for a color that is not "#rrggbb".
     """
     if not places:
-        raise ValueError("a line needs places.\nFix: lj.line(lj.ground, body).")
+        raise ValueError("a line needs places.\nFix: lj.shapes.line(lj.bodies.ground, body).")
     return Shape("line" if len(places) > 1 else "dot", tuple(map(_anchor, places)), color=color)
 
 
@@ -129,11 +152,11 @@ def trail(place: Place, color: str | None = None) -> Shape:
     """The path that a place leaves behind; in a film, its last part.
 
     >>> import lagjax as lj
-    >>> pen = lj.Body("pen", 1.0, (0.1, 0.1, 0.1))
-    >>> lj.trail(pen.at((0.0, 0.0, -0.1)))
+    >>> pen = lj.bodies.Body("pen", 1.0, (0.1, 0.1, 0.1))
+    >>> lj.shapes.trail(pen.at((0.0, 0.0, -0.1)))
     Shape(a trail on 'pen')
 
-    **Raises:** as `lj.box` does.
+    **Raises:** as `lj.shapes.box` does.
     """
     return Shape("trail", (_anchor(place),), color=color)
 
@@ -143,12 +166,12 @@ def gap(a: Place, b: Place) -> Shape:
     return Shape("gap", (_anchor(a), _anchor(b)), color=OPEN)
 
 
-def axis(place: Marker) -> Shape:
+def axis(place: Anchored) -> Shape:
     """The axis of a joint, which pictures show where they are asked for frames."""
     return Shape("axis", (_anchor(place),))
 
 
-def level(place: Marker, f: Callable) -> Shape:
+def level(place: Anchored, f: Callable) -> Shape:
     """The surface f = 0 about all else that is drawn, seen from where f > 0; `f(r, params)` in a marker's frame."""
     return Shape("level", (_anchor(place),), color=GROUND, level=partial(_values, f))
 
@@ -162,41 +185,14 @@ def _at_points(f: Callable, points: np.ndarray, params: PyTree):
     return jax.vmap(lambda r: jnp.asarray(f(r, params), float))(points)
 
 
-def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:
-    """What is drawn of a system if nothing is given: what its functions look like, and bodies as boxes.
-
-    A box of mass m has I_1 = m (b² + c²)/12 and so on, so that a² = 6 (I_2 + I_3 - I_1)/m. A wheel that rolls is a disk
-    instead.
-    """
-    # Several wheels have one surface.
-    found = list(dict.fromkeys(shape for function in functions for shape in getattr(function, "drawing", ())))
-    solid = {shape.owner for shape in found if shape.kind == "solid"}
-    return (*(_equal_box(body, params) for body in bodies if body.name not in solid), *found)
-
-
-def _equal_box(body: Body, params: PyTree) -> Shape:
-    inertia = np.asarray(valued(body.inertia, params), float)
-    moments, axes = (inertia, np.eye(3)) if inertia.ndim == 1 else np.linalg.eigh(inertia)
-    # Columns that are right-handed: a mirrored box would be seen from inside.
-    axes = axes * np.sign(np.linalg.det(axes))
-    edges = np.sqrt(np.maximum(6 * (np.sum(moments) - 2 * moments) / float(valued(body.mass, params)), 0.0))
-    if not edges.max() > 0:
-        return line(body)
-    anchor = Anchor(body.name, (0.0, 0.0, 0.0), tuple(map(tuple, axes.T.tolist())))
-    return Shape("solid", (anchor,), CUBE, tuple(np.maximum(edges, THIN * edges.max()).tolist()))
-
-
 def _anchor(place: Any) -> Anchor:
-    if isinstance(place, Ground):
-        return Anchor(None, (0.0, 0.0, 0.0))
-    if isinstance(place, Body):
-        return Anchor(place.name, (0.0, 0.0, 0.0))
-    if isinstance(place, Marker):
-        return Anchor(None if isinstance(place.body, Ground) else place.body.name, place.place, place.frame)
+    if isinstance(anchor := getattr(place, "anchor", None), Anchor):
+        return anchor
     if np.shape(place) != (3,):
         raise TypeError(
-            f"a place must be a body, body.at(point), lj.ground or a point (x, y, z), not {type(place).__name__}.\n"
-            'Usual cause: the name of a body in place of the body.\nFix: lj.sphere(lj.Body("ball", ...), 0.5).'
+            "a place must be a body, body.at(point), lj.bodies.ground or a point (x, y, z), not "
+            f"{type(place).__name__}.\nUsual cause: the name of a body in place of the body.\n"
+            'Fix: lj.shapes.sphere(lj.bodies.Body("ball", ...), 0.5).'
         )
     return Anchor(None, tuple(np.asarray(place, float).tolist()))
 
@@ -210,6 +206,6 @@ def _sizes(*lengths: Any) -> Any:
 
 def _of_params(lengths: tuple) -> Callable:
     def size(params):
-        return jnp.stack([jnp.asarray(valued(length, params), float) for length in lengths])
+        return jnp.stack([jnp.asarray(length(params) if callable(length) else length, float) for length in lengths])
 
     return size
