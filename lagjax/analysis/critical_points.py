@@ -29,9 +29,9 @@ E_y, which changes by two where two vanish together.
 
 Source: Allgower & Georg, *Introduction to Numerical Continuation Methods*, §8.1 (the determinant).
 
-**Between two points of a branch** the extended systems are solved, and what is found is classified. The extended
-systems are those of `critical_points.py`. At a branch point the two directions are the roots of the algebraic
-bifurcation equation: with b₁, b₂ a basis of the null space of `(E_y, E_μ)`, and τ = α b₁ + β b₂,
+**Between two points of a branch** the extended systems are solved, and what is found is classified. At a branch point
+the two directions are the roots of the algebraic bifurcation equation: with b₁, b₂ a basis of the null space of `(E_y,
+E_μ)`, and τ = α b₁ + β b₂,
 
     ψ·D²E[τ, τ] = a α² + 2 b α β + c β² = 0
 

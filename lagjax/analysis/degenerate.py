@@ -1,6 +1,6 @@
 """Stability where a stiffness is zero: the first term decides that does not vanish along the zero mode.
 
-With the reduced force b(s) of `degenerate.py`, which is c s^k near the equilibrium s = 0:
+With the reduced force b(s), which is c s^k near the equilibrium s = 0:
 
 - b = 0 at all amplitudes: the equilibrium is one of a family, as along a symmetry. The linear terms decide the rest.
 - With friction along the mode, d = ψ·Cφ ≠ 0, the motion on the centre manifold is d s' = -b(s) to leading order.

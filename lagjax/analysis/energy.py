@@ -7,15 +7,9 @@ Along any motion of `d/dt ∂L/∂v - ∂L/∂q = Q - ∂R/∂v + Aᵀ λ` the J
 one term each for the force, the dissipation, the constraints and explicit time. Their works are integrated separately,
 without using h, so that the remainder of the balance, the closure, tests the motion, the multipliers and the forces
 together. A work is the integral of a power: the motion is integrated again, by the same method with the same
-tolerances, with outputs at the nodes of a quadrature, which is refined until it is more accurate than the motion
-(`energy.py`).
+tolerances, with outputs at the nodes of a quadrature, which is refined until it is more accurate than the motion.
 
-Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7.
-
-*The works*: the motion is integrated again, with outputs at the nodes of a quadrature. The quadrature is refined until
-it is more accurate than the motion.
-
-Source: Piessens et al., *QUADPACK* (1983), §2.2.
+Source: Goldstein, *Classical Mechanics*, Eq. (2.53), (2.54) and §2.7; Piessens et al., *QUADPACK* (1983), §2.2.
 """
 
 import warnings

@@ -74,8 +74,8 @@ class Passage(NamedTuple):
     """The end of a state z (2n,) and of a frame of tangents (2n, k) after a time.
 
     `growth`: the logarithm of the growth of a complete frame's volume by Liouville's formula; 0 if not requested. The
-    other fields are those of a motion with switches (`flow.py`): the `rate` at its end, whether it `returns`
-    to the phase of its start, and the `phase` in which it ends.
+    other fields are those of a motion with switches: the `rate` at its end, whether it `returns` to the phase of its
+    start, and the `phase` in which it ends.
     """
 
     z: Float[Array, " 2n"]

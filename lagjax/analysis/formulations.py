@@ -15,8 +15,7 @@ Source: Goldstein, *Classical Mechanics*, Eq. (8.15)-(8.18); Arnold, *Mathematic
 
 **Routh's function**: a system without its cyclic coordinates, whose momenta are parameters.
 
-The momentum p_c = ∂L/∂v_c of a cyclic coordinate c is constant. With v_c found from it (`formulations.py`), the
-function
+The momentum p_c = ∂L/∂v_c of a cyclic coordinate c is constant. With v_c found from it, the function
 
     R(t, q, v) = L(t, q, v, v_c) - p_c·v_c
 

@@ -21,7 +21,7 @@ is a smooth function of A with correct derivatives.
 Source: Goldstein, *Classical Mechanics*, §6.1-6.2; Neimark & Fufaev, *Dynamics of Nonholonomic Systems*, ch. V;
 Meijaard, Papadopoulos, Ruina & Schwab, *Proc. R. Soc. A* 463 (2007) 1955, Appendix B (linearised velocity constraints).
 
-*Kinds of forces.* `linearise.py` has the derivation. The matrix that multiplies velocities has an antisymmetric part,
+*Kinds of forces.* The matrix that multiplies velocities has an antisymmetric part,
 which is gyroscopic and does no work, and a symmetric part, which damps. The matrix that multiplies positions has a
 symmetric part, the stiffness, and an antisymmetric part, the circulatory one, whose forces can feed in energy without
 limit.

@@ -1,4 +1,6 @@
-"""Where the links of a tree are and how they move: outward from the ground, each from its parent.
+"""Where the links of a tree are, how they move and what acts on them; their accelerations by recursion.
+
+*The motion*: outward from the ground, each link from its parent.
 
     R = R_p E,      r = r_p + R_p o + R b',      ω = ω_p + R_p ω_j,      ṙ = ṙ_p + ω_p × R_p o + R_p v_j + ω × R b'
 
@@ -11,22 +13,55 @@ and no constraint holds it:
     Ω = 2 vec(ė e*) / |e|²,      ṡ = 2 e·ė / |e|²,      ė = ½ (Ω + ṡ) e,      ë = ½ (Ω̇ + s̈) e + ½ (Ω + ṡ) ė
 
 Source: Featherstone, *Rigid Body Dynamics Algorithms*, §4.4 and Table 5.1.
+
+**Loads** on the bodies of a tree: functions of joint coordinates, and moments and forces on the bodies' centres.
+
+A load reads `q[body.name]` as the body's pose; here it reads the pose that the joint coordinates give, and any other
+name as the joint coordinate of that name. The derivatives of a potential by a body's pose are a force and, by
+
+    N = Σ R_i × ∂V/∂R_i = ∂V/∂Ω,      since Ṙ_i = Ω × R_i for the columns of R,
+
+a moment: so a potential costs its own derivative, not that of the way to the links. By a quaternion it is
+½ vec(∂V/∂e e*), since ė = ½ Ω e.
+
+**The accelerations** by the articulated-body recursion, in time that grows as the number of links.
+
+Seen from its parent, a link with all that hangs on it acts as one body, whose force is f = I a + p. Inward, from the
+ends of the branches to the ground, the link's own inertia and that of its children are added up, and what its joint
+lets go is taken out; outward the accelerations follow:
+
+    D = Sᵀ I S,     u = τ - Sᵀ p,     I_a = I - I S D⁻¹ Sᵀ I,     p_a = p + I_a c + I S D⁻¹ u           (inward)
+    I_p += Xᵀ I_a X,     p_p += Xᵀ p_a
+    ẇ = D⁻¹ (u - Sᵀ I (X a_p + c)),     a = X a_p + c + S ẇ                                              (outward)
+
+a = (ω̇, r̈) is that of the centre of mass, along the axes of space, so that X is a shift by d = r - r_p, and c what the
+velocities alone accelerate:
+
+    X a_p = (ω̇_p, r̈_p + ω̇_p × d),     c = (γ, ω_p × (ω_p × o) + 2 ω_p × v_j + γ × b' + ω × (ω × b')),     γ = ω_p × ω_j
+
+S has a column for each freedom of the joint. A column of zeros stands for one that is not there, with D = 1. A rotor
+that turns with a joint has an inertia on its diagonal of D, and no part in what the joint passes on. A free body has
+a = -I⁻¹ p; one that moves as given has its acceleration for c.
+
+Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes; §9.6 (rotors).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial, reduce
 from operator import add
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.bodies.body import Pose
-from lagjax.bodies.rotation import conjugate, product, rotation_matrix
-from lagjax.bodies.tree.geometry import FixedNumbers, Geometry, LinkNumbers
+from lagjax.bodies.body import Pose, PoseOnTree, conjugate, product, quaternion_of, rotation_matrix, valued
+from lagjax.bodies.links import FixedNumbers, Geometry, LinkNumbers
+from lagjax.bodies.loads import Load, Weight
+from lagjax.numerics import dense
 
 # So few links are written out, one by one; more of them in a loop.
 FEW = 3
@@ -316,3 +351,168 @@ def placing(
     columns = jnp.concatenate([joints.turn, joints.offset[:, :, None]], axis=2)
     found, _ = outward(geometry, given.fixed, link_of, ground, (columns, joints.arm))
     return found[:, :, 3], found[:, :, :3]
+
+
+class Placed(eqx.Module):
+    """What loads and closures read as q or v: bodies by name as poses, all else as it is in the tree's own q or v."""
+
+    geometry: Geometry = eqx.field(static=True)
+    poses: PoseOnTree
+    others: PyTree
+
+    def __getitem__(self, name: str) -> Any:
+        place = self.geometry.body_at.get(name)
+        return self.others[name] if place is None else jax.tree.map(lambda x: x[place], self.poses)
+
+
+def poses_of(centre: Float[Array, "n 3"], turn: Float[Array, "n 3 3"]) -> PoseOnTree:
+    """The poses of all links, stacked."""
+    return PoseOnTree(centre, _quaternions(turn), turn)
+
+
+# Jitted, as it is traced wherever poses are read, and rarely used.
+_quaternions = jax.jit(jax.vmap(quaternion_of))
+
+
+def potential(geometry: Geometry, given: LinkNumbers, loads: Iterable[Load], motion: LinkMotion, state: tuple) -> Array:
+    """V of all loads."""
+    weights, others = _sorted(loads)
+    total = -jnp.sum(_weights(geometry, given, weights, state[-1]) * motion.centre)
+    return total + _of_poses(geometry, others, poses_of(motion.centre, motion.turn), state) if others else total
+
+
+def wrenches(
+    geometry: Geometry, given: LinkNumbers, loads: Iterable[Load], motion: LinkMotion, state: tuple
+) -> Float[Array, "n 6"]:
+    """Moments and forces of the loads' potentials on the centres of links."""
+    weights, others = _sorted(loads)
+    force = _weights(geometry, given, weights, state[-1])
+    moment = jnp.zeros_like(force)
+    if others:
+        place = motion.centre, motion.turn
+        pull, slope = jax.grad(lambda place: _of_poses(geometry, others, poses_of(*place), state))(place)
+        # Their columns as rows.
+        columns, slopes = (jnp.swapaxes(x, 1, 2) for x in (motion.turn, slope))
+        force, moment = force - pull, moment - jnp.sum(cross(columns, slopes), axis=1)
+    return jnp.concatenate([moment, force], axis=1)
+
+
+def _sorted(loads: Iterable[Load]) -> tuple[list[Weight], list[Callable]]:
+    """Weights, whose forces are known without a derivative, and the other potentials."""
+    given = [load.potential for load in loads if load.potential is not None]
+    return [x for x in given if isinstance(x, Weight)], [x for x in given if not isinstance(x, Weight)]
+
+
+def _of_poses(geometry: Geometry, potentials: Sequence[Callable], poses: PoseOnTree, state: tuple) -> Array:
+    t, q, v, params = state
+    return jnp.asarray(sum(x(t, Placed(geometry, poses, q), v, params) for x in potentials))
+
+
+def moments(e: Float[Array, "m 4"], slope: Float[Array, "m 4"]) -> Float[Array, "m 3"]:
+    """½ vec(slope e*): the derivative by Ω of what has this derivative by ė."""
+    return jax.vmap(product)(slope, jax.vmap(conjugate)(e))[:, 1:] / 2
+
+
+def _weights(geometry: Geometry, given: LinkNumbers, weights: Sequence[Weight], params: PyTree) -> Float[Array, "n 3"]:
+    total = jnp.zeros((geometry.n, 3), given.mass.dtype)
+    for weight in weights:
+        field, bodies = jnp.asarray(valued(weight.g, params), total.dtype), set(weight.bodies)
+        pulled = np.array([link.body in bodies for link in geometry.links], total.dtype)
+        total = total + (pulled * given.mass)[:, None] * field[None]
+    return total
+
+
+class Accelerated(NamedTuple):
+    """Accelerations of joints (n, k), zero for freedoms that are not there; of links, angular ones and those of centres
+    (n, 6)."""
+
+    joints: Float[Array, "n k"]
+    links: Float[Array, "n 6"]
+
+
+def accelerated(
+    geometry: Geometry, given: LinkNumbers, motion: LinkMotion, torque: Float[Array, "n k"], wrench: Float[Array, "n 6"]
+) -> Accelerated:
+    """The accelerations under forces `torque` of joints, and moments and forces on centres of mass, `wrench`."""
+    dtype = motion.turn.dtype
+    turns, slides = (x[:, None, :] for x in (given.fixed.turns, given.fixed.slides))
+    spin, arm, joint_spin = motion.spin, motion.arm, motion.joint_spin
+    before = spin - joint_spin
+    twist = turns * motion.axes
+    levered = jnp.swapaxes(cross(jnp.swapaxes(twist, 1, 2), arm[:, None, :]), 1, 2)
+    freedoms = jnp.concatenate([twist, levered + slides * motion.axes], axis=1)
+    beside = (1 - turns - slides)[:, 0, :] + given.armature
+    gamma = cross(before, joint_spin)
+    centripetal = cross(gamma, arm) + cross(spin, cross(spin, arm)) + cross(before, cross(before, motion.offset))
+    if geometry.slides.any() or geometry.free.any():
+        centripetal = centripetal + 2 * cross(before, motion.joint_slide)
+    bias = jnp.concatenate([gamma, centripetal], axis=1)
+    if given.driven is not None:
+        bias = jnp.where(geometry.driven[:, None], given.driven.acceleration, bias)
+    inertia = times(times(motion.turn, given.inertia), jnp.swapaxes(motion.turn, 1, 2))
+    gyroscopic = cross(spin, applied(inertia, spin))
+    mass = given.mass[:, None, None] * jnp.eye(3, dtype=dtype)[None]
+    zero = jnp.zeros_like(inertia)
+    own = jnp.concatenate([jnp.concatenate([inertia, zero], axis=2), jnp.concatenate([zero, mass], axis=2)], axis=1)
+    # The last column is p.
+    load = jnp.concatenate([gyroscopic, jnp.zeros_like(gyroscopic)], axis=1) - wrench
+    own = jnp.concatenate([own, load[:, :, None]], axis=2)
+    shift = motion.offset + arm
+    has_free = bool(geometry.free.any())
+
+    def inward_link(children: Array | None, x: tuple, at_ground: bool) -> tuple[Array | None, tuple]:
+        own, freedoms, bias, shift, torque, beside = x
+        both = own if children is None else own + children
+        articulated, load = both[:, :6], both[:, 6]
+        pushed = times(articulated, freedoms)
+        solve = _inverse(times(freedoms.T, pushed) + jnp.diag(beside))
+        force = torque - applied(freedoms.T, load)
+        rows = times(solve, pushed.T)
+        found = rows, applied(solve, force), both if has_free else ()
+        if at_ground:
+            return None, found
+        passed = articulated - times(pushed, rows)
+        along = load + applied(passed, bias) + applied(rows.T, force)
+        return _shifted(jnp.concatenate([passed, along[:, None]], axis=1), shift), found
+
+    given_inward = own, freedoms, bias, shift, torque, beside
+    rows, force, every = inward(geometry, given.fixed, inward_link, jnp.zeros((6, 7), dtype), given_inward)
+
+    free = jnp.zeros((geometry.n, 6), dtype)
+    if has_free:
+        places = [i for i in range(geometry.n) if geometry.free[i]]
+        for i in places:
+            solved = dense.solve(every[i, :, :6], -every[i, :, 6])
+            free = free + (jnp.arange(geometry.n) == i)[:, None] * solved[None]
+
+    def outward_link(parent: Array | None, x: tuple) -> tuple[Array, Array]:
+        rows, force, freedoms, bias, shift, free = x
+        carried = bias + free
+        if parent is not None:
+            leaning = jnp.concatenate([jnp.zeros(3, dtype), cross(parent[:3], shift)])
+            carried = carried + parent + leaning
+        joint = force - applied(rows, carried)
+        return carried + applied(freedoms, joint), joint
+
+    given_outward = rows, force, freedoms, bias, shift, free
+    links, joints = outward(geometry, given.fixed, outward_link, jnp.zeros(6, dtype), given_outward)
+    return Accelerated(joints, links)
+
+
+def _shifted(body: Float[Array, "6 7"], d: Float[Array, "3"]) -> Float[Array, "6 7"]:
+    """Xᵀ I X and Xᵀ p, side by side."""
+    x, y, z = d
+    zero = jnp.zeros_like(x)
+    crossed = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    # Forces at r are, at r_p, the same forces and moments about it; columns of Xᵀ I belong to accelerations at r.
+    body = jnp.concatenate([body[:3] + times(crossed, body[3:]), body[3:]], axis=0)
+    return jnp.concatenate([body[:, :3] - times(body[:, 3:6], crossed), body[:, 3:]], axis=1)
+
+
+def _inverse(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    if matrix.shape[0] == 1:
+        return 1 / matrix
+    rows = jnp.stack(
+        [jnp.cross(matrix[1], matrix[2]), jnp.cross(matrix[2], matrix[0]), jnp.cross(matrix[0], matrix[1])]
+    )
+    return rows.T / applied(matrix[:1], rows[0])[0]

@@ -12,29 +12,30 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.bodies.assemble import usual_shapes
-from lagjax.bodies.body import Body, Pose, PoseOnTree, SystemFunction, check_bodies, floats
-from lagjax.bodies.driven import OfPlaced
+from lagjax.bodies.body import Body, OfPlaced, Pose, PoseOnTree, SystemFunction, check_bodies, floats, product
 from lagjax.bodies.joints import named
+from lagjax.bodies.links import Geometry, LinkNumbers, check_armature, links_of
 from lagjax.bodies.loads import Acting, Load, check_loads
-from lagjax.bodies.rotation import product
-from lagjax.bodies.tree.geometry import Geometry, LinkNumbers
-from lagjax.bodies.tree.links import check_armature, links_of
-from lagjax.bodies.tree.loads_on_links import Placed, moments, poses_of, potential, wrenches
-from lagjax.bodies.tree.motion import (
+from lagjax.bodies.motion import (
     Coordinates,
     LinkMotion,
+    Placed,
+    accelerated,
     applied,
     flat,
     growth,
     joint_rates,
+    moments,
     moving,
     numbers_of_links,
     of_links,
     placing,
+    poses_of,
+    potential,
     spins,
     unflat,
+    wrenches,
 )
-from lagjax.bodies.tree.recursion import accelerated
 from lagjax.display import Drawing, Shape
 from lagjax.jaxtools import to_jax
 from lagjax.system import Holonomic, Nonholonomic, System

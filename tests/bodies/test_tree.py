@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies.tree.links import slots_of
+from lagjax.bodies.links import slots_of
 from lagjax.jaxtools import equations
 from lagjax.system.traced import TracedProgram
 from tests.by_numpy import by_numpy
