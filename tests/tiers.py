@@ -13,7 +13,7 @@ NAMES = """
     numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting sweep.sweep.sweep
     system.constraints.CompliantContact system.constraints.Contact system.constraints.SampledControl
     system.hybrid.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
-    two_points.optimal_control.steer two_points.steering.Steering two_points.tracking.TrackingLQR
+    two_points.optimal_control.steer two_points.regulators.TrackingLQR two_points.steering.Steering
     work_precision.work_precision.horizons work_precision.work_precision.work_precision
 """
 SLOW_EXAMPLES = {f"lagjax.{name}" for name in NAMES.split()}

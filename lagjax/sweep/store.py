@@ -13,8 +13,8 @@ belong there. Files are compared with their marks in two ways:
   bytes per file, and detects files that are missing, cut off, or of another block;
 - a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
 
-Any other damage is detected when values are read. Files are read and written without zarr, and nothing outside of the store
-is, whatever its description says (`metadata`); opening a store writes nothing.
+Any other damage is detected when values are read. Files are read and written without zarr, and nothing outside of the
+store is, whatever its description says (`metadata`); opening a store writes nothing.
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
 blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.

@@ -1,4 +1,4 @@
-"""What is asked of `steer`, checked: ends, times, controls, bounds and costs by the user's names."""
+"""The optimal-control problem of `steer`, checked: ends, times, controls, bounds and costs by the user's names."""
 
 import difflib
 from collections.abc import Callable, Mapping

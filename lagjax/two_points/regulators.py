@@ -1,6 +1,7 @@
-"""The linear-quadratic regulator: the feedback that costs least near an equilibrium.
+"""The linear-quadratic regulators, the feedback that costs least: near an equilibrium, and about a trajectory.
 
-With δx = (δq, δv) and δu about an equilibrium, the equations of motion and the cost are, to the lowest order,
+*Near an equilibrium.* With δx = (δq, δv) and δu about an equilibrium, the equations of motion and the cost are, to the
+lowest order,
 
     δẋ = A δx + B δu,    J = ∫ δxᵀ Q δx + δuᵀ R δu + 2 δxᵀ N δu dt
 
@@ -10,29 +11,327 @@ and the least J from δx is δxᵀ S δx, by δu = -K δx with K = R⁻¹ (Bᵀ 
 
 A and B are derivatives of the accelerations, Q, R and N halves of second derivatives of the cost. On holonomic
 constraints δq and δv are the displacements that these allow, T η and T ω with Tᵀ T = 1; at rest T does not change. A
-slope of the cost along their normals then has a part in Q (`linear_quadratic.py`).
+slope of the cost along their normals then has a part in Q.
 
 Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.4; SciPy's `solve_continuous_are`.
+
+*About a trajectory*: the feedback that brings a motion back to it.
+
+With δx = (δq, δv) and δu about a motion x₀(t) under controls u₀(t), and A, B, Q, R, N along it as at an equilibrium,
+the least of ∫ δxᵀ Q δx + δuᵀ R δu + 2 δxᵀ N δu dt + δx_bᵀ F δx_b from δx on is δxᵀ S(t) δx, by
+
+    δu = -K δx,    K = R⁻¹ (Bᵀ S + Nᵀ),    -Ṡ = Aᵀ S + S A - (S B + N) R⁻¹ (Bᵀ S + Nᵀ) + Q,    S(t_b) = F
+
+S = Y X⁻¹ for solutions of Hamilton's equations of the deviations, which are linear:
+
+    Ẋ = (A - B R⁻¹ Nᵀ) X - B R⁻¹ Bᵀ Y,    Ẏ = -(Q - N R⁻¹ Nᵀ) X - (A - B R⁻¹ Nᵀ)ᵀ Y
+
+They are solved by Gauss's collocation, of order 2s for s points, from each element's end, X = 1, Y = S, to its start.
+What constraints allow is kept by the accelerations that A and B are derivatives of, and so the other directions do not
+enter; the weights have what a deviation bends by on them.
+
+Source: Kwakernaak & Sivan, *Linear Optimal Control Systems*, §3.3; Hairer, Lubich & Wanner, *Geometric Numerical
+Integration*, §II.1.3 (Gauss's collocation).
+
+*What both take from a system and a cost*: derivatives of accelerations, and second derivatives.
+
+On constraints a deviation is no straight line. With G = ∂g/∂q and its pseudoinverse G⁺, what g = 0 bends it by is
+
+    q = q₀ + δq + q₂,    q₂ = -½ G⁺ g''(δq, δq),    v = v₀ + δv + v₂,    v₂ = dq₂/dt
+
+to the second order, and by A⁺ as much more of v₂ as velocity constraints with A = ∂phi/∂v ask for. A cost with slopes
+c_q, c_v has second derivatives to which those of c_q·q₂ + c_v·v₂ are added; for a slope along the normal, c_q = Gᵀ λ,
+they are -λ·g'', as everywhere on a manifold.
+
+Source: Nocedal & Wright, *Numerical Optimization*, §12.5 (the second-order condition).
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 from scipy.linalg import solve_continuous_are
 
 from lagjax.integrate import ENDED_WELL, Trajectory, is_among
 from lagjax.jaxtools import compiled, to_jax
+from lagjax.mechanics import accelerations_at
 from lagjax.numerics import null_space
-from lagjax.system import System, check_system, constraints, coordinates, unchecked
-from lagjax.two_points.linear_quadratic import check_weights, linear
-from lagjax.two_points.question import checked_cost, controlled, velocity_name
-from lagjax.two_points.tracking import TrackingLQR, about_trajectory
+from lagjax.system import (
+    OF_STATE,
+    Call,
+    Form,
+    State,
+    System,
+    check_system,
+    constraints,
+    coordinates,
+    traced_call,
+    unchecked,
+)
+from lagjax.two_points.control_problem import Controlled, check_number, checked_cost, controlled, velocity_name
+from lagjax.two_points.elements import Rule, integrals, rule_of_degree
+from lagjax.two_points.steering import Plan, plan_of
+
+# Rows of constraints with smaller singular values, relative, say nothing that others do not.
+DEPENDENT = 1e-10
+
+
+@compiled
+def linear(given: Controlled, cost: Callable, x: Array, u: Array, w: Array):
+    """The accelerations with their derivatives, and the first and second derivatives of the cost."""
+    form: Form = given.form
+
+    def a(x: Array, u: Array, w: Array):
+        model = unchecked(given.system, given.merge(given.state.params, coordinates.like(given.controls, w)), form)
+        s = State(given.state.t, form.tree(x), form.tree(u), model.params)
+        return coordinates.flatten(accelerations_at(model, s)[0])[0]
+
+    def of_all(y: Array):
+        x, u, w = jnp.split(y, (form.n, 2 * form.n))
+        s = given.state
+        return cost(s.t, form.tree(x), form.tree(u), coordinates.like(given.controls, w), s.params)
+
+    y = jnp.concatenate([x, u, w])
+    slope, curvature = jax.grad(of_all)(y), jax.hessian(of_all)(y)
+    if form.m:
+        states = 2 * form.n
+        more = bent(given, x, u, w, slope[:states])
+        curvature = curvature.at[:states, :states].add(more)
+    return a(x, u, w), jax.jacfwd(a, argnums=(0, 1, 2))(x, u, w), slope, curvature
+
+
+def bent(given: Controlled, x: Array, u: Array, w: Array, slope: Array) -> Float[Array, "m m"]:
+    """What constraints add to the second derivatives (2n, 2n) of a cost with this slope (2n,) in x and u."""
+    model = unchecked(given.system, given.merge(given.state.params, coordinates.like(given.controls, w)), given.form)
+    t, n = given.state.t, given.form.n
+
+    def g(t: Array, x: Array) -> Array:
+        return constraints.position_residual(model, t, x)
+
+    def second(t: Array, x: Array, dx: Array) -> Array:
+        """q₂."""
+        rows = jax.jacfwd(g, argnums=1)(t, x)
+        bends = jax.jvp(lambda x: jax.jvp(lambda x: g(t, x), (x,), (dx,))[1], (x,), (dx,))[1]
+        return -0.5 * jnp.linalg.pinv(rows, rtol=DEPENDENT) @ bends
+
+    def rates(x: Array, u: Array) -> Array:
+        return constraints.velocity_residual(model, t, x, u)
+
+    def of_deviation(d: Array) -> Array:
+        dx, du = d[:n], d[n:]
+        q_2, v_2 = jnp.zeros_like(x), jnp.zeros_like(x)
+        if model.holonomic.any():
+            q_2, v_2 = jax.jvp(second, (t, x, dx), (jnp.ones_like(t), u, du))
+        if not model.holonomic.all():
+            along = jax.jvp(lambda x, u: jax.jvp(rates, (x, u), (dx, du))[1], (x, u), (dx, du))[1]
+            off = 0.5 * along + jax.jvp(rates, (x, u), (q_2, v_2))[1]
+            v_2 = v_2 - jnp.linalg.pinv(jax.jacfwd(rates, argnums=1)(x, u), rtol=DEPENDENT) @ off
+        return slope[:n] @ q_2 + slope[n:] @ v_2
+
+    return jax.hessian(of_deviation)(jnp.zeros_like(slope))
+
+
+def check_weights(weights: np.ndarray, names: list[str]):
+    """Raise for a control that costs nothing."""
+    values, vectors = np.linalg.eigh(weights)
+    if values[0] <= 1e-12 * max(values[-1], 0.0):
+        name = names[int(np.argmax(np.abs(vectors[:, 0])))]
+        raise ValueError(
+            f"the control '{name}' costs nothing, and the least cost would take it without limit.\n"
+            f'Fix: + 1e-3 * u["{name}"] ** 2 in the cost.'
+        )
+
+
+# Points on an element; elements at first and at most; and the change of S by which halving them ends, relative.
+POINTS, FIRST, MOST, SETTLED = 4, 32, 1024, 1e-8
+# Points that are treated together.
+TOGETHER = 128
+
+
+class TrackingLQR(eqx.Module):
+    """The feedback u = u₀(t) - K(t) (x - x₀(t)) about a motion, x = (q, v).
+
+    >>> import lagjax as lj
+    >>> cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"] + 0.0 * v)
+    >>> rolling = lj.integrate(cart, 0.0, 1.0, {"push": 0.0}, ts=[0.0, 20.0])
+    >>> held = lj.lqr(cart, lambda t: {"push": 0.0}, rolling, lambda t, q, v, u, p: q**2 + u["push"] ** 2)
+    >>> print(held.control(0.0, 1.0, 1.0)["push"].round(6))  # 1 ahead, long before the end
+    -1.0
+
+    - `control(t, q, v)`: the controls at a time and state, by name, also inside JAX programs; after the end with x₀,
+      u₀ and K of the end.
+    - `gain(t)` K (k, 2n): rows in the order of the controls, columns in that of `names`, coordinates, then velocities.
+    - `cost_to_go` S (2n, 2n) at the start: δxᵀ S δx is the cost of a deviation, to the lowest order.
+    - `knots`: the times between which gains are one polynomial, `[t]`; `change`: the change of S by halving them last,
+      relative.
+    """
+
+    pieces: Plan
+    controls: Callable
+    cost_to_go: Float[Array, "m m"]
+    change: float
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def knots(self) -> np.ndarray:
+        return self.pieces.knots
+
+    def gain(self, t: ArrayLike) -> Float[Array, "k m"]:
+        """K at a time."""
+        return self.pieces(self._within(t))["gain"]
+
+    def control(self, t: ArrayLike, q: PyTree, v: PyTree) -> PyTree:
+        """The controls at a time and a state, in the structure of those that are given."""
+        t = self._within(t)
+        along, (held, back) = self.pieces(t), ravel_pytree(jax.tree.map(jnp.asarray, self.controls(t)))
+        x = jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
+        return back(held - along["gain"] @ (x - along["state"]))
+
+    def _within(self, t: ArrayLike) -> Array:
+        return jnp.clip(jnp.asarray(t, self.pieces.starts.dtype), self.knots[0], self.knots[-1])
+
+    def __repr__(self):
+        return (
+            f"TrackingLQR of {', '.join(self.names)} from t = {self.knots[0]:.6g} to {self.knots[-1]:.6g}; "
+            f"{len(self.knots) - 1} pieces, and S changed by {self.change:.0e} when they were halved"
+        )
+
+
+def about_trajectory(
+    given: Controlled, controls: Callable, trajectory: Trajectory, cost: Callable, end_cost: Callable | None
+) -> TrackingLQR:
+    """The regulator about a motion, on elements halved until S at its start no longer changes."""
+    names = coordinates.names(given.state.q)
+    names = (*names, *(velocity_name(name) for name in names))
+    end = _end_weights(given, controls, trajectory, end_cost)
+    first, last = float(trajectory.t[0]), float(trajectory.end.t)
+    knots = np.unique(np.clip([first, *np.asarray(getattr(controls, "knots", ())), last], first, last))
+    knots = _divided(knots, max(1, -(-FIRST // (len(knots) - 1))))
+    before, change = None, np.inf
+    while True:
+        pieces, s = _regulated(given, controls, trajectory, cost, knots, end)
+        if before is not None:
+            change = float(np.max(np.abs(s - before)) / max(np.max(np.abs(s)), np.finfo(float).tiny))
+        if not np.all(np.isfinite(s)):
+            raise ValueError(
+                "the cost of deviations has no least value: it grows without limit toward the start.\n"
+                "Usual cause: a cost that rewards to depart, as -q**2 or a cosine about its maximum.\n"
+                "Fix: squares of q, v and u; the gradient of the cost along the motion does not matter."
+            )
+        if change < SETTLED or 2 * (len(knots) - 1) > MOST:
+            return TrackingLQR(pieces, controls, jnp.asarray(s), change, names)
+        before, knots = s, _divided(knots, 2)
+
+
+def _divided(knots: np.ndarray, parts: int) -> np.ndarray:
+    inner = knots[:-1, None] + np.diff(knots)[:, None] * np.arange(parts) / parts
+    return np.append(inner.ravel(), knots[-1])
+
+
+def _regulated(given: Controlled, controls: Callable, trajectory: Trajectory, cost: Callable, knots: np.ndarray, end):
+    """K and x₀ on elements between knots, and S at the start."""
+    rule, h = rule_of_degree(POINTS), np.diff(knots)
+    t = knots[:-1, None] + h[:, None] * rule.points
+    x, u = _together(partial(_states, trajectory), t.ravel())
+    w = np.stack([coordinates.vector(controls(t)) for t in t.ravel()])
+    a, b, weights = _along(given, cost, t.ravel(), x, u, w)
+    k, m = w.shape[1], 2 * x.shape[1]
+    q, cross, r = weights[:, :m, :m], weights[:, :m, m:], weights[:, m:, m:]
+    for matrix in r:
+        check_weights(matrix, coordinates.names(given.controls))
+    left = np.linalg.solve(r, np.concatenate([cross.transpose(0, 2, 1), b.transpose(0, 2, 1)], axis=2))
+    by_cross, by_b = left[..., :m], left[..., m:]
+    a_less = a - b @ by_cross
+    hamiltonian = np.block([[a_less, -b @ by_b], [-(q - cross @ by_cross), -a_less.transpose(0, 2, 1)]])
+    hamiltonian = hamiltonian.reshape(len(h), POINTS, 2 * m, 2 * m)
+    gains, s = np.empty((len(h), POINTS, k, m)), end
+    for e in reversed(range(len(h))):
+        at_points, start = _back(rule, h[e], hamiltonian[e], np.concatenate([np.eye(m), s]))
+        inside = np.linalg.solve(at_points[:, :m].transpose(0, 2, 1), at_points[:, m:].transpose(0, 2, 1))
+        gains[e] = by_b.reshape(len(h), POINTS, k, m)[e] @ inside + by_cross.reshape(len(h), POINTS, k, m)[e]
+        s = np.linalg.solve(start[:m].T, start[m:].T)
+        s = (s + s.T) / 2
+    example = {"gain": np.zeros((k, m)), "state": np.zeros(m)}
+    rows = np.concatenate([gains.reshape(len(h), POINTS, -1), np.concatenate([x, u], 1).reshape(len(h), POINTS, -1)], 2)
+    limits = np.full((2, rows.shape[2]), np.inf) * np.array([[-1.0], [1.0]])
+    return plan_of(knots, rows, limits, example, rule.points, len(h)), s
+
+
+def _back(rule: Rule, h: float, matrices: np.ndarray, end: np.ndarray):
+    """The solution of ẏ = H y at Gauss's points and at the start, from the end of an element."""
+    size = end.shape[0]
+    # y_i = y_b - h Σ_j (∫_{c_i}^{1} l_j) ẏ_j, and ẏ_j = H_j y_j.
+    reach = -integrals(rule.points, np.ones(POINTS))
+    system = np.eye(len(reach) * size) + h * np.einsum("ij,jab->iajb", reach, matrices).reshape(
+        (len(reach) * size,) * 2
+    )
+    inside = np.linalg.solve(system, np.tile(end, (len(reach), 1))).reshape(len(reach), size, -1)
+    return inside, end - h * np.einsum("j,jab,jbc->ac", rule.weights, matrices, inside)
+
+
+def _together(function: Callable, *arrays: np.ndarray):
+    """A function of many points, some at a time: one program serves any number of them."""
+    count, found = len(arrays[0]), []
+    for i in range(0, count, TOGETHER):
+        more = max(0, i + TOGETHER - count)
+        part = (np.concatenate([x[i : i + TOGETHER], np.repeat(x[-1:], more, axis=0)]) for x in arrays)
+        found.append(jax.tree.map(np.asarray, function(*part)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
+
+
+def _states(trajectory: Trajectory, t: np.ndarray) -> list[np.ndarray]:
+    now = trajectory.at(t)
+    return [np.concatenate([np.reshape(y, (len(t), -1)) for y in jax.tree.leaves(x)], axis=1) for x in (now.q, now.v)]
+
+
+def _along(given: Controlled, cost: Callable, *states: np.ndarray):
+    """A (T, 2n, 2n), B (T, 2n, k) and the halves of the cost's second derivatives at times (T,) and states."""
+    (by_q, by_v, by_w), weights = _together(partial(_derivatives, given, cost), *states)
+    count, n = by_q.shape[:2]
+    upper = np.broadcast_to(np.concatenate([np.zeros((n, n)), np.eye(n)], axis=1), (count, n, 2 * n))
+    a = np.concatenate([upper, np.concatenate([by_q, by_v], axis=2)], axis=1)
+    return a, np.concatenate([np.zeros_like(by_w), by_w], axis=1), weights / 2
+
+
+@compiled
+def _derivatives(given: Controlled, cost: Callable, t: Array, x: Array, u: Array, w: Array):
+    def at(t: Array, x: Array, u: Array, w: Array):
+        now = eqx.tree_at(lambda given: given.state.t, given, t)
+        _, slopes, _, weights = linear(now, cost, x, u, w)
+        return slopes, weights
+
+    return jax.vmap(at)(t, x, u, w)
+
+
+def _end_weights(
+    given: Controlled, controls: Callable, trajectory: Trajectory, end_cost: Callable | None
+) -> np.ndarray:
+    """F."""
+    n, end = given.form.n, trajectory.end
+    if end_cost is None:
+        return np.zeros((2 * n, 2 * n))
+    call = traced_call(Call("end_cost", end_cost, OF_STATE), given.state._asdict(), check_number)
+    y = jnp.concatenate([coordinates.flatten(end.q)[0], coordinates.flatten(end.v)[0]])
+    w = jnp.asarray(coordinates.vector(controls(end.t)))
+    now = eqx.tree_at(lambda given: given.state.t, given, jnp.asarray(end.t))
+    return np.asarray(_of_end(now, call, y, w)) / 2
+
+
+@compiled
+def _of_end(given: Controlled, cost: Callable, y: Array, w: Array) -> Float[Array, "m m"]:
+    form, s, n = given.form, given.state, given.form.n
+
+    def of_state(y: Array) -> Array:
+        return cost(s.t, form.tree(y[:n]), form.tree(y[n:]), s.params)
+
+    found = jax.hessian(of_state)(y)
+    return found + bent(given, y[:n], y[n:], w, jax.grad(of_state)(y)) if form.m else found
+
 
 # Accelerations, in units of what a displacement of one brings about, below which a state is an equilibrium.
 STEADY_BELOW = 1e-6
@@ -120,7 +419,7 @@ def lqr(
     """
     check_system(system, states=False)
     if isinstance(state, Trajectory):
-        return _along(system, controls, state, cost, params, end_cost, with_control)
+        return _along_trajectory(system, controls, state, cost, params, end_cost, with_control)
     if end_cost is not None:
         raise ValueError("end_cost belongs to a trajectory, and an equilibrium has no end.\nFix: leave it out.")
     q, v = state
@@ -174,7 +473,7 @@ def lqr(
     return LQR(*found, values, to_jax(np.concatenate([x, u])), given.controls, names)
 
 
-def _along(system, controls, trajectory, cost, params, end_cost, with_control) -> TrackingLQR:
+def _along_trajectory(system, controls, trajectory, cost, params, end_cost, with_control) -> TrackingLQR:
     """The regulator about a trajectory."""
     if not callable(controls):
         raise TypeError(
