@@ -151,49 +151,21 @@ from .system import PrecisionWarning as PrecisionWarning
 
 # isort: split
 # Analysis of a system.
-from .analysis.continuation import (
-    continue_equilibria as continue_equilibria,
-)
-from .analysis.continuation import (
-    continue_orbits as continue_orbits,
-)
+from .analysis.branches import continue_equilibria as continue_equilibria
+from .analysis.cycles import continue_orbits as continue_orbits
 from .analysis.equilibria import equilibria as equilibria
-from .analysis.formulations import (
-    action as action,
-)
-from .analysis.formulations import (
-    hamiltonian as hamiltonian,
-)
-from .analysis.formulations import (
-    latex as latex,
-)
-from .analysis.formulations import (
-    routhian as routhian,
-)
-from .analysis.modes import (
-    linearise as linearise,
-)
-from .analysis.modes import (
-    normal_modes as normal_modes,
-)
-from .analysis.orbits import (
-    OrbitWarning as OrbitWarning,
-)
-from .analysis.orbits import (
-    floquet as floquet,
-)
-from .analysis.orbits import (
-    lyapunov_exponents as lyapunov_exponents,
-)
-from .analysis.orbits import (
-    periodic_orbit as periodic_orbit,
-)
-from .analysis.symmetry import (
-    is_symmetry as is_symmetry,
-)
-from .analysis.symmetry import (
-    symmetries as symmetries,
-)
+from .analysis.exponents import floquet as floquet
+from .analysis.exponents import lyapunov_exponents as lyapunov_exponents
+from .analysis.formulations import action as action
+from .analysis.formulations import hamiltonian as hamiltonian
+from .analysis.formulations import routhian as routhian
+from .analysis.latex import latex as latex
+from .analysis.linearise import linearise as linearise
+from .analysis.normal_modes import normal_modes as normal_modes
+from .analysis.periodic_orbit import OrbitWarning as OrbitWarning
+from .analysis.periodic_orbit import periodic_orbit as periodic_orbit
+from .analysis.symmetry_search import symmetries as symmetries
+from .analysis.symmetry_test import is_symmetry as is_symmetry
 
 # isort: split
 # Two points.

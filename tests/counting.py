@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax.monitoring
 
-from lagjax.jaxtools.compiled import are_known
+from lagjax.jaxtools.cache import are_known
 
 # Fewer operations make a kernel; where they cannot be counted, fewer seconds.
 OPERATIONS, SECONDS = 250, 0.25

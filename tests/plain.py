@@ -2,6 +2,6 @@
 
 import pytest
 
-from lagjax.jaxtools.plain import is_plain
+from lagjax.jaxtools.tracing import is_plain
 
 not_plain = pytest.mark.skipif(is_plain(), reason="LAGJAX_PLAIN=1 rewrites nothing")

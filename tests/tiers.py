@@ -4,18 +4,17 @@ import pytest
 
 # Examples of docstrings that compile programs of their own, for 2 to 10 s.
 NAMES = """
-    analysis.continuation.equilibria.continue_equilibria
-    analysis.energy.energy_ledger analysis.equilibria.equilibria.equilibria analysis.explain.explain
-    analysis.formulations.action.action analysis.orbits.floquet.floquet analysis.orbits.lyapunov.lyapunov_exponents
-    analysis.orbits.periodic_orbit.periodic_orbit analysis.poincare.poincare analysis.poincare.turning_points
-    exchange.standalone_programs.export fit.fit.fit fit.identifiability.identifiability fit.load.load_fit
-    fit.loss.fit_loss fit.loss.fit_residuals integrate.adjoint.replay.Replay integrate.contacts.contacts.touches
-    integrate.events.event.Crossing numerics.methods.gauss.Gauss numerics.methods.nystrom.Nystrom8
-    numerics.methods.radau.Radau5 numerics.methods.splitting.Splitting sweep.sweep.sweep
-    system.elements.CompliantContact system.elements.Contact system.elements.SampledControl system.hybrid.Hybrid
-    two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
-    two_points.optimal_control.steer two_points.steering.Steering two_points.tracking.TrackingLQR
-    work_precision.over_horizons.horizons work_precision.work_precision.work_precision
+    analysis.branches.continue_equilibria analysis.energy.energy_ledger analysis.equilibria.equilibria
+    analysis.explain.explain analysis.exponents.floquet analysis.exponents.lyapunov_exponents
+    analysis.formulations.action analysis.periodic_orbit.periodic_orbit analysis.poincare.poincare
+    analysis.poincare.turning_points exchange.standalone_programs.export fit.fit.fit fit.fit.fit_loss
+    fit.fit.fit_residuals fit.fit.load_fit fit.uncertainty.identifiability integrate.adjoint.replay.Replay
+    integrate.contacts.contacts.touches integrate.events.event.Crossing numerics.radau.Radau5
+    numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting sweep.sweep.sweep
+    system.constraints.CompliantContact system.constraints.Contact system.constraints.SampledControl
+    system.hybrid.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
+    two_points.optimal_control.steer two_points.regulators.TrackingLQR two_points.steering.Steering
+    work_precision.work_precision.horizons work_precision.work_precision.work_precision
 """
 SLOW_EXAMPLES = {f"lagjax.{name}" for name in NAMES.split()}
 

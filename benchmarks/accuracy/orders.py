@@ -25,7 +25,7 @@ from scipy.integrate import solve_ivp
 import lagjax as lj
 from benchmarks.measure import main, row
 from lagjax.mechanisms import double_pendulum
-from lagjax.numerics.methods.radau import SimplifiedNewton
+from lagjax.numerics.radau import SimplifiedNewton
 
 jax.config.update("jax_enable_x64", True)
 

@@ -24,7 +24,7 @@ from jax.flatten_util import ravel_pytree
 
 import lagjax as lj
 from benchmarks.measure import machine, row, versions, written
-from lagjax.fit.problem.residuals import dampened
+from lagjax.fit.residuals import dampened
 from lagjax.integrate.trajectory.results import in_words
 from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions
 

@@ -39,7 +39,7 @@ from jax import lax
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.jaxtools.fuse_cpu import one_function
+from lagjax.jaxtools.fuse import one_function
 
 jax.config.update("jax_enable_x64", True)
 

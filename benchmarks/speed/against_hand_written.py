@@ -21,7 +21,7 @@ import numpy as np
 import lagjax as lj
 from benchmarks.accuracy.by_hand import CASES, DOUBLE_PENDULUM
 from benchmarks.measure import in_turn, main, row, skipped
-from lagjax.jaxtools.fuse_cpu import one_function
+from lagjax.jaxtools.fuse import one_function
 
 try:
     import numba

@@ -11,20 +11,32 @@ What they look like in pictures is in `lj.shapes`.
 """
 
 from lagjax.bodies.assemble import multibody, usual_shapes
-from lagjax.bodies.body import Body, Ground, Marker, Pose, ground
-from lagjax.bodies.gears import gear, rack_and_pinion
+from lagjax.bodies.body import (
+    Body,
+    Ground,
+    Marker,
+    Pose,
+    about,
+    conjugate,
+    ground,
+    product,
+    rotation_matrix,
+    spin_in_body,
+    unit_vector,
+)
 from lagjax.bodies.joints import (
     cylindrical,
     fixed,
+    gear,
     named,
     planar,
     prismatic,
+    rack_and_pinion,
     revolute,
     spherical,
     universal,
 )
 from lagjax.bodies.loads import Load, applied, motor, spring, torsion, weight
-from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_body, unit_vector
 from lagjax.bodies.tree import Tree
 from lagjax.bodies.wheels import Surface, rolling, rolling_ellipsoid, rolling_sphere
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import (
     Body,
+    Driven,
     Pose,
     PoseOnTree,
     SystemFunction,
@@ -21,7 +22,6 @@ from lagjax.bodies.body import (
     together,
     valued,
 )
-from lagjax.bodies.driven import Driven
 from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.display import CUBE, Anchor, Drawing, Shape

@@ -1,8 +1,11 @@
 """Figures, films, progress."""
 
 from lagjax.display import plots
-from lagjax.display.animation import Animation, film, film_scripts
-from lagjax.display.in_space import (
+from lagjax.display.animation import Animation, Still, film, film_scripts
+from lagjax.display.page import Page, encoded, fragment, in_bytes
+from lagjax.display.painting import stills_in_space
+from lagjax.display.plots import COLOURS, DrawnAxes
+from lagjax.display.scenery import (
     CUBE,
     CYLINDER,
     DISK,
@@ -10,15 +13,12 @@ from lagjax.display.in_space import (
     TUBE,
     Anchor,
     Drawing,
+    Faces,
     InSpace,
     Shape,
+    fewer,
     poses_in_q,
-    stills_in_space,
     surface,
+    triangles,
 )
-from lagjax.display.in_space.surfaces import Faces, fewer, triangles
-from lagjax.display.plots import COLOURS, DrawnAxes
-from lagjax.display.printable import by_line, is_plain, printable
-from lagjax.display.progress import meter, waiting
-from lagjax.display.still import Still
-from lagjax.display.web_page.page import Page, encoded, fragment, in_bytes
+from lagjax.display.terminal import by_line, is_plain, meter, printable, waiting

@@ -1,4 +1,4 @@
-"""The closed table of what files may hold besides numbers, text, dicts, lists and tuples (`tree_json.py`).
+"""The closed table of what files may hold besides numbers, text, dicts, lists and tuples (`npz.py`).
 
 A class or a function is looked up here by its package and its own name; a file's name that is not in the table is
 refused, and nothing is imported for it. Each class has the fields that a file may give it. A class that is not listed,
@@ -24,17 +24,17 @@ from lagjax.numerics import tolerance_of_the_controller
 
 # A module, and the classes that are found there: their fields.
 CLASSES = """
-lagjax.numerics.methods.runge_kutta
+lagjax.numerics.runge_kutta
   Dopri8 Tsit5 RK4: in_a_loop
-lagjax.numerics.methods.nystrom
+lagjax.numerics.runge_kutta
   Nystrom8 Nystrom12: in_a_loop
-lagjax.numerics.methods.gauss
+lagjax.numerics.symplectic
   Gauss: stages newton pace
-lagjax.numerics.methods.splitting
+lagjax.numerics.symplectic
   Splitting: order pace
-lagjax.numerics.methods.radau
+lagjax.numerics.radau
   Radau5: root_finder root_find_max_steps step_powers
-lagjax.numerics.methods.radau
+lagjax.numerics.radau
   SimplifiedNewton: rtol atol norm kappa slow
 diffrax
   Euler SemiImplicitEuler LeapfrogMidpoint ReversibleHeun ConstantStepSize DirectAdjoint ForwardMode:
@@ -95,56 +95,56 @@ lagjax.analysis.poincare
 lagjax.analysis.energy
   EnergyLedger: t jacobi_integral kinetic potential works constraints impact_times impacts switches impact_total
     closure scale allowed quadrature
-lagjax.sweep.batch_program
+lagjax.sweep.engine
   Status: result steps scaled_error residual
-lagjax.analysis.orbits.floquet
+lagjax.analysis.exponents
   Floquet: multipliers trivial reasons monodromy log_volume error period ended apart words
-lagjax.analysis.orbits.lyapunov
+lagjax.analysis.exponents
   LyapunovExponents: exponents uncertainty t growth volume settled ended all_of_them
-lagjax.analysis.symmetry.is_symmetry
+lagjax.analysis.symmetry_test
   SymmetryTest: name residual charge_rate lagrangian force has_forces displacement invariance charge rate states at
-lagjax.analysis.continuation.result
+lagjax.analysis.branches
   Branches: branches critical along first last names params status
   Branch: parameter q v multipliers stable eigenvalues status critical
   Critical: kind parameter q v multipliers derivative frequency accuracy branches
-lagjax.analysis.modes.linearise
+lagjax.analysis.linearise
   Linearisation: mass gyroscopic damping circulatory stiffness positions velocities multipliers residual sound state
     parts kind names
-lagjax.analysis.modes.reduced_matrices
+lagjax.analysis.linearise
   LinearisationKind: unseen holonomic independent conservative at_rest timeless
   LinearParts: mass velocity position drift transfer positions velocities turning multipliers a off forces sound
     independent raw
   Raw: mass velocity position rows slopes
-lagjax.analysis.modes.normal_modes
+lagjax.analysis.normal_modes
   NormalModes: roots shapes energy zero growing double code unexplained linearisation zero_words
   Mode: root shape energy double linearisation label
 lagjax.numerics.windowed_least_squares
   Unknowns: shared local
   Covariance: shared local local_shared
-lagjax.fit.uncertainty.identifiable
+lagjax.fit.uncertainty
   Identifiability: names values singular_values combinations noise next
-lagjax.fit.uncertainty.candidates
+lagjax.fit.next_measurement
   NextMeasurements: of now candidates absolute
   Candidate: name t times sd alone sigma rows known direction least
-lagjax.fit.problem.parameters
+lagjax.fit.unknowns
   Leaf: number places
   FreeNumbers: params start low high mean sd names leaves weak
-lagjax.fit.problem.records
+lagjax.fit.records
   Windows: ts real sample last seam record
   Record: t measured q0 v0 hold_q hold_v params sigma
-lagjax.fit.problem.initial_states
+lagjax.fit.unknowns
   Chart: guess along across
   Starts: q v
-lagjax.fit.problem.residuals
+lagjax.fit.residuals
   FitProblem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
     options loss absolute
-lagjax.fit.search.search
+lagjax.fit.search
   Misfit: times large curved doubtful
-lagjax.fit.search.search
+lagjax.fit.search
   Evaluation: rows well covariance determined singular_values combinations chi2 freedom
 lagjax.bodies.body
   Pose: position quaternion
-lagjax.fit.result.result
+lagjax.fit.result
   Fit: problem unknowns cost steps rested misfit costs evaluation units
 """
 

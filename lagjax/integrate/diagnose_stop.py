@@ -4,7 +4,7 @@ If steps collapse or `max_steps` is used up, some more steps are taken from wher
 is said only where one of these numbers shows it, and with the number; otherwise the facts stand alone:
 
 - The rate of progress at the end, not the average rate, tells how many steps are missing.
-- An eigenvalue of the mass matrix is below zero at the end or just beyond it (`lagjax/mechanics/indefinite_mass.py`).
+- An eigenvalue of the mass matrix is below zero at the end or just beyond it (`lagjax/mechanics/diagnosis.py`).
 - Velocities or accelerations that have grown a millionfold, or that grow while steps shrink, approach a singularity.
 - Steps are rejected at jumps and kinks of forces, where these are read off their programs and `jumps="ignored"`.
 - Eigenvalues of d(v, a)/d(q, v) that are large compared with one over a step limit it: real negative ones by the

@@ -3,6 +3,8 @@
 from lagjax.jaxtools.cache import (
     FACTS,
     HashablePart,
+    compiled,
+    compiler_options,
     filled_up,
     hashable_partition,
     is_array,
@@ -14,9 +16,27 @@ from lagjax.jaxtools.cache import (
     shape_of,
     varies,
 )
-from lagjax.jaxtools.compiled import compiled, compiler_options
-from lagjax.jaxtools.fuse_both_modes import one_function_in_both_modes
-from lagjax.jaxtools.fuse_cpu import PRODUCT, TOGETHER, apart, calls_host, kept_as_call, one_function, poisoned
+from lagjax.jaxtools.dependence import is_linear, pattern
+from lagjax.jaxtools.fuse import (
+    PRODUCT,
+    TOGETHER,
+    apart,
+    calls_host,
+    kept_as_call,
+    one_function,
+    one_function_in_both_modes,
+    poisoned,
+)
+from lagjax.jaxtools.identity import (
+    Itself,
+    Meaning,
+    content_of,
+    meaning_of,
+    rule_follows,
+    rules_of,
+    with_own_constants,
+    without_repeats,
+)
 from lagjax.jaxtools.jaxpr import (
     ADDITIVE,
     ARITHMETIC,
@@ -44,17 +64,6 @@ from lagjax.jaxtools.jaxpr import (
     stands_for,
     written,
 )
-from lagjax.jaxtools.jaxpr_identity import (
-    Itself,
-    Meaning,
-    content_of,
-    meaning_of,
-    rule_follows,
-    rules_of,
-    with_own_constants,
-    without_repeats,
-)
-from lagjax.jaxtools.linearity import is_linear
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,
@@ -66,32 +75,36 @@ from lagjax.jaxtools.open_jumps import (
     has_jumps,
     judging,
 )
-from lagjax.jaxtools.plain import is_plain
 from lagjax.jaxtools.primitives import (
     ad,
     front,
     is_float,
     jaxpr_as_fun,
+    jitted,
     linear_map_primitive,
     no_tangent,
+    one_by_one,
     primitive,
     split,
 )
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
-from lagjax.jaxtools.sparsity import pattern
 from lagjax.jaxtools.tracing import (
     REGULAR_FIRST,
     SILENT,
     WATCHED,
     as_usual,
     at_once,
+    decided,
     full_products,
     is_differentiated,
     is_eager,
+    is_plain,
     is_traced,
+    like,
     numpy_of,
+    stop_gradient,
     takes_for_regular,
     to_jax,
+    where,
+    without_init,
 )
-from lagjax.jaxtools.trees import decided, like, stop_gradient, where, without_init
-from lagjax.jaxtools.without_lapack_batches import jitted, one_by_one

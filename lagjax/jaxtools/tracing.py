@@ -1,19 +1,52 @@
-"""Whether JAX is tracing here and now, and in which context."""
+"""Questions to JAX before a program is run: is it tracing, does the user want plain JAX; and small helpers for trees.
 
-from collections.abc import Callable
+`LAGJAX_PLAIN=1` in the environment runs every program as plain JAX, the fallback: nothing is then written out number by
+number and nothing compiled as one function: the same results to round-off, several times slower. It serves for
+comparison, and for versions of XLA with which no test was run: XLA does not check what our marks promise, and where it
+mishandles one it ends the process. `LAGJAX_PLAIN=0` compiles as ever with any.
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
 from functools import wraps
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import jaxlib.version
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
-from jaxtyping import PyTree
+from jaxtyping import Bool, PyTree
+
+# Run with 0.10.2: all tests; with 0.10.1: the fast ones; with the others: those of this package, a pendulum and a rod.
+KNOWN = {"0.10.1", "0.10.2", "0.11.0", "0.11.1", "0.11.2", "0.12.0", "0.12.0.1"}
+# Read once: compiled programs are kept, and the two kinds must not mix.
+_WANTED = os.environ.get("LAGJAX_PLAIN", "")
+_decided: list[bool] = []
+
+
+def is_plain() -> bool:
+    """Whether every program runs as plain JAX; decided when the first one is made."""
+    if not _decided:
+        known = jaxlib.version.__version__ in KNOWN
+        _decided.append(_WANTED != "0" if _WANTED else not known)
+        if not _WANTED and not known:
+            warnings.warn(
+                f"lagjax was not tested with jaxlib {jaxlib.version.__version__}, so motions are compiled as plain "
+                "JAX programs: the same results, several times slower.\n"
+                f"Fix: a tested jaxlib ({', '.join(sorted(KNOWN))}), or a newer lagjax; LAGJAX_PLAIN=1 in the "
+                "environment for no warning, LAGJAX_PLAIN=0 to compile for speed all the same.",
+                stacklevel=2,
+            )
+    return _decided[0]
+
 
 # A new thread traces nothing, also where this module is imported inside a program.
 with ThreadPoolExecutor(1) as _thread:
@@ -116,3 +149,45 @@ def is_differentiated(tree: PyTree) -> bool:
         return isinstance(x, Tracer) and (hasattr(x, "tangent") or hasattr(x, "batch_dim") and moves(getattr(x, "val")))
 
     return any(map(moves, jtu.tree_leaves(tree)))
+
+
+def stop_gradient(tree: PyTree):
+    """The tree without derivatives.
+
+    >>> print(jax.grad(lambda x: x * stop_gradient({"x": x})["x"])(3.0))
+    3.0
+    """
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
+def without_init(cls: type, fields: Mapping[str, Any]):
+    """An instance with these fields, whose own `__init__` is not called: it would check, or take long.
+
+    >>> print(without_init(type("Pair", (), {}), {"re": 1.0}).re)
+    1.0
+    """
+    made = object.__new__(cls)
+    for name, x in fields.items():
+        object.__setattr__(made, name, x)
+    return made
+
+
+def where(condition, a, b):
+    """The arrays of `a` where the condition holds, else those of `b`, in the dtypes of these."""
+    return jax.tree.map(
+        lambda x, y: jnp.where(condition, x, y).astype(jnp.result_type(y)) if eqx.is_array(y) else y, a, b
+    )
+
+
+def like(mask, x):
+    """A mask of rows or lanes with as many axes as x has."""
+    return mask.reshape(mask.shape + (1,) * (jnp.ndim(x) - jnp.ndim(mask)))
+
+
+def decided(truth: Bool[Array, "..."]) -> Bool[Array, "..."]:
+    """The same truth value, behind a quotient.
+
+    On a CPU, XLA copies what a selection depends on into each selection of single numbers, but computes a quotient
+    once. A test of all results that decides about each of them would be compiled as often as there are results.
+    """
+    return 1.0 / jnp.where(truth, 1.0, -1.0) > 0

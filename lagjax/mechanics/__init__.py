@@ -1,25 +1,52 @@
 """The equations of motion at one state."""
 
 from lagjax.mechanics.accelerations import accelerations, accelerations_at, constraint_force, constraint_residual
-from lagjax.mechanics.consistent_state import consistent_state, free_coordinates, unreachable_ahead
-from lagjax.mechanics.diagnosis import dependencies, describe, explain_failure, listed, where
-from lagjax.mechanics.equations import Equations, all_finite, equations_of
-from lagjax.mechanics.first_order import completed, of_states, resolved, with_first_order
-from lagjax.mechanics.generators import AXES, Generator, as_generator, points, turned
-from lagjax.mechanics.indefinite_mass import IndefiniteMass, indefinite_mass
+from lagjax.mechanics.consistent_state import (
+    consistent_state,
+    departures,
+    free_coordinates,
+    returned,
+    to_manifold,
+    unreachable_ahead,
+    velocity_change,
+    within,
+    worst_residual,
+)
+from lagjax.mechanics.diagnosis import (
+    IndefiniteMass,
+    dependencies,
+    describe,
+    explain_failure,
+    indefinite_mass,
+    listed,
+    where,
+)
+from lagjax.mechanics.equations import Equations, all_finite, equations_of, has_networks
 from lagjax.mechanics.lagrangian import (
     applied_force,
+    completed,
     forcing_and_inertia,
     jacobi_integral,
     mass_and_forcing,
     mass_matrix,
     momentum,
+    of_states,
+    resolved,
+    response,
+    with_first_order,
 )
-from lagjax.mechanics.multiplier_forces import response
-from lagjax.mechanics.noether import GeneratorFlow, NoetherCharge, flow, noether_charge
-from lagjax.mechanics.projection import departures, returned, to_manifold, velocity_change, within, worst_residual
+from lagjax.mechanics.noether import (
+    AXES,
+    Generator,
+    GeneratorFlow,
+    NoetherCharge,
+    as_generator,
+    flow,
+    noether_charge,
+    points,
+    turned,
+)
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, examined, solve_saddle_point
-from lagjax.mechanics.scalar_equations import has_networks
 from lagjax.mechanics.structure import (
     Structure,
     are_angles,

@@ -13,8 +13,7 @@ from jaxtyping import Array, PyTree
 from lagjax.jaxtools import compiled, is_differentiated, is_eager, is_traced
 from lagjax.mechanics.diagnosis import explain_failure, explain_singular, where
 from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.forward_dynamics import ForwardDynamics
-from lagjax.mechanics.saddle_point import Dense, examined
+from lagjax.mechanics.saddle_point import Dense, ForwardDynamics, examined
 from lagjax.system import (
     Model,
     State,

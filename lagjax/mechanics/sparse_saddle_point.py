@@ -3,7 +3,7 @@
     M a = F + Aᵀ λ,    A a = gamma        =>        S λ = gamma - A M⁻¹ F,    S = A M⁻¹ Aᵀ
 
 M is split into blocks that share no velocity (bodies, particles), and inverted block by block. S couples constraint
-equations that act on a common block, and is a band once they are ordered (`numerics/linalg/banded.py`). M, A and S are
+equations that act on a common block, and is a band once they are ordered (`numerics/banded.py`). M, A and S are
 found from their products with a few coloured vectors, M and A as derivatives of the user's functions. Which entries can
 be nonzero is read off the jaxpr (see below) and holds at every state.
 
@@ -125,7 +125,8 @@ def _plan(structure, leaves: tuple) -> SparsePlan | None:
 # chains of particles (9), and multiplies by the entries of others, which would make it too long: 3,600 operations for a
 # chain of eight bodies (48), 2,000 by entries, which compile in three quarters of the time and run no slower.
 SHORT = 30
-# The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in `rank.py`.
+# The sine below which a row is dependent; only its square is known, which round-off reaches sooner than in
+# `numerics/dense.py`.
 DEPENDENT_BELOW = {np.dtype("float64"): 1e-5, np.dtype("float32"): 1e-2}
 # A vanishing mass counts as this share of the largest: small enough for one refinement to correct.
 VANISHING_MASS = {np.dtype("float64"): 1e-8, np.dtype("float32"): 1e-4}

@@ -1,15 +1,16 @@
 """Methods and linear algebra that know no mechanics."""
 
-from lagjax.numerics import quadrature
-from lagjax.numerics.linalg import banded, dense, lapack
-from lagjax.numerics.linalg.dense import SINGULAR_BELOW, reciprocal_condition, solve_without_exchanges
-from lagjax.numerics.linalg.eigenvalues import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, null_space, unit_rows
-from lagjax.numerics.methods.gauss import EqualSteps, Gauss, Tableau, tableau
-from lagjax.numerics.methods.nystrom import Nystrom, Nystrom8, Nystrom12, Quintic, evaluations_a_step
-from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, tolerance_of_the_controller, with_tolerances
-from lagjax.numerics.methods.runge_kutta import RK4, Dopri8, ExplicitRungeKutta, Interpolation, Tsit5, in_our_form
-from lagjax.numerics.methods.splitting import Splitting, lengths, sequence
+from lagjax.numerics import banded, dense, lapack, quadrature
+from lagjax.numerics.dense import (
+    DEPENDENT_BELOW,
+    SINGULAR_BELOW,
+    independent_rows,
+    null_space,
+    reciprocal_condition,
+    solve_without_exchanges,
+    unit_rows,
+)
+from lagjax.numerics.lapack import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
 from lagjax.numerics.newton import (
     MOST,
     damped_newton,
@@ -23,6 +24,21 @@ from lagjax.numerics.newton import (
     with_value,
     zero_below,
 )
+from lagjax.numerics.radau import Radau5, SimplifiedNewton, tolerance_of_the_controller, with_tolerances
+from lagjax.numerics.runge_kutta import (
+    RK4,
+    Dopri8,
+    ExplicitRungeKutta,
+    Interpolation,
+    Nystrom,
+    Nystrom8,
+    Nystrom12,
+    Quintic,
+    Tsit5,
+    evaluations_a_step,
+    in_our_form,
+)
+from lagjax.numerics.symplectic import EqualSteps, Gauss, Splitting, Tableau, lengths, sequence, tableau
 from lagjax.numerics.windowed_least_squares import (
     ByWindows,
     Covariance,

@@ -26,7 +26,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.numerics.linalg import lapack
+from lagjax.numerics import lapack
 
 # Singular values below this many round-offs of the largest count as zero.
 ZERO_BELOW = 1e3

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.continuation import continue_equilibria
+from lagjax.analysis.branches import continue_equilibria
 from lagjax.display import plots
 from lagjax.integrate import EventWarning, integrate
 from lagjax.mechanics import accelerations

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.modes import normal_modes
+from lagjax.analysis.normal_modes import normal_modes
 from lagjax.display import plots
 from lagjax.integrate import integrate
 from lagjax.report import FULL, MAIN, QUICK, Case, Run, Scene, relative_error

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.analysis.symmetry import symmetries
+from lagjax.analysis.symmetry_search import symmetries
 from lagjax.display import plots
 from lagjax.integrate import integrate
 from lagjax.report import FULL, QUICK, Case, Run, Scene, relative_error

@@ -7,12 +7,8 @@ ends of their ranges, each compared with a closed form or an independent value.
 from dataclasses import replace
 
 from lagjax.report import FULL, MAIN, QUICK
-from lagjax.stability.amplifying import amplifying
-from lagjax.stability.constraints import redundant
-from lagjax.stability.geodesics import geodesics
-from lagjax.stability.hoop_and_wedge import bead, float32, separatrix, wedge
-from lagjax.stability.long import long
-from lagjax.stability.stiff import stable_steps, stiff
+from lagjax.stability.closed_forms import bead, float32, geodesics, long, redundant, separatrix, wedge
+from lagjax.stability.stiff_and_chaotic import amplifying, stable_steps, stiff
 from lagjax.stability.trial import SILENTLY_WRONG, VERDICTS, Outcome, Trial, stability_table
 
 __all__ = ["FULL", "QUICK", "MAIN", "SILENTLY_WRONG", "VERDICTS", "Outcome", "Trial", "stability_table", "trials"]

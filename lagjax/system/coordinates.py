@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import printable
 from lagjax.jaxtools import is_eager, is_traced, numpy_of, to_jax
-from lagjax.system.warn import warn
+from lagjax.system.user_errors import warn
 
 SINGLE = np.dtype("float32")
 # Not empty once this process has warned, or float32 is known to be meant.

@@ -19,10 +19,10 @@ from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
+from lagjax.system.constraints import Elements
 from lagjax.system.coordinates import State
-from lagjax.system.elements import Elements
-from lagjax.system.function_arguments import takes_of
 from lagjax.system.system import System, check_functions
+from lagjax.system.traced import takes_of
 
 MOST_SWITCHES = 16
 

@@ -20,10 +20,8 @@ from jaxtyping import PyTree
 
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
-from lagjax.system.constraints import Holonomic, Nonholonomic
-from lagjax.system.elements import Element, Elements, Held, SampledControl
-from lagjax.system.function_arguments import OF_STATE, WITH_FORCE
-from lagjax.system.traced_functions import Traced
+from lagjax.system.constraints import Element, Elements, Held, Holonomic, Nonholonomic, SampledControl
+from lagjax.system.traced import OF_STATE, WITH_FORCE, Traced
 
 # Packages that pickle any function, whatever its name: they write down what it does.
 TAKES_ANY_FUNCTION = ("cloudpickle", "dill")

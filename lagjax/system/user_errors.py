@@ -1,4 +1,4 @@
-"""Explain errors inside the user's functions in the user's names, with the line where they happened.
+"""Errors inside the user's functions in the user's names and lines, and warnings that show the user's line.
 
 An error that is not recognised is raised unchanged. Each explanation is chained to the original error, whose traceback
 ends at the user's line.
@@ -11,15 +11,35 @@ whose subject is the function, `L(t, q, v, params) ...`.
 
 import difflib
 import inspect
+import os
 import re
+import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
+
+# The code between the user's line and here: warnings skip it.
+PACKAGES = tuple(str(Path(str(module.__file__)).parent) + os.sep for module in (jax, eqx, diffrax))
+BETWEEN = (*PACKAGES, __file__.rsplit("system", 1)[0])
+
+
+def warn(words: str, category: type[Warning]) -> None:
+    """Warn at the innermost line outside this library and the libraries that it calls."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(BETWEEN):
+        frame = frame.f_back
+    module, registry = frame.f_globals.get("__name__", "?"), frame.f_globals.setdefault("__warningregistry__", {})
+    warnings.warn_explicit(words, category, frame.f_code.co_filename, frame.f_lineno, module, registry)
+
 
 Words = tuple[str, str, str]
 

@@ -29,12 +29,11 @@ from lagjax.system import (
     model_of,
     traced_call,
 )
-from lagjax.two_points import descent, path_mesh
-from lagjax.two_points.answer import answer_from, inside, is_same, not_found, why_not_variational
+from lagjax.two_points import path_mesh
+from lagjax.two_points import starts as descent
+from lagjax.two_points.answer import Connection, answer_from, inside, is_same, not_found, why_not_variational
 from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
-from lagjax.two_points.result import Connection
-from lagjax.two_points.shoot import launches_of
-from lagjax.two_points.start_velocity import shoots_alone
+from lagjax.two_points.shoot import launches_of, shoots_alone
 from lagjax.two_points.starts import DEGREE, Nodes, PathGuess, Starts, guesses_of, nodes_of, sizes_of
 
 ELEMENTS = 8
@@ -109,7 +108,7 @@ def connect(
     too many or too few conditions. Warns (`ConnectWarning`) where no motion was found, or a path that no motion
     follows to its end; under `jit` and `vmap` `converged` says so, and the start velocity and the action are NaN.
 
-    Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `index.py`.
+    Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `path_mesh.py`.
     """
     goes_down = isinstance(starts, int | np.integer) and starts > 1
     return connected(

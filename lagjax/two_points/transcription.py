@@ -1,4 +1,4 @@
-"""A motion with controls as finitely many numbers: a nonlinear program on elements in time.
+"""A motion with controls as finitely many numbers: a nonlinear program on elements in time, and these elements.
 
 The elements are those of `elements.py`, where d'Alembert's principle with p = ∂L/∂v takes the place of accelerations,
 and M is never inverted. What remains free are the controls, on each element a polynomial through Gauss's points, or
@@ -11,9 +11,19 @@ together.
 
 Source: Ober-Blöbaum, Junge & Marsden, *ESAIM: COCV* 17 (2011) 322 (discrete mechanics and optimal control);
 Leyendecker, Ober-Blöbaum, Marsden & Ortiz, *Optim. Control Appl. Meth.* 31 (2010) 505 (constraints).
+
+**How elements are made finer**, where a control jumps, and the same motion on other elements.
+
+Two rules. All elements are halved until the cost no longer changes. And where a control goes from one of its bounds to
+the other within an element, this is cut in two at a time that the program then finds, and the control stays at the
+one bound before the cut and at the other after it.
+
+Without the second half of that rule the cut would not be where the control jumps: a polynomial is held to its bounds at
+Gauss's points alone, and one that is beyond them in between costs less.
 """
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import NamedTuple
 
 import equinox as eqx
@@ -209,3 +219,238 @@ def curvatures(plant: Plant, form: tuple, z: Array, share: Array, multipliers: A
         return share * cost + jnp.dot(multipliers, rows)
 
     return jax.vmap(jax.hessian(lagrangian))(z, multipliers)
+
+
+# Elements that are differentiated together: a program serves any number of elements.
+TOGETHER = 16
+
+
+class Block(NamedTuple):
+    """Parts of one kind: which unknowns (B, d) each sees, and to which equations (B, r) it adds."""
+
+    plant: Plant
+    form: tuple
+    columns: np.ndarray
+    rows: np.ndarray
+
+    def _together(self, function: Callable, *arguments):
+        size = TOGETHER if len(self.columns) > 1 else 1
+        found = []
+        for start in range(0, len(self.columns), size):
+            pieces = [_filled(x[start : start + size], size) for x in arguments]
+            found.append(jax.tree.map(np.asarray, function(self.plant, self.form, *pieces)))
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(self.columns)], *found)
+
+    def values_and_slopes(self, x: np.ndarray):
+        """Costs (B,) and rows (B, r), and their derivatives by what each part sees, (B, d) and (B, r, d)."""
+        return self._together(values_and_slopes, x[self.columns])
+
+    def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray):
+        """The second derivatives (B, d, d) of `share` times the cost plus the rows times `multipliers`."""
+
+        def function(plant: Plant, form: tuple, *pieces):
+            return curvatures(plant, form, pieces[0], np.asarray(share), pieces[1])
+
+        return self._together(function, x[self.columns], multipliers[self.rows])
+
+
+def _filled(x: np.ndarray, size: int):
+    return np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) if len(x) < size else x
+
+
+class Layout:
+    """The unknowns and equations of a plant on K elements.
+
+    `places`: by kind, where unknowns stand in the vector of all, in the shapes of these; `rows`: the same of equations.
+    """
+
+    def __init__(self, plant: Plant, count: int):
+        self.plant, self.count = plant, count
+        n, s, k = plant.form.n, plant.degree, count
+        controls = {"smooth": k * s, "linear": k + 1, "constant": k}[plant.interpolation]
+        self.size, self.places = _numbered({
+            "end": (1,), "parts": (k + 1,), "q": (s * k + 1, n), "v": (2, n), "controls": (controls, plant.n_controls),
+            "node_multipliers": (s * k + 1, plant.of_positions), "point_multipliers": (s * k, plant.of_velocities),
+            "impulse": (plant.of_velocities,),
+        })  # fmt: skip
+        g, phi = plant.of_positions, plant.of_velocities
+        self.row_count, self.rows = _numbered({
+            "motion": (s * k + 1, n), "positions": (k, s, g), "velocities": (k, s, phi),
+            "bounded": (k, s, len(plant.bounded)), "start": (2 * g + phi,), "stop": (g + phi,),
+            "end": (plant.conditions,),
+        })  # fmt: skip
+
+    @cached_property
+    def of_nodes(self) -> np.ndarray:
+        """Which nodes each element has, (K, s + 1)."""
+        s = self.plant.degree
+        return s * np.arange(self.count)[:, None] + np.arange(s + 1)
+
+    @cached_property
+    def of_points(self) -> np.ndarray:
+        """Which points each element has, (K, s)."""
+        return self.of_nodes[:, :-1]
+
+    @cached_property
+    def of_controls(self) -> np.ndarray:
+        """Which rows of controls each element has, (K, r)."""
+        each = np.arange(self.count)[:, None]
+        return {"smooth": self.of_points, "linear": each + np.arange(2), "constant": each}[self.plant.interpolation]
+
+    def blocks(self) -> tuple[Block, Block]:
+        """The elements and the ends."""
+        at, rows, k = self.places, self.rows, self.count
+        elements = Element(
+            np.repeat(at["end"][None], k, axis=0),
+            np.stack([at["parts"][:-1], at["parts"][1:]], axis=1),
+            at["q"][self.of_nodes],
+            at["controls"][self.of_controls],
+            at["node_multipliers"][self.of_nodes],
+            at["point_multipliers"][self.of_points],
+        )
+        ends = PlanEnds(at["end"], at["q"][[0, -1]], at["v"], at["controls"][self.of_controls[[0, -1]]], at["impulse"])
+        ends = PlanEnds(*(x[None] for x in ends))
+        of_elements = rows["motion"][self.of_nodes], rows["positions"], rows["velocities"], rows["bounded"]
+        of_ends = rows["motion"][[0, -1]], rows["start"], rows["stop"], rows["end"]
+        return (
+            Block(self.plant, _form(elements), _flat(elements, k), _flat(of_elements, k)),
+            Block(self.plant, _form(ends), _flat(ends, 1), _flat(of_ends, 1)),
+        )
+
+
+def _numbered(shapes: dict[str, tuple[int, ...]]):
+    found, start = {}, 0
+    for name, shape in shapes.items():
+        size = int(np.prod(shape))
+        found[name] = np.arange(start, start + size).reshape(shape)
+        start += size
+    return start, found
+
+
+def _form(seen: Element | PlanEnds):
+    return type(seen), tuple(x.shape[1:] for x in seen)
+
+
+def _flat(parts: tuple, count: int):
+    return np.concatenate([x.reshape(count, -1) for x in parts], axis=1)
+
+
+# A control this near to a bound, in parts of the distance between both, is at it.
+AT_BOUND = 0.02
+# How near to a neighbour a bound of elements may move, in parts of their distance.
+APART = 0.02
+
+
+class Jump(NamedTuple):
+    """Where a control jumps, as a part of the whole time; which one, and whether it is at its upper bound before."""
+
+    at: float
+    control: int
+    falls: bool
+
+
+class Mesh(NamedTuple):
+    """The bounds of K elements (K + 1,) as parts of the whole time, and the jumps at which they may move, by number."""
+
+    parts: np.ndarray
+    jumps: dict[int, list[Jump]]
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Which of the bounds may move, (K + 1,)."""
+        return np.isin(np.arange(len(self.parts)), list(self.jumps))
+
+    @classmethod
+    def even(cls, count: int) -> "Mesh":
+        """Elements of one length."""
+        return cls(np.linspace(0.0, 1.0, count + 1), {})
+
+    @property
+    def count(self) -> int:
+        """The number of elements."""
+        return len(self.parts) - 1
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Between which values each bound of elements may move."""
+        low, high, moves = self.parts.copy(), self.parts.copy(), self.moves
+        for i in self.jumps:
+            before, after = self.parts[i] - self.parts[i - 1], self.parts[i + 1] - self.parts[i]
+            # Two neighbours that both move each have half of what lies between them.
+            low[i] -= before * ((0.5 if moves[i - 1] else 1.0) - APART)
+            high[i] += after * ((0.5 if moves[i + 1] else 1.0) - APART)
+        return low, high
+
+    def at(self, parts: np.ndarray) -> "Mesh":
+        """The same mesh after its bounds have moved."""
+        return Mesh(parts, self.jumps)
+
+    def halved(self) -> "Mesh":
+        """Each element cut in two."""
+        middle = (self.parts[:-1] + self.parts[1:]) / 2
+        parts = np.append(np.stack([self.parts[:-1], middle], axis=1).ravel(), self.parts[-1])
+        return Mesh(parts, {2 * i: jumps for i, jumps in self.jumps.items()})
+
+    def cut(self, jumps: list[Jump]) -> "Mesh":
+        """With a bound of elements at each jump; one that is nearby is moved there."""
+        parts = list(self.parts)
+        for jump in jumps:
+            i = int(np.clip(np.searchsorted(parts, jump.at), 1, len(parts) - 1))
+            share = (jump.at - parts[i - 1]) / (parts[i] - parts[i - 1])
+            near = i - 1 if share < 0.1 else i if share > 0.9 else None
+            if near is not None and 0 < near < len(parts) - 1:
+                parts[near] = jump.at
+            elif near is None:
+                parts.insert(i, jump.at)
+        found = {}
+        for jump in jumps:
+            found.setdefault(int(np.argmin(np.abs(np.array(parts) - jump.at))), []).append(jump)
+        return Mesh(np.array(parts), {i: found[i] for i in sorted(found) if 0 < i < len(parts) - 1})
+
+
+def jumps_of(layout: Layout, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Jump]:
+    """Where a control goes from one bound to the other within an element, in their order."""
+    plant, at = layout.plant, layout.places
+    if plant.interpolation == "linear":
+        return []
+    parts, smooth = x[at["parts"]], plant.interpolation == "smooth"
+    nodes, weights = (plant.rule.points, plant.rule.weights) if smooth else (np.array([0.5]), np.array([1.0]))
+    width = np.diff(parts)[:, None]
+    # To each value the time that it counts for.
+    ends = (parts[:-1, None] + width * np.cumsum(weights)).ravel()
+    widths, found = (width * weights).ravel(), []
+    for control, (u, a, b) in enumerate(zip(x[at["controls"]].T, low, high)):
+        if not np.isfinite(b - a):
+            continue
+        share = (u - a) / (b - a)
+        side = np.where(share < AT_BOUND, -1, np.where(share > 1 - AT_BOUND, 1, 0))
+        (places,) = np.nonzero(side)
+        for i, j in zip(places, places[1:]):
+            if side[i] != side[j] and j - i <= len(nodes) + 1:
+                # The time of a jump that has the same integral as what lies between.
+                as_before = share[i + 1 : j] if side[i] > 0 else 1 - share[i + 1 : j]
+                place = float(ends[i] + np.sum(as_before * widths[i + 1 : j]))
+                found.append(Jump(place, control, bool(side[i] > 0)))
+    return sorted(found)
+
+
+def moved(layout: Layout, x: np.ndarray, mesh: Mesh) -> tuple[Layout, np.ndarray]:
+    """The same motion on other elements: the new layout and its unknowns."""
+    plant, old, k = layout.plant, layout.places, layout.count
+    new = Layout(plant, mesh.count)
+    rule, parts, at, y = plant.rule, x[old["parts"]], new.places, np.zeros(new.size)
+    for name in ("end", "v", "impulse"):
+        y[at[name]] = x[old[name]]
+    y[at["parts"]] = mesh.parts
+
+    def resample(name: str, of_elements: np.ndarray, nodes: np.ndarray, last: bool):
+        where = mesh.parts[:-1, None] + np.diff(mesh.parts)[:, None] * (nodes[:-1] if last else nodes)
+        where = np.append(where.ravel(), 1.0) if last else where.ravel()
+        place = np.clip(np.searchsorted(parts, where, side="right") - 1, 0, k - 1)
+        inside = (where - parts[place]) / (parts[place + 1] - parts[place])
+        y[at[name]] = np.einsum("mr,mrn->mn", through(nodes, inside), x[old[name]][of_elements][place])
+
+    resample("q", layout.of_nodes, rule.nodes, True)
+    resample("node_multipliers", layout.of_nodes, rule.nodes, True)
+    resample("point_multipliers", layout.of_points, rule.points, False)
+    resample("controls", layout.of_controls, plant.control_nodes, plant.interpolation == "linear")
+    return new, y

@@ -23,8 +23,7 @@ from jaxtyping import PyTree
 from lagjax.integrate import Crossing, Trajectory, ended_well, message, runs_backward
 from lagjax.numerics import Radau5
 from lagjax.system import coordinates
-from lagjax.work_precision.methods import TIGHTEST, usual_methods
-from lagjax.work_precision.programs import ComparedMotion, TimedProgram
+from lagjax.work_precision.methods import TIGHTEST, ComparedMotion, TimedProgram, usual_methods
 
 # A given reference is wrong if it is this many times farther from solves than these are from each other.
 FARTHER = 10.0

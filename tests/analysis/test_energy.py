@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis import energy, works
+from lagjax.analysis import energy
 from lagjax.integrate import HybridTrajectory
 from lagjax.integrate.trajectory.parts import Snapshot
 from lagjax.numerics import quadrature
@@ -49,7 +49,7 @@ def flipped(system):
     return lj.System(system.lagrangian, constraints, negative(system.force), negative(system.dissipation))
 
 
-class Known(works.Motion):
+class Known(energy.Motion):
     """The motion of `DRAGGED` from (5, 0) at these times, and in closed form between them: nothing is integrated."""
 
     def __init__(self, ts, end=None, system=DRAGGED, **fields):
@@ -138,10 +138,10 @@ def test_powers_are_the_rate_of_h(sign):
     t, q, v, p = state
     moved, accounted = equations(SLEDGE, *state), SLEDGE if sign == 1 else flipped(SLEDGE)
     lanes = jax.tree.map(lambda x: np.asarray(x)[None], (t, q, v, moved.multipliers))
-    found = by_numpy(lambda *lanes: inspect.unwrap(works._powers)(model_of(accounted, *state), *lanes, None))(*lanes)
+    found = by_numpy(lambda *lanes: inspect.unwrap(energy._powers)(model_of(accounted, *state), *lanes, None))(*lanes)
 
     def h(t, q, v):
-        at = inspect.unwrap(works._energies)(model_of(SLEDGE, *state), *jax.tree.map(lambda x: x[None], (t, q, v)))
+        at = inspect.unwrap(energy._energies)(model_of(SLEDGE, *state), *jax.tree.map(lambda x: x[None], (t, q, v)))
         return at[0][0]
 
     start = jax.tree.map(np.asarray, (t, q, v))
@@ -223,4 +223,4 @@ def test_bad_input():
     with pytest.raises(TypeError, match="any other one by a lj.System"):
         lj.energy_ledger(alone, lj.Hybrid({"falling": DRAGGED}))
     with pytest.raises(ValueError, match="did not get beyond its start"):
-        works.Motion(by_hand(DRAGGED, [0.0, 1.0], *np.full((2, 2), np.nan)), DRAGGED)
+        energy.Motion(by_hand(DRAGGED, [0.0, 1.0], *np.full((2, 2), np.nan)), DRAGGED)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.analysis.params_by_name import no_such_number, numbers_in
+from lagjax.analysis.arclength import no_such_number, numbers_in
 
 PARAMS = {"spring": {"k": 2.0}, "k": np.array([[1.0, 3.0], [5.0, 7.0]]), "count": 3, "name": "steel", "on": True}
 

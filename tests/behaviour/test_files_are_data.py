@@ -20,7 +20,7 @@ import pytest
 import lagjax as lj
 from lagjax.files import npz
 from lagjax.files import table as file_table
-from lagjax.sweep import chunks, metadata, store
+from lagjax.sweep import metadata, store
 from tests import mutated
 from tests.by_hand import with_problem
 from tests.mutated import describe, mutated_file, mutated_store
@@ -270,8 +270,8 @@ def larger_grid(path, n):
     folder, axes = path / "lagjax/marks/c", {"k": np.zeros(n), "x": np.zeros(n)}
     shutil.rmtree(folder)
     for name, x in axes.items():
-        spec = chunks.Spec(x.shape, x.shape, x.dtype, np.nan, [name])
-        chunks.write_chunk(path / name / "c/0", spec, x)
+        spec = metadata.Spec(x.shape, x.shape, x.dtype, np.nan, [name])
+        metadata.write_chunk(path / name / "c/0", spec, x)
 
     def change(said):
         said["block"] = [1, n]

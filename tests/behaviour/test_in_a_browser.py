@@ -14,7 +14,7 @@ import lagjax as lj
 from benchmarks.speed.browser import Browser, installed
 from lagjax.display import CUBE, SPHERE, TUBE, Anchor, InSpace, Shape, Still
 from lagjax.display.animation import Animation, film, film_scripts
-from lagjax.display.web_page import fragment, whole
+from lagjax.display.page import fragment, whole
 
 pytestmark = [
     pytest.mark.slow,

@@ -18,7 +18,7 @@ import optimistix as optx
 import pytest
 
 import lagjax as lj
-from lagjax.numerics.methods.radau import SimplifiedNewton
+from lagjax.numerics.radau import SimplifiedNewton
 from tests.systems import DOUBLE_PARAMS, DOUBLE_SWING, double_pendulum, double_rods, rods_from_angles
 from tests.tiers import exhaustive_but
 

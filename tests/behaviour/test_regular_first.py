@@ -14,7 +14,7 @@ from lagjax.integrate import in_turn
 from lagjax.integrate.solve import harvest
 from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
-from lagjax.sweep import batch_program
+from lagjax.sweep import engine
 from lagjax.sweep.axes import axes_of
 from tests.plain import not_plain
 from tests.tiers import exhaustive_but
@@ -52,14 +52,14 @@ def quiet(run, axes=BOTH, **settings):
 def regular_alone(run, axes=BOTH):
     """(values, status, settled) of only the program that assumes regular motions."""
     grid = axes_of(axes, False)
-    program, _ = batch_program.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
+    program, _ = engine.program_for(run, grid, grid.size, jax.local_devices()[:1], "vmap", robust=False)
     return program.call(grid.at(np.arange(grid.size)), grid.size)
 
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch, request):
     """Count the compiled programs of each kind, starting with an empty cache."""
-    count, compiled = Counter(), batch_program.compiled
+    count, compiled = Counter(), engine.compiled
     if not request.node.get_closest_marker("exhaustive"):
         return count
 
@@ -67,7 +67,7 @@ def compiled(monkeypatch, request):
         count["robust" if args[-1] else "regular"] += 1
         return compiled(*args)
 
-    monkeypatch.setattr(batch_program, "compiled", counted)
+    monkeypatch.setattr(engine, "compiled", counted)
     PROGRAMS.clear()
     return count
 
@@ -82,13 +82,13 @@ def test_lanes_that_are_not_regular(compiled):
     values, status, settled = regular_alone(first_coordinate)
     np.testing.assert_array_equal(settled, BOTH["k"] > 1)
     np.testing.assert_array_equal(np.isnan(values), ~settled)
-    assert not np.isin(status.result[~settled], batch_program.TRUSTED).any()
+    assert not np.isin(status.result[~settled], engine.TRUSTED).any()
 
 
 @pytest.mark.parametrize(("axes", "kinds"), [(DEFINITE, {"regular": 1}), (BOTH, {"regular": 1, "robust": 1})])
 def test_which_lanes_need_the_robust_program(axes, kinds, compiled, monkeypatch):
     """Lanes that a first program does not settle are those of a robust one, which is compiled only for them."""
-    monkeypatch.setattr(batch_program, "program_of", lambda key, make: make())
+    monkeypatch.setattr(engine, "program_of", lambda key, make: make())
 
     def made(run, axes, chunk, devices, layout, patience, robust):
         compiled["robust" if robust else "regular"] += 1
@@ -98,12 +98,12 @@ def test_which_lanes_need_the_robust_program(axes, kinds, compiled, monkeypatch)
             settled = None if robust else k > 1
             values = exact(k) if robust else np.where(settled, exact(k), np.nan)
             result = np.where(np.isnan(values), lj.RESULTS.not_finite._value, lj.RESULTS.successful._value)
-            return values, batch_program.Status(result, *3 * [np.zeros(count)]), settled
+            return values, engine.Status(result, *3 * [np.zeros(count)]), settled
 
         value = jax.ShapeDtypeStruct((), float)
-        return batch_program.Program(call, chunk, value, 0, "", threading.Event(), not robust)
+        return engine.Program(call, chunk, value, 0, "", threading.Event(), not robust)
 
-    monkeypatch.setattr(batch_program, "compiled", made)
+    monkeypatch.setattr(engine, "compiled", made)
     swept = quiet(lambda point: point["k"], axes)
     assert swept.ok.all() and compiled == kinds
     np.testing.assert_array_equal(swept.values, exact(axes["k"]))
@@ -160,7 +160,7 @@ def test_derivatives(compiled):
 
 def irregular_programs():
     """The programs of sweeps in the cache that turned out not to be regular."""
-    return [x for x in PROGRAMS.values() if isinstance(x, batch_program.Program) and x.irregular.is_set()]
+    return [x for x in PROGRAMS.values() if isinstance(x, engine.Program) and x.irregular.is_set()]
 
 
 @pytest.mark.exhaustive

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.formulations.latex import written
+from lagjax.analysis.latex import written
 from lagjax.display import plots
-from lagjax.display.printable import by_line, printable
+from lagjax.display.terminal import by_line, printable
 from lagjax.system import coordinates
 
 BAD = "a$\\frac$\x1b[2J</script><!--<b>\u202e"

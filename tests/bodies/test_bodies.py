@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies.rotation import about, conjugate, product, rotation_matrix, spin_in_space
+from lagjax.bodies.body import about, conjugate, product, rotation_matrix, spin_in_space
 from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import accelerations, along
 

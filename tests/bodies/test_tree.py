@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies.tree.links import slots_of
+from lagjax.bodies.links import slots_of
 from lagjax.jaxtools import equations
-from lagjax.system.traced_functions import TracedProgram
+from lagjax.system.traced import TracedProgram
 from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import in_numpy
 

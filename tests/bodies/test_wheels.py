@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.bodies.contact_point import least_of, searched
-from lagjax.bodies.wheels import tangents
+from lagjax.bodies.wheels import least_of, searched, tangents
 from tests.by_numpy import by_numpy
 from tests.jaxtools.in_numpy import accelerations, evaluated
 

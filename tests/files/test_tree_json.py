@@ -5,7 +5,7 @@ import jax
 import pytest
 
 import lagjax as lj
-from lagjax.files import tree_json
+from lagjax.files import npz
 
 
 def test_a_network_comes_back():
@@ -14,9 +14,9 @@ def test_a_network_comes_back():
     settings = dict(width=4, first=1.0, activation=jax.nn.softplus)
     made = eqx.filter_jit(lambda: lj.learned.Network({"x": 1.0}, key=jax.random.key(0), **settings))
     net, value = made(), eqx.filter_jit(lambda net: net({"x": 0.3}))
-    writer = tree_json.Writer()
+    writer = npz.Writer()
     node = writer.down(net, "net")
-    again = tree_json.Reader(dict(writer.arrays).pop).up(node)
+    again = npz.Reader(dict(writer.arrays).pop).up(node)
     assert eqx.tree_equal(net, again) and value(again) == value(net) != 0.0
     for field, value in (
         ("sizes", "wide"),
@@ -27,7 +27,7 @@ def test_a_network_comes_back():
     ):
         wrong = node | {"fields": node["fields"] | {field: value}}  # pyright: ignore
         with pytest.raises(ValueError, match=f"field {field}"):
-            tree_json.Reader(dict(writer.arrays).pop).up(wrong)
+            npz.Reader(dict(writer.arrays).pop).up(wrong)
 
 
 def test_objects_of_flax():
@@ -35,12 +35,12 @@ def test_objects_of_flax():
     for module, fix in (("flax.nnx.statelib", "nnx.to_pure_dict"), ("flux", "use numbers, arrays")):
         state = type("State", (), {"__module__": module})()
         with pytest.raises(TypeError, match=f"(?s)params.net is a State.*Fix.*{fix}"):
-            tree_json.Writer().down(state, "params.net")
+            npz.Writer().down(state, "params.net")
 
 
 def test_what_is_nested_too_deep():
     """A list in a list, a hundred times, is written; once more is refused, named by the beginning of its path."""
     inside = lambda depth: [inside(depth - 1)] if depth else 1.0
-    tree_json.Writer().down(inside(tree_json.DEEPEST), "params")
-    with pytest.raises(tree_json.NotWritable, match=r"params\[0\].* is nested deeper than 100 levels"):
-        tree_json.Writer().down(inside(tree_json.DEEPEST + 1), "params")
+    npz.Writer().down(inside(npz.DEEPEST), "params")
+    with pytest.raises(npz.NotWritable, match=r"params\[0\].* is nested deeper than 100 levels"):
+        npz.Writer().down(inside(npz.DEEPEST + 1), "params")

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.fit.problem import residuals
-from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit import residuals
+from lagjax.fit.arguments import problem_of
 from lagjax.scenes import rolling_hoop, sliding_wedge, sphere_geodesic
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import lagjax as lj
-from lagjax.fit.result.warnings import caveats
+from lagjax.fit.result import caveats
 from lagjax.scenes import rolling_hoop
 from tests.counting import compiles
 from tests.fit.cases import CASES, FREE, GUESS, HUNG, PENDULUM, TS, hung, noisy, pendulum, swing, swung
@@ -56,7 +56,7 @@ def test_prints_and_plots(swinging, monkeypatch):
     assert abs(found.whiteness()["q"]) < 0.3 and found.rms()["q"] == pytest.approx(0.01, rel=0.2)
     assert len(found.plot().axes) == 2
     # Its motion starts where the fit does, at the record's times.
-    monkeypatch.setattr(import_module("lagjax.fit.result.result"), "integrate", lambda *state, ts, throw: (*state, ts))
+    monkeypatch.setattr(import_module("lagjax.fit.result"), "integrate", lambda *state, ts, throw: (*state, ts))
     system, q0, v0, params, ts = cast(tuple, found.motion())
     assert (system, q0, v0) == (pendulum, found.q0[0], found.v0[0]) and params == found.params
     np.testing.assert_array_equal(ts, TS)

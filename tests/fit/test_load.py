@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.files import tree_json
+from lagjax.files import npz
 from lagjax.files.table import Table
 
 T = np.linspace(0.0, 3.0, 16)
@@ -98,9 +98,9 @@ def networks():
 @pytest.mark.slow
 def test_networks_alone():
     """Networks of eight kinds come back from JSON and arrays; twin: without a class of the user's they do not."""
-    writer, nets = tree_json.Writer(), networks()
+    writer, nets = npz.Writer(), networks()
     node = writer.down(nets, "net")
-    read = lambda *classes: tree_json.Reader(dict(writer.arrays).pop, table=Table(classes)).up(node)
+    read = lambda *classes: npz.Reader(dict(writer.arrays).pop, table=Table(classes)).up(node)
     again = read(Own)
     assert eqx.tree_equal(nets, again) and again["own"].activation is jnp.sin
     with pytest.raises(ValueError, match="(?s)class .*Own"):

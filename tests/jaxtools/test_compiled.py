@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from lagjax.jaxtools.cache import FACTS
-from lagjax.jaxtools.compiled import WITHOUT_EMITTERS, compiler_options
+from lagjax.jaxtools.cache import FACTS, WITHOUT_EMITTERS, compiler_options
 
 # The room hands out a function of this name.
-compiled = import_module("lagjax.jaxtools.compiled")
+compiled = import_module("lagjax.jaxtools.cache")
 
 
 def test_unknown_options_are_left_out(monkeypatch):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax.jaxtools import elementary
-from lagjax.jaxtools.elementary import ARITHMETIC, sincos, sincos_in_lanes
+from lagjax.jaxtools import scalarize
+from lagjax.jaxtools.scalarize import ARITHMETIC, sincos, sincos_in_lanes
 from tests.jaxtools.in_numpy import evaluated
 
 rng = np.random.default_rng(19)
@@ -51,12 +51,12 @@ def ulps(found, exact, x):
 
 def fused(x):
     """Sine and cosine compiled as one program, in which XLA may fuse products and sums."""
-    return jax.jit(lambda x: elementary._by_arithmetic(x))(x)
+    return jax.jit(lambda x: scalarize._by_arithmetic(x))(x)
 
 
 def apart(x):
     """Sine and cosine with every operation rounded separately."""
-    return evaluated(elementary._by_arithmetic, x)
+    return evaluated(scalarize._by_arithmetic, x)
 
 
 @pytest.mark.optimised

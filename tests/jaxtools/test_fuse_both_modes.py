@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from lagjax.jaxtools.fuse_both_modes import one_function_in_both_modes
-from lagjax.jaxtools.fuse_cpu import one_function
+from lagjax.jaxtools.fuse import one_function, one_function_in_both_modes
 
 X, Y = np.array([[0.3, -0.7], [0.2, 0.5]])
 MODES = {"forward": jax.jacfwd, "reverse": jax.jacrev}

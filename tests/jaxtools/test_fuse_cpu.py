@@ -10,8 +10,8 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
-import lagjax.jaxtools.fuse_cpu as one_function_module
-from lagjax.jaxtools.fuse_cpu import (  # fmt: skip
+import lagjax.jaxtools.fuse as one_function_module
+from lagjax.jaxtools.fuse import (
     ONE_KERNEL,
     calls_host,
     fits,
@@ -20,7 +20,7 @@ from lagjax.jaxtools.fuse_cpu import (  # fmt: skip
     without_checks,
     without_library,
 )
-from lagjax.jaxtools.plain import is_plain
+from lagjax.jaxtools.tracing import is_plain
 
 pytestmark = [
     pytest.mark.optimised,

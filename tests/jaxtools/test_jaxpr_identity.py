@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxpr_as_fun
 
-from lagjax.jaxtools.jaxpr import callbacks_in_turn
-from lagjax.jaxtools.jaxpr_identity import (
+from lagjax.jaxtools.identity import (
     Itself,
     content_of,
     meaning_of,
@@ -16,6 +15,7 @@ from lagjax.jaxtools.jaxpr_identity import (
     with_own_constants,
     without_repeats,
 )
+from lagjax.jaxtools.jaxpr import callbacks_in_turn
 from tests.jaxtools.in_numpy import evaluated, run
 
 TABLE = np.arange(300.0)

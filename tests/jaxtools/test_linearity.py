@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.jaxtools.linearity import is_linear
+from lagjax.jaxtools.dependence import is_linear
 from tests.jaxtools.in_numpy import evaluated
 
 E, UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])

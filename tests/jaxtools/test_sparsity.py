@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.jaxtools.sparsity import pattern
+from lagjax.jaxtools.dependence import pattern
 from tests.jaxtools.in_numpy import evaluated
 
 CHOSEN = np.array([3, 1, 1, 0, 7])

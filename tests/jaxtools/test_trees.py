@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.jaxtools.trees import decided
+from lagjax.jaxtools.tracing import decided
 
 
 def _kept(through):

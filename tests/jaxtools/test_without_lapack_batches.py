@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 from lagjax.jaxtools.jaxpr import LAPACK
-from lagjax.jaxtools.without_lapack_batches import one_by_one
+from lagjax.jaxtools.primitives import one_by_one
 from tests.library_calls import batches_in, calls_in, text_of
 from tests.tiers import exhaustive_but
 

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 import lagjax as lj
 from lagjax.mechanics import with_first_order
-from lagjax.mechanics.first_order import resolved
+from lagjax.mechanics.lagrangian import resolved
 from lagjax.system import model_of
 from tests.jaxtools.in_numpy import accelerations, in_numpy
 

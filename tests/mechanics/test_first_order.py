@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import lagjax as lj
 from lagjax.mechanics import diagnosis, with_first_order
-from lagjax.mechanics.first_order import is_determined, of_states, resolved
+from lagjax.mechanics.lagrangian import is_determined, of_states, resolved
 from lagjax.system import coordinates, model_of
 from tests.jaxtools.in_numpy import accelerations, in_numpy
 

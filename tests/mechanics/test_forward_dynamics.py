@@ -8,7 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate.elements.in_modes import in_modes
 from lagjax.mechanics import equations_of
-from lagjax.mechanics.forward_dynamics import ForwardDynamics
+from lagjax.mechanics.saddle_point import ForwardDynamics
 from lagjax.system import State, model_of
 from tests.jaxtools.in_numpy import accelerations
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.equations import equations_of
-from lagjax.mechanics.projection import to_manifold
-from lagjax.mechanics.scalar_equations import is_small, write_out
+from lagjax.mechanics.consistent_state import to_manifold
+from lagjax.mechanics.equations import equations_of, is_small, write_out
 from lagjax.scenes import bead_on_hoop
 from lagjax.system import coordinates
 from lagjax.system.model import model_of
@@ -127,8 +126,8 @@ def test_a_massless_coordinate_is_left_to_arrays():
 
 def test_a_long_program_is_not_written_out(monkeypatch):
     """Writing out a potential by quadrature of 500 nodes is given up before its end; a short one is written out."""
-    monkeypatch.setattr("lagjax.mechanics.scalar_equations.LONG", 1_000_000)
-    monkeypatch.setattr("lagjax.mechanics.scalar_equations.ON_THE_WAY", 6e-3)
+    monkeypatch.setattr("lagjax.mechanics.equations.LONG", 1_000_000)
+    monkeypatch.setattr("lagjax.mechanics.equations.ON_THE_WAY", 6e-3)
     nodes = np.linspace(0.0, 6.0, 500)
     wire = lambda q: jnp.sum(1 / jnp.sqrt((q[0] - jnp.cos(nodes)) ** 2 + (q[1] - jnp.sin(nodes)) ** 2 + q[2] ** 2))
     system = lj.System(lambda t, q, v, params: 0.5 * v @ v + wire(q))

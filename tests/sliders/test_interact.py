@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.sliders.interact import Values, controls_of, start_of, words
+from lagjax.sliders import Values, controls_of, start_of, words
 from tests import by_hand
 from tests.counting import compiles
 

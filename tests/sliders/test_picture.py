@@ -7,8 +7,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lagjax.sliders.picture import FINE, MOST_PANELS, MOST_POINTS, Picture
-from lagjax.sweep.web_page import drawn
+from lagjax.sliders import FINE, MOST_PANELS, MOST_POINTS, Picture
+from lagjax.sweep.result import drawn
 from tests.tiers import exhaustive_but
 
 T = np.linspace(0.0, 1.0, 200)

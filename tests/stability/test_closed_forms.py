@@ -8,12 +8,28 @@ import pytest
 from scipy import integrate
 
 from lagjax.scenes import bead_on_hoop, sliding_wedge, sphere_geodesic
-from lagjax.stability.amplifying import _on_ellipse, amplifying, kepler
-from lagjax.stability.constraints import _on_the_rod, redundant, twice
-from lagjax.stability.geodesics import _circle_from_angles, by_angles
-from lagjax.stability.hoop_and_wedge import _bead_motion, _wedge_motion, single
-from lagjax.stability.long import UNIT, _whole_turns
-from lagjax.stability.stiff import _braking, _spring, _whirl, braked, whirled
+from lagjax.stability.closed_forms import (
+    UNIT,
+    _bead_motion,
+    _circle_from_angles,
+    _on_the_rod,
+    _wedge_motion,
+    _whole_turns,
+    by_angles,
+    redundant,
+    single,
+    twice,
+)
+from lagjax.stability.stiff_and_chaotic import (
+    _braking,
+    _on_ellipse,
+    _spring,
+    _whirl,
+    amplifying,
+    braked,
+    kepler,
+    whirled,
+)
 from tests.by_numpy import by_numpy, equations
 
 

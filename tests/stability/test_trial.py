@@ -7,26 +7,26 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax.numerics.methods.runge_kutta import Dopri8
-from lagjax.stability import oscillator
+from lagjax.numerics.runge_kutta import Dopri8
+from lagjax.stability import stiff_and_chaotic
 from lagjax.stability.trial import ACCURATE, DEGRADED, REFUSED, SILENTLY_WRONG, Trial
 from tests.test_stability import OUTCOME
 
 
 def fixed(step):
     """A thousand fixed steps of length `step` divided by the oscillator's frequency."""
-    options = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(step / oscillator.OMEGA)}
-    ts = np.linspace(0.0, 1000 * step / oscillator.OMEGA, 3)
-    params = {"omega": oscillator.OMEGA}
+    options = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": np.asarray(step / stiff_and_chaotic.OMEGA)}
+    ts = np.linspace(0.0, 1000 * step / stiff_and_chaotic.OMEGA, 3)
+    params = {"omega": stiff_and_chaotic.OMEGA}
     return Trial(
-        "test", f"{step}", oscillator.oscillator, 1.0, 0.0, params, ts, oscillator.exact, tolerance=1e-9,
+        "test", f"{step}", stiff_and_chaotic.oscillator, 1.0, 0.0, params, ts, stiff_and_chaotic.exact, tolerance=1e-9,
         method=Dopri8(), options=options, periods=1000 * step / (2 * np.pi), expected=None,
     )  # fmt: skip
 
 
 def detuned(q0, v0, params, ts):
     """A wrong reference: the frequency is off by 1e-6, and the phase by 2.5e-4."""
-    return oscillator.exact(q0, v0, {"omega": (1 + 1e-6) * params["omega"]}, ts)
+    return stiff_and_chaotic.exact(q0, v0, {"omega": (1 + 1e-6) * params["omega"]}, ts)
 
 
 def test_each_verdict():
@@ -69,7 +69,7 @@ def test_a_wrong_derivative_is_found():
     by_frequency = replace(fixed(0.25), along=(0.0, 0.0, {"omega": 1.0}))
     right = by_frequency.attempt()
     assert right.verdict == ACCURATE and right.gradient is not None and right.gradient < 1e-6
-    ignorant = lambda q0, v0, params, ts: oscillator.exact(q0, v0, jax.lax.stop_gradient(params), ts)
+    ignorant = lambda q0, v0, params, ts: stiff_and_chaotic.exact(q0, v0, jax.lax.stop_gradient(params), ts)
     wrong = replace(by_frequency, exact=ignorant).attempt()
     assert wrong.verdict == SILENTLY_WRONG and wrong.error == right.error
 
@@ -77,6 +77,8 @@ def test_a_wrong_derivative_is_found():
 def test_stability_function():
     """R of Bogacki & Shampine's method is 1 + z + z²/2 + z³/6, stable up to √3 on the imaginary axis."""
     z = np.array([0.3 - 2.0j, 1.5j])
-    np.testing.assert_allclose(oscillator.amplification(diffrax.Bosh3(), z), 1 + z + z**2 / 2 + z**3 / 6, rtol=1e-14)
-    assert oscillator.stable_limit(diffrax.Bosh3()) == pytest.approx(3**0.5, rel=1e-3)
-    assert oscillator.stable_limit(diffrax.Kvaerno5()) == np.inf
+    np.testing.assert_allclose(
+        stiff_and_chaotic.amplification(diffrax.Bosh3(), z), 1 + z + z**2 / 2 + z**3 / 6, rtol=1e-14
+    )
+    assert stiff_and_chaotic.stable_limit(diffrax.Bosh3()) == pytest.approx(3**0.5, rel=1e-3)
+    assert stiff_and_chaotic.stable_limit(diffrax.Kvaerno5()) == np.inf

@@ -8,7 +8,7 @@ import pytest
 from jax import flatten_util, lax
 
 import lagjax as lj
-from lagjax.steps.rollout import piece_length
+from lagjax.steps import piece_length
 from tests.by_numpy import network
 from tests.systems import HORIZONTAL, PARAMS, rod_pendulum
 

@@ -6,7 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from lagjax.sweep.chunks import Spec, chunk_file, nothing, read_chunk, write_chunk
+from lagjax.sweep.engine import nothing
+from lagjax.sweep.metadata import Spec, chunk_file, read_chunk, write_chunk
 from tests.sweep.small_stores import flip_bit
 
 

@@ -7,8 +7,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.sweep import store as store_module
-from lagjax.sweep.batch_program import LOST
-from lagjax.sweep.chunks import read_chunk
+from lagjax.sweep.engine import LOST
+from lagjax.sweep.metadata import read_chunk
 from lagjax.sweep.store import Store
 from tests.sweep.small_stores import (
     AXES,

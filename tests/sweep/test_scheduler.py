@@ -8,7 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate import Report, reported
 from lagjax.integrate.solve.harvest import Settled
-from lagjax.sweep import scheduler
+from lagjax.sweep import engine
 from tests.sweep.small_stores import scaled
 from tests.sweep.test_sweep import AXES, MAX_STEPS, quiet, swing
 from tests.systems import motion
@@ -70,7 +70,7 @@ def test_a_trajectory_knows():
 @pytest.mark.exhaustive
 def test_long_lanes_are_run_alone(monkeypatch):
     """Other lanes do not wait for them; lanes that hit the user's own step limit are not run again."""
-    monkeypatch.setattr(scheduler, "PATIENCE", 30)
+    monkeypatch.setattr(engine, "PATIENCE", 30)
     run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
     alone = run(2**16)
     swept = quiet(alone)

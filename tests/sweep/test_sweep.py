@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.display.progress import Silent
+from lagjax.display.terminal import Silent
 from lagjax.integrate import Report, reported
 from tests.sweep.small_stores import scaled
 from tests.systems import motion

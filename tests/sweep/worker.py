@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax as lj
-from lagjax.display.progress import Silent
+from lagjax.display.terminal import Silent
 
 jax.config.update("jax_enable_x64", True)
 

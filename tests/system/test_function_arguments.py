@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from lagjax.system.function_arguments import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, takes_of
+from lagjax.system.traced import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, takes_of
 
 
 class Declared:

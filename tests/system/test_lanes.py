@@ -8,7 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.jaxtools import length
 from lagjax.system import constraints, prepare
-from lagjax.system.lanes import opened, vectors
+from lagjax.system.traced import opened, vectors
 from tests.jaxtools.in_numpy import evaluated
 
 RNG = np.random.default_rng(5)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.system.states import with_rates
+from lagjax.system.checks import with_rates
 
 START = {"x": 1.0, "z": 0.0}, {"x": 0.0}
 

@@ -18,8 +18,8 @@ import pytest
 import lagjax as lj
 from lagjax.integrate.events.event import traced_guard
 from lagjax.jaxtools import cache
-from lagjax.system import coordinates, traced_functions
-from lagjax.system.check_functions import traced_system
+from lagjax.system import coordinates, traced
+from lagjax.system.checks import traced_system
 from tests.counting import compiles
 from tests.systems import PARAMS, TS, pendulum_lagrangian
 
@@ -277,7 +277,7 @@ def test_histories_would_show_it(monkeypatch):
     """Twin: if programs were kept by the shapes of arguments alone, answers would be wrong."""
     forget()
     with monkeypatch.context() as patched:
-        patched.setattr(traced_functions, "meaning_of", lambda jaxpr: len(jaxpr.eqns))
+        patched.setattr(traced, "meaning_of", lambda jaxpr: len(jaxpr.eqns))
         wrong, _ = wrong_answers(np.random.default_rng(0), 15)
     forget()
     assert wrong > 15
@@ -325,10 +325,10 @@ def with_default(t, q, v, params, k=1.0): return 0.5 * v**2 + k * q
 def with_eval(t, q, v, params): return eval("constant") * q
 """
     exec(source, names)
-    assert traced_functions.names_outside(names["plain"]) is not None
+    assert traced.names_outside(names["plain"]) is not None
     names["constant"] = 1.0
     for name in ("with_value", "with_import", "with_random", "with_default", "with_eval"):
-        assert traced_functions.names_outside(names[name]) is None, name
+        assert traced.names_outside(names[name]) is None, name
     plain = lj.System(names["plain"])
     at = lambda: float(lj.jacobi_integral(plain, 0.0, 0.0, 0.0, {"k": 1.0}))
     np.testing.assert_allclose(at(), -1 - np.pi)

@@ -7,8 +7,7 @@ import pytest
 from scipy.special import ellipe, ellipkm1
 
 import lagjax as lj
-from lagjax.two_points.answer import is_same
-from lagjax.two_points.result import Connection
+from lagjax.two_points.answer import Connection, is_same
 
 PARAMS = {"g": 9.81, "k": 0.3}
 thrown = lj.System(

@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.system import State, model_of
-from lagjax.two_points import descent
+from lagjax.two_points import starts
 from lagjax.two_points.elements import rule_of_degree
 from lagjax.two_points.path import FIXED, Ends
 from lagjax.two_points.starts import DEGREE, Sizes, sizes_of
@@ -19,15 +19,15 @@ def test_kinetic_energy_of_a_wave():
     t = (times[:-1, None] + np.diff(times)[:, None] * rule_of_degree(DEGREE).nodes[1:]).ravel()[:-1]
     wave = (np.sin(np.pi * t / 2.0)[:, None] * amplitude).ravel()
     exact = amplitude @ mass @ amplitude * np.pi**2 / 4.0
-    assert abs(wave @ descent._kinetic(times, DEGREE, mass) @ wave / exact - 1) < 1e-9
+    assert abs(wave @ starts._kinetic(times, DEGREE, mass) @ wave / exact - 1) < 1e-9
 
 
 def test_steps_within_a_radius():
     """The shift makes a step as long as the radius, and is zero where it is shorter."""
     slope, values = np.array([3.0, -1.0, 0.5]), np.array([1.0, 0.1, 2.0])
-    shift = descent._shift(slope, values, 0.5)
+    shift = starts._shift(slope, values, 0.5)
     assert abs(np.linalg.norm(slope / (values + shift)) - 0.5) < 1e-9
-    assert descent._shift(slope, values, 100.0) == 0.0
+    assert starts._shift(slope, values, 100.0) == 0.0
 
 
 def ends_of(a, b, time):
@@ -52,11 +52,11 @@ def test_slope_and_descent_on_a_constraint():
     height = 0.5 * np.sin(np.pi * at)
     x = np.stack([np.cos(2 * at), np.sin(2 * at), height], axis=1)
     x = (x / np.linalg.norm(x, axis=1, keepdims=True)).reshape(2, DEGREE, 3)
-    ground = descent._Ground(sphere, ends, parts, Sizes(np.ones(3), np.eye(3)))
+    ground = starts._Ground(sphere, ends, parts, Sizes(np.ones(3), np.eye(3)))
     place = ground.at(x, None)
     assert place is not None and place.allowed is not None
     step = 1e-4 * np.random.default_rng(0).normal(size=place.slope.size)
-    there, back = (ground.at(descent._moved(place, sign * step), place.multipliers) for sign in (1, -1))
+    there, back = (ground.at(starts._moved(place, sign * step), place.multipliers) for sign in (1, -1))
     assert there is not None and back is not None
     assert abs((there.action - back.action) / 2 / (place.slope @ step) - 1) < 1e-5
     second = there.action + back.action - 2 * place.action

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.two_points import mesh, optimal_control
-from lagjax.two_points.first_plan import split_controls
+from lagjax.two_points import optimal_control, transcription
+from lagjax.two_points.optimal_control import split_controls
 from lagjax.two_points.steering import Accuracy
 
 cart = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["push"])
@@ -241,8 +241,8 @@ def test_what_is_said_of_a_tolerance(accuracy, words):
 
 def test_meshes():
     """Elements are cut at a jump, near a bound of theirs are moved there, and keep it as they are halved."""
-    even = mesh.Mesh.even(4)
-    cut = even.cut([mesh.Jump(0.6, 0, True), mesh.Jump(0.251, 1, False)])
+    even = transcription.Mesh.even(4)
+    cut = even.cut([transcription.Jump(0.6, 0, True), transcription.Jump(0.251, 1, False)])
     np.testing.assert_allclose(cut.parts, [0.0, 0.251, 0.5, 0.6, 0.75, 1.0])
     assert sorted(cut.jumps) == [1, 3] and sorted(cut.halved().jumps) == [2, 6] and cut.halved().count == 10
     low, high = cut.limits()
@@ -259,7 +259,7 @@ def test_controls_at_a_jump(falls):
     layout = SimpleNamespace(places=places | {"v": places["q"]}, size=14, of_controls=np.arange(4)[:, None])
     limits = {"q": (-1.0, 1.0), "v": (-1.0, 1.0), "controls": (np.array([-2.0, -3.0]), np.array([2.0, 3.0]))}
     question = SimpleNamespace(limits=limits, t_b=(1.0, 1.0), ends=(none, none))
-    cut = mesh.Mesh(np.linspace(0.0, 1.0, 5), {2: [mesh.Jump(0.5, 1, falls)]})
+    cut = transcription.Mesh(np.linspace(0.0, 1.0, 5), {2: [transcription.Jump(0.5, 1, falls)]})
     low, high = optimal_control._limits_of(question, layout, cut)
     known = {1: 3.0 if falls else -3.0, 2: -3.0 if falls else 3.0}
     for k in range(4):

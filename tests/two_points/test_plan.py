@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from lagjax.two_points.plan import plan_of
+from lagjax.two_points.steering import plan_of
 from tests.by_numpy import by_numpy
 
 

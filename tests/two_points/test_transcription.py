@@ -6,10 +6,9 @@ import pytest
 import scipy.sparse as sp
 
 import lagjax as lj
-from lagjax.two_points.layout import Layout
-from lagjax.two_points.mesh import Mesh, moved
+from lagjax.two_points.control_problem import asked
 from lagjax.two_points.nonlinear_program import NonlinearProgram
-from lagjax.two_points.question import asked
+from lagjax.two_points.transcription import Layout, Mesh, moved
 
 # A skate whose path is also held on a cylinder, for constraints of both kinds.
 skate = lj.System(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.work_precision.programs import ComparedMotion
+from lagjax.work_precision.methods import ComparedMotion
 from tests.systems import motion
 from tests.work_precision.test_work_precision import compared, swing
 

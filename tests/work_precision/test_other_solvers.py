@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lagjax.work_precision.other_solvers import dop853, usual_others
+from lagjax.work_precision.methods import dop853, usual_others
 
 TS, PARAMS = np.linspace(0.0, 2.0, 5), {"k": 4.0}
 START = {"x": 1.0}, {"x": 0.0}

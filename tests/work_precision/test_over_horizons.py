@@ -8,7 +8,7 @@ from scipy import special
 
 import lagjax as lj
 from lagjax.work_precision import Horizons
-from lagjax.work_precision.over_horizons import STEPS, Needed
+from lagjax.work_precision.work_precision import STEPS, Needed
 from tests.by_hand import swing
 from tests.systems import PARAMS, pendulum
 

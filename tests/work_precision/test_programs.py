@@ -9,8 +9,8 @@ import pytest
 
 from lagjax import System, Tsit5
 from lagjax.system import coordinates
-from lagjax.work_precision import programs
-from lagjax.work_precision.programs import (
+from lagjax.work_precision import methods
+from lagjax.work_precision.methods import (
     RESOLVED,
     VERY_LONG,
     ComparedMotion,
@@ -37,7 +37,7 @@ def oscillation(system, q, v, params, *, ts, rtol, method, throw, **options):
 
 def test_motions_that_differ_in_numbers_share_a_program(monkeypatch):
     """Each has its own motion, cos ωt; twin: a jump's time is part of the program, which is then another."""
-    monkeypatch.setattr(programs, "integrate", oscillation)
+    monkeypatch.setattr(methods, "integrate", oscillation)
 
     def program(omega, options):
         start = coordinates.state(0.0, 1.0, 0.0, {"omega": omega})

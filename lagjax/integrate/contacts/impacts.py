@@ -20,7 +20,7 @@ constant γ_N. Then, with γ₀ the sliding velocity after the impact without fr
 The contact sticks, with σ = -γ₀, if that is in the cone. Otherwise it slides to the side s of γ₀, with
 Λ_T = -s μ c n / (1 - s μ k). For Λ_T = -ρ μ Λ_N, γ_T' falls strictly from ρ = -1 to 1 as long as Λ_N > 0, so that there
 is exactly one solution; if that denominator is not above zero, friction jams the contact before it slides, and sticking
-is in the cone. Unlike the forces of a motion (`multiplier_forces.py`), an impact with Newton's law has no paradox,
+is in the cone. Unlike the forces of a motion (`lagrangian.py`), an impact with Newton's law has no paradox,
 except for a contact whose sliding velocity is fixed by the gap and the constraints, γ_T' = γ₀ whatever friction does.
 If friction would then exceed what pushes the contact together, there is no impulse, and the velocities are NaN.
 

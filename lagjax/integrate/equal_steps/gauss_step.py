@@ -1,4 +1,4 @@
-"""One step of the variational integrator by Gauss' quadrature (`numerics/methods/gauss.py`).
+"""One step of the variational integrator by Gauss' quadrature (`numerics/symplectic.py`).
 
 The unknowns of a step are the velocities V_i at its nodes, the multipliers λ_j of constraints on positions at Lobatto's
 nodes but the last, and those of velocity constraints, μ_i, at Gauss' nodes. They are found by iteration. With what the

@@ -7,7 +7,7 @@ Of the length h, with the forces at both ends and the multipliers κ that bring 
     u1 = u½ + h/2 M⁻¹ F(x1) + M⁻¹ A(x1)ᵀ μ                              0 = A(x1) u1 + ∂g/∂t
 
 It is symmetric and, on the constraints, symplectic, of order 2; steps of the lengths γ_i h after each other
-(`numerics/methods/splitting.py`) are so of a higher order. κ is found by iteration with A(x1) M⁻¹ A(x0)ᵀ at a guess of
+(`numerics/symplectic.py`) are so of a higher order. κ is found by iteration with A(x1) M⁻¹ A(x0)ᵀ at a guess of
 x1, and is h/2 times the multiplier there. Of constraints that depend on each other a largest independent set is kept in
 each step, chosen at its start: the others then hold as well.
 

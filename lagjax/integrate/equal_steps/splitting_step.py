@@ -1,4 +1,4 @@
-"""One step of an explicit symplectic splitting (`numerics/methods/splitting.py`)."""
+"""One step of an explicit symplectic splitting (`numerics/symplectic.py`)."""
 
 from typing import NamedTuple
 

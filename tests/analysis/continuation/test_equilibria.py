@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.continuation.arclength import BranchPath, Tracer
+from lagjax.analysis.arclength import BranchPath, Tracer
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (  # fmt: skip  # fmt: skip
     BUCKLING,

@@ -7,10 +7,9 @@ import pytest
 from scipy import integrate, optimize, special
 
 import lagjax as lj
-from lagjax.analysis.continuation.arclength import BranchPoint
-from lagjax.analysis.continuation.orbit_equations import extent
-from lagjax.analysis.continuation.orbit_result import CriticalOrbit
-from lagjax.analysis.continuation.orbits import _zero
+from lagjax.analysis.arclength import BranchPoint
+from lagjax.analysis.cycle_equations import extent
+from lagjax.analysis.cycles import CriticalOrbit, _zero
 from tests.analysis import closed_forms as known
 from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, block, bounce_of, bouncing, stick_slip
 from tests.systems import PARAMS, pendulum, rod_pendulum

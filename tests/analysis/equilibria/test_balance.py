@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.equilibria.balance import Steady, SteadySymmetries, balance, departures, shortest_multipliers
-from lagjax.analysis.equilibria.equilibria import _zero_modes
-from lagjax.analysis.equilibria.result import Equilibria, merged
+from lagjax.analysis.balance import (
+    Equilibria,
+    Steady,
+    SteadySymmetries,
+    balance,
+    departures,
+    merged,
+    shortest_multipliers,
+)
+from lagjax.analysis.equilibria import _zero_modes
 from lagjax.scenes import cross_rails
 from lagjax.system.model import model_of
 from tests.analysis.steady_systems import DISK, UPRIGHT_DISK, disk, straight_on

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.equilibria.result import NO_BALANCE, NOT_FINITE, NOT_LASTING
+from lagjax.analysis.balance import NO_BALANCE, NOT_FINITE, NOT_LASTING
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import about_z, conical
 from tests.systems import PARAMS, pendulum

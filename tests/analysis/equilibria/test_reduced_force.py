@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.equilibria.result import NO_BALANCE
+from lagjax.analysis.balance import NO_BALANCE
 
 HILLS = lj.System(
     lambda t, q, v, p: 0.5 * v**2 - sum(c * (q - p["at"]) ** k for k, c in enumerate(p["c"], 1)),

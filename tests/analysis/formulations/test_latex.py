@@ -10,7 +10,7 @@ import pytest
 import sympy
 
 import lagjax as lj
-from lagjax.analysis.formulations.latex import FORMULAS, jaxpr_to_formula, simplified, typeset, written
+from lagjax.analysis.latex import FORMULAS, jaxpr_to_formula, simplified, typeset, written
 from lagjax.scenes import cross_rails, sliding_wedge
 
 X, Y = sympy.symbols("x y", real=True)

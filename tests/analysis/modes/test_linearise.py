@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.modes.linearise import _changed, _singular
-from lagjax.analysis.modes.reduced_matrices import Raw, _least_squares
+from lagjax.analysis.linearise import Raw, _changed, _least_squares, _singular
 from lagjax.scenes import cross_rails
 from lagjax.system import coordinates
 from tests.analysis import small_systems as small

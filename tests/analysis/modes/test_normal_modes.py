@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.modes import NormalModes
+from lagjax.analysis.normal_modes import NormalModes
 from lagjax.scenes import cross_rails
 from tests.analysis import small_systems as small
 from tests.analysis.steady_systems import DISK, TOP, UPRIGHT, UPRIGHT_DISK, disk, straight_on, top

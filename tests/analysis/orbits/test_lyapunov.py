@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.orbits import LyapunovExponents
-from lagjax.analysis.orbits.lyapunov import _estimates
+from lagjax.analysis.exponents import LyapunovExponents, _estimates
 from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, PERIOD, E, block, bounce, bouncing, stick_slip
 from tests.by_numpy import by_numpy
 from tests.systems import PARAMS, pendulum, rod_pendulum

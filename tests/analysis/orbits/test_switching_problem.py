@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.orbits.switching_problem import any_problem_of
+from lagjax.analysis.monodromy import any_problem_of
 from lagjax.system import State
 from tests.analysis.orbits.test_switching_flow import BELT, block, bouncing, bouncing_by_element, wheel
 

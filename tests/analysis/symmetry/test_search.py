@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.symmetry.result import Ratios, in_words
+from lagjax.analysis.symmetry_result import Ratios, in_words
 from lagjax.scenes import cross_rails, mass_distributions, sliding_wedge
 from tests.symmetric_systems import DISK, IN_SPACE, KEPLER, OF_KEPLER, OF_STONE, ON_PLANE, RADIUS, STONE, rolling
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lagjax.display import CUBE, SPHERE, Anchor, Animation, InSpace, Shape, film, film_scripts, stills_in_space
-from lagjax.display.in_space.painting import marks, trails
-from lagjax.display.in_space.view import view_of
+from lagjax.display.painting import marks, trails, view_of
 from tests.display.web_page.test_page import NASTY, told
 
 T = np.linspace(0.0, 2.0, 51)

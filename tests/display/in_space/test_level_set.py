@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lagjax.display.in_space.level_set import CELLS, level_set
-from lagjax.display.in_space.surfaces import MOST, Faces, fewer
+from lagjax.display.scenery import CELLS, MOST, Faces, fewer, level_set
 
 LOW, HIGH = -1.3 * np.ones(3), np.array([1.2, 1.5, 1.4])
 

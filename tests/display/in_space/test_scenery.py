@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lagjax.display import CUBE, TUBE, Anchor, InSpace, Shape
-from lagjax.display.in_space.scenery import along, placed
+from lagjax.display.scenery import along, placed
 
 RANDOM = np.random.default_rng(3)
 

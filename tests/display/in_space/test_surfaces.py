@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, surface
-from lagjax.display.in_space.surfaces import SIDES
+from lagjax.display.scenery import SIDES
 
 # The area of a regular polygon in the unit circle.
 POLYGON = SIDES / 2 * np.sin(2 * np.pi / SIDES)

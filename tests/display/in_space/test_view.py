@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from lagjax.display import CUBE, SPHERE, Anchor, InSpace, Shape
-from lagjax.display.in_space.painting import marks
-from lagjax.display.in_space.view import WIDTH, grid_under, labelled, view_of
+from lagjax.display.painting import WIDTH, grid_under, labelled, marks, view_of
 
 RANDOM = np.random.default_rng(5)
 LOW, HIGH = np.array([-1.0, -2.0, 0.5]), np.array([3.0, 1.0, 2.5])

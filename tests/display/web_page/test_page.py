@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from lagjax.display.web_page import Page, encoded, fragment, whole
+from lagjax.display.page import Page, encoded, fragment, whole
 
 NASTY = '</script><script>alert("1")</script><!-- & \u2028'
 

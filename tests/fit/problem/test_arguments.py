@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.fit.problem.arguments import problem_of
+from lagjax.fit.arguments import problem_of
 from tests.fit.cases import PENDULUM, pendulum
 
 T = np.linspace(0.0, 1.0, 20)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.fit.problem import checks
-from lagjax.fit.problem.checks import check_predicted
-from lagjax.fit.problem.initial_states import _guess, _parabola
-from lagjax.fit.problem.residuals import starts_at
+from lagjax.fit import residuals
+from lagjax.fit.residuals import check_predicted, starts_at
+from lagjax.fit.unknowns import _guess, _parabola
 from lagjax.numerics import Unknowns
 from tests.fit.cases import CASES, pendulum
 
@@ -101,10 +100,10 @@ def test_a_motion_that_fails(monkeypatch):
     def integrate(system, q, v, params, *, ts, throw, **options):
         raise ValueError(f"{q} after {v} with {params} at {ts}, {throw}, {options}")
 
-    monkeypatch.setattr(checks, "integrate", integrate)
+    monkeypatch.setattr(residuals, "integrate", integrate)
     setting = lambda x, s, w, stage: ("ts", x, (s, w), {"throw": False, "rtol": 1e-3})
     problem = SimpleNamespace(system=pendulum, setting=setting, windows=SimpleNamespace(record=np.array([0, 7])))
-    checks.check_motion(problem, np.array([True, True]), Unknowns("x", "ab"))
+    residuals.check_motion(problem, np.array([True, True]), Unknowns("x", "ab"))
     words = "the motion of record 7 fails: b after 1 with x at ts, True, {'rtol': 0.001}"
     with pytest.raises(ValueError, match=f"from the guess {words}"):
-        checks.check_motion(problem, np.array([True, False]), Unknowns("x", "ab"))
+        residuals.check_motion(problem, np.array([True, False]), Unknowns("x", "ab"))

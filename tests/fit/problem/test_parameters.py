@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.fit.problem import parameters
+from lagjax.fit import unknowns
 
 
 def found_priors(params, priors={}, error=1.0):
     """The names of all numbers with a prior, with its mean and standard deviation, and the entries with weak ones."""
-    found = parameters.find(params, None, {}, priors, np.dtype(float), error)
+    found = unknowns.find(params, None, {}, priors, np.dtype(float), error)
     rows = zip(found.names, found.mean, found.sd)
     return {name: (float(mean), float(sd)) for name, mean, sd in rows if np.isfinite(sd)}, found.weak
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from lagjax.fit.problem.residuals import WHOLE, _counts, equations
-from lagjax.fit.search.search import linearised
+from lagjax.fit.residuals import WHOLE, _counts, equations
+from lagjax.fit.search import linearised
 from tests.fit.cases import CASES
 
 

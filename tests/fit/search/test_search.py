@@ -9,9 +9,9 @@ import pytest
 from scipy.special import chdtri
 
 import lagjax as lj
-from lagjax.fit.problem.arguments import problem_of
-from lagjax.fit.problem.residuals import dampened
-from lagjax.fit.search.search import CHANCE, _exceeded_by_chance, _undampened, misfit
+from lagjax.fit.arguments import problem_of
+from lagjax.fit.residuals import dampened
+from lagjax.fit.search import CHANCE, _exceeded_by_chance, _undampened, misfit
 from lagjax.numerics.windowed_least_squares import WindowedEquations
 from tests.fit.cases import formula, in_closed_form
 

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from lagjax.fit.uncertainty.candidates import assess, eliminate_unknowns, sd_after_each, sd_of
+from lagjax.fit.next_measurement import assess, eliminate_unknowns, sd_after_each, sd_of
 from tests.fit.uncertainty.test_next_measurement import SIGMA, parabola, sds
 
 LEAST = 1e-7

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.fit.problem.arguments import problem_of
-from lagjax.fit.search.search import LinearisedResiduals
-from lagjax.fit.uncertainty import next_measurement
-from lagjax.fit.uncertainty.next_measurement import Survey, next_measurements
+from lagjax.fit import next_measurement
+from lagjax.fit.arguments import problem_of
+from lagjax.fit.next_measurement import Survey, next_measurements
+from lagjax.fit.search import LinearisedResiduals
 from lagjax.numerics import Slopes
 from tests.counting import compiles
 from tests.fit.cases import CASES, HUNG, PENDULUM, TS, formula, hung, in_closed_form, noisy, pendulum
@@ -240,7 +240,7 @@ def test_words_elsewhere(monkeypatch):
     with pytest.raises(ValueError, match="no parameter is fitted"):
         next_measurement._direction(problem_for([fallen], free=()), "g")
     monkeypatch.setattr(
-        import_module("lagjax.fit.identifiability"), "survey", lambda problem, u: Survey(None, problem.measured)
+        import_module("lagjax.fit.uncertainty"), "survey", lambda problem, u: Survey(None, problem.measured)
     )
     of = lambda q: lj.identifiability(fall, lj.Record(T, q=q, sigma=SIGMA), {"g": 9.81}, shrink="g").next.now
     with pytest.raises(TypeError, match="not in jit, vmap or lj.sweep"):

@@ -13,7 +13,7 @@ from lagjax.system.coordinates import State
 from lagjax.system.model import model_of
 
 # The room hands out a function of this name.
-legendre = import_module("lagjax.analysis.formulations.hamiltonian")
+legendre = import_module("lagjax.analysis.formulations")
 KNOTS, HEIGHTS = np.array([-1.0, 0.0, 0.5, 2.0]), np.array([1.0, 0.0, -0.2, -3.0])
 free = lambda t, q, v, params: 0.5 * v**2
 JUMPING = {

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.numerics.linalg import banded
-from lagjax.numerics.linalg.rank import independent_rows
+from lagjax.numerics import banded
+from lagjax.numerics.dense import independent_rows
 from tests.tiers import exhaustive_but
 
 

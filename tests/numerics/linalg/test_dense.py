@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax.numerics.linalg import dense
-from lagjax.numerics.linalg.dense import Saddle
+from lagjax.numerics import dense
+from lagjax.numerics.dense import Saddle
 from tests.tiers import exhaustive_but
 
 solve = jax.jit(dense.solve)

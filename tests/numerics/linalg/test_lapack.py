@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from lagjax.numerics.linalg import lapack
+from lagjax.numerics import lapack
 
 RNG = np.random.default_rng(3)
 MATRICES = RNG.normal(size=(3, 4, 4))

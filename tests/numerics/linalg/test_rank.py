@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from lagjax.jaxtools import length
-from lagjax.numerics.linalg.rank import DEPENDENT_BELOW, independent_rows, unit_rows
+from lagjax.numerics.dense import DEPENDENT_BELOW, independent_rows, unit_rows
 from tests.numerics.methods.driven_pendulum import in_numpy
 
 RNG = np.random.default_rng(11)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lagjax import RK4, Dopri8, Nystrom8, Nystrom12, Tsit5
-from lagjax.numerics.methods.nystrom import RKN86, RKN1210
+from lagjax.numerics.runge_kutta import RKN86, RKN1210
 from tests.numerics.methods.driven_pendulum import errors, in_numpy, swing
 
 ORDERS = [

@@ -10,8 +10,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from lagjax.numerics.methods import radau
-from lagjax.numerics.methods.radau import Radau5, SimplifiedNewton, with_tolerances
+from lagjax.numerics import radau
+from lagjax.numerics.radau import Radau5, SimplifiedNewton, with_tolerances
 from tests.numerics.methods.driven_pendulum import in_numpy
 from tests.tiers import exhaustive_but
 

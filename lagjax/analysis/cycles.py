@@ -1,0 +1,619 @@
+"""How a cycle changes with a parameter: a branch of cycles, its folds, and where it becomes unstable.
+
+At a critical point a multiplier passes 1 or -1, or a pair leaves the unit circle.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, PyTree
+
+from lagjax.analysis.arclength import AT_EDGE, BranchPath, BranchPoint, no_such_number, numbers_in
+from lagjax.analysis.branches import (
+    OTHER_MARK,
+    STABLE,
+    UNKNOWN,
+    UNSTABLE,
+    draw_by_stability,
+    name_stability,
+    stability_in_words,
+)
+from lagjax.analysis.cycle_equations import (
+    ENERGY,
+    ENTRY,
+    NUMBER,
+    PERIOD,
+    Along,
+    Guide,
+    OrbitFrame,
+    OrbitTracer,
+    drive_by_parameter,
+    sizes_at,
+)
+from lagjax.analysis.flow import any_flow
+from lagjax.analysis.monodromy import OrbitProblem, any_problem_of, tolerance_of, user_system
+from lagjax.analysis.periodic_orbit import PeriodicOrbit
+from lagjax.analysis.shooting import OrbitRequest, guessed
+from lagjax.display import plots as plot
+from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
+from lagjax.system import State, checked, coordinates
+
+MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4)}
+
+
+class CriticalOrbit(eqx.Module):
+    """A point where a branch of cycles folds, where others branch off, or where stability is lost.
+
+    - `kind`: `"fold"`, where the parameter turns; `"branch point"`, where a multiplier passes 1 and the branch
+      continues, or where the parameter turns as the branch meets another, of whose orbits it is a side branch;
+      `"period doubling"`,
+      where one passes -1; `"torus"`, where a pair leaves the unit circle (Neimark-Sacker; without damping two pairs
+      meet).
+    - `parameter`: its value; `accuracy`: how far off it may be; `located`: False where no more is known than that it
+      lies between two points of the branch, since the equations are nearly singular there.
+    - `index`: its index on the branch: `branch[index]` is the cycle.
+    - `multipliers` (k,): the trivial ones (1 for a known reason) first.
+    """
+
+    kind: str = eqx.field(static=True)
+    parameter: Float[Array, ""]
+    accuracy: Float[Array, ""]
+    index: int = eqx.field(static=True)
+    multipliers: Complex[Array, " k"]
+    located: bool = eqx.field(static=True, default=True)
+
+    def __repr__(self):
+        return f"{self.kind} at {float(self.parameter):.10g}{self.doubt}"
+
+    @property
+    def doubt(self) -> str:
+        """In words, how far off the parameter may be, where it was not located."""
+        return "" if self.located else f" (to {float(self.accuracy):.0e})"
+
+
+class OrbitBranch(eqx.Module):
+    """One curve of P cycles, in their order along it: `branch[i]` is a `PeriodicOrbit`.
+
+    - `parameter`, `period` (P,); `q`, `v`: the state at the start of each, with a leading axis P.
+    - `low`, `high`: the smallest and the largest value of each coordinate over a period, like `q`; accurate to 1e-6.
+    - `stable` (P,): whether no multiplier is outside the unit circle; `multipliers` (P, k): the trivial ones first.
+    - `critical`: a list of `CriticalOrbit`, in the order along the branch.
+    - `along`, `first`, `last`: the parameter and its range. `status`: where and why the branch ends.
+    """
+
+    parameter: Float[Array, " P"]
+    period: Float[Array, " P"]
+    q: PyTree[Float[Array, "P ..."]]
+    v: PyTree[Float[Array, "P ..."]]
+    low: PyTree[Float[Array, "P ..."]]
+    high: PyTree[Float[Array, "P ..."]]
+    stable: Bool[Array, " P"]
+    multipliers: Complex[Array, "P k"]
+    nodes: Float[Array, "P K 2n"]
+    critical: list[CriticalOrbit]
+    orbit: PeriodicOrbit
+    place: Along
+    along: str = eqx.field(static=True)
+    first: float = eqx.field(static=True)
+    last: float = eqx.field(static=True)
+    status: str = eqx.field(static=True)
+
+    def __len__(self):
+        return len(self.parameter)
+
+    def __getitem__(self, i: int) -> PeriodicOrbit:
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"there are {len(self)} cycles, branch[0] to branch[{len(self) - 1}].")
+
+        def pick(tree: PyTree):
+            return jax.tree.map(lambda x: x[i], tree)
+
+        system, params = self.orbit.system, self.orbit.params
+        if self.place.kind == NUMBER and self.place.number is not None:
+            params = self.place.number.put(params, self.parameter[i])
+        arrays, static = hashable_partition((system, coordinates.as_arrays(params, self.orbit.t.dtype)))
+        return replace(
+            self.orbit, q=pick(self.q), v=pick(self.v), period=self.period[i], nodes=self.nodes[i], arrays=arrays,
+            static=static, switches=None,
+        )  # fmt: skip
+
+    def of_kind(self, kind: str) -> list[CriticalOrbit]:
+        """The critical points of one kind, `"fold"`, `"period doubling"`, ..."""
+        return [c for c in self.critical if c.kind == kind]
+
+    @plot.names_as_they_are()
+    def plot(self, *names: str):
+        """Draw the largest value of coordinates against the parameter: stable solid, unstable dashed, with markers.
+
+        **Arguments:** `names` of coordinates, or `"period"`, one panel each; by default the first six coordinates.
+
+        **Returns:** a matplotlib `Figure`.
+
+        **Raises:** `ValueError` for an unknown name; `ImportError` without matplotlib.
+        """
+        known = self._names()
+        if unknown := [name for name in names if name not in (*known, "period")]:
+            raise ValueError(
+                f"plot({unknown[0]!r}) names no coordinate; there are {', '.join(known)}, and 'period'.\n"
+                f"Fix: plot({known[0]!r})."
+            )
+        shown = list(names) or known[:6]
+        fig, axes = plot.panel_axes(len(shown), 2, (4.8, 3.4))
+        for axis, name in zip(axes, shown):
+            self.draw(axis, name)
+        axes[0].legend(fontsize=8, frameon=False)
+        return fig
+
+    def draw(self, axis, name: str | None = None):
+        """Draw the largest value of one coordinate, by default the first, or `"period"`, on matplotlib axes."""
+        name = self._names()[0] if name is None else name
+        y, verdicts = self._values(name), self._verdicts()
+        draw_by_stability(axis, np.asarray(self.parameter), y, verdicts, plot.COLOURS[0])
+        name_stability(axis, [verdicts])
+        for c in self.critical:
+            marker, colour = MARKS.get(c.kind, OTHER_MARK)
+            axis.plot(
+                float(c.parameter), y[c.index], marker, color=plot.COLOURS[colour], markeredgecolor="white",
+                markersize=7, linestyle="", zorder=4,
+                label=None if c.kind in axis.get_legend_handles_labels()[1] else c.kind,
+            )  # fmt: skip
+        axis.set(xlabel=self.along, ylabel=name if name == "period" else f"largest {name}")
+
+    def _names(self):
+        return coordinates.names(self.orbit.q)
+
+    def _values(self, name: str):
+        if name == "period":
+            return np.asarray(self.period)
+        leaves = [np.asarray(x).reshape(len(self), -1) for x in jax.tree.leaves(self.high)]
+        return np.concatenate(leaves, axis=1)[:, self._names().index(name)]
+
+    def _verdicts(self):
+        known = np.all(np.isfinite(self.multipliers), axis=1)
+        return np.where(known, np.where(self.stable, STABLE, UNSTABLE), UNKNOWN)
+
+    def __repr__(self):
+        count = len(self.critical)
+        points = f"{count} critical point{'s' * (count != 1)}" if count else "no critical point"
+
+        def number(x: float) -> str:
+            return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.10g}"
+
+        reached = [float(np.min(self.parameter)), float(np.max(self.parameter))]
+        reached = reached if self.first <= self.last else reached[::-1]
+        # Of the range that was asked for, which ends may lie beside by round-off.
+        whole = abs(reached[1] - self.last) < 1e-9 * abs(self.last - self.first)
+        span = f"from {number(reached[0])} to {number(reached[1])}" + ("" if whole else f" (asked to {self.last:.6g})")
+        lines = [f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {points}"]
+        lines += [
+            f"  {c.kind:<16}{self.along} = {number(c.parameter) + c.doubt:<14} {_torus_angle(c)}" for c in self.critical
+        ]
+        low, high = np.min(self.period), np.max(self.period)
+        lines.append(f"  {'periods':<16}{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else ""))
+        lines.append(f"  {'stability':<16}{stability_in_words(self._verdicts())}")
+        where = f", {self.along} = {number(self.parameter[-1])}" if self.status == AT_EDGE else ""
+        lines.append(f"  {'ends at':<16}{self.status}{where}")
+        return "\n".join(lines)
+
+
+def _torus_angle(c: CriticalOrbit):
+    """For a torus, the angle of its pair of multipliers; otherwise nothing."""
+    if c.kind != "torus":
+        return ""
+    upper = np.asarray(c.multipliers)[np.imag(c.multipliers) > 1e-6]
+    if not upper.size:
+        return ""
+    pair = upper[np.argmin(np.abs(np.abs(upper) - 1))]
+    return f"a pair at ±{np.angle(pair):.6g} rad"
+
+
+HALVINGS = 40
+# A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
+DIPS, VERTICES = 0.3, 8
+
+
+class FoundOrbit(NamedTuple):
+    """The kind of a critical point, the point, how far off its parameter may be, and whether it was located."""
+
+    kind: str
+    point: BranchPoint
+    accuracy: float
+    located: bool = True
+
+
+def between(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint) -> list[FoundOrbit]:
+    """All critical points between two neighbouring points."""
+    found = []
+    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
+    if folds:
+        # At a pitchfork the parameter turns along the side branch, where the multiplier only touches 1.
+        kind = "fold" if crosses or not tracer.crosses else "branch point"
+        found.append(_zero(tracer, a, b, kind, lambda p: p.tangent[-1]))
+    elif crosses:
+        found.append(_zero(tracer, a, b, "branch point", lambda p: p.outputs.plus))
+    if a.outputs.minus * b.outputs.minus < 0:
+        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.outputs.minus))
+    if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
+        found.append(_torus(tracer, a, b))
+    return [one for one in found if one is not None]
+
+
+def dips(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[FoundOrbit | BranchPoint]:
+    """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
+    for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
+        left, middle, right = of(a), of(b), of(c)
+        same = left * middle > 0 and middle * right > 0
+        if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
+            continue
+        lowest = _beyond_zero(tracer, a, b, c, of)
+        if lowest is not None:
+            sides = [_zero(tracer, a, lowest, kind, of), _zero(tracer, lowest, c, kind, of)]
+            return [one for one in (sides[0], lowest, sides[1]) if one is not None]
+    return []
+
+
+def _beyond_zero(tracer, a, b, c, of):
+    """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
+
+    def length(p: BranchPoint, q: BranchPoint) -> float:
+        return float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
+
+    whole = length(a, b) + length(b, c)
+    x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
+    sign, tried = np.sign(f[0]), set(x)
+    for _ in range(VERTICES):
+        near = np.argsort(np.abs(np.array(x) - x[int(np.argmin(np.abs(f)))]))[:3]
+        (x0, x1, x2), (f0, f1, f2) = np.array(x)[near], np.array(f)[near]
+        slope, bend = (f1 - f0) / (x1 - x0), ((f2 - f1) / (x2 - x1) - (f1 - f0) / (x1 - x0)) / (x2 - x0)
+        if not np.isfinite(bend) or bend * sign <= 0:
+            return None
+        vertex = 0.5 * (x0 + x1) - slope / (2 * bend)
+        point = tracer.between(a, c, vertex) if 0 < vertex < 1 and vertex not in tried else None
+        if point is None:
+            return None
+        if of(point) * sign < 0:
+            return point
+        tried.add(vertex)
+        x.append(vertex)
+        f.append(of(point))
+    return None
+
+
+def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
+    found = tracer.zero_between(a, b, of)
+    if found is None:
+        return None
+    point, off = found
+    if np.isfinite(off):
+        return FoundOrbit(kind, point, off * tracer.unit)
+    # Somewhere between the two points: by a straight line, and how far the parameter changes on the way.
+    share = of(a) / (of(a) - of(b))
+    point = tracer.between(a, b, share) or replace(a if share < 0.5 else b)
+    length, steepest = np.sqrt(tracer.weights @ (b.z - a.z) ** 2), max(abs(a.tangent[-1]), abs(b.tangent[-1]))
+    off = max(abs(float((b.z - a.z)[-1])), float(length * steepest))
+    return FoundOrbit(kind, point, off * tracer.unit, located=False)
+
+
+def _torus(tracer, a, b) -> FoundOrbit | None:
+    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
+    many = a if a.growing > b.growing else b
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
+    slowest = min(outside, key=abs, default=1.0)
+    if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
+        return None
+    found = _zero(tracer, a, b, "torus", lambda p: p.outputs.pairs)
+    if found is not None:
+        return found
+    low, high, point = 0.0, 1.0, None
+    for _ in range(HALVINGS):
+        share = 0.5 * (low + high)
+        middle = tracer.between(a, b, share)
+        if middle is None or middle.growing is None or share in (low, high):
+            break
+        point = middle
+        low, high = (share, high) if middle.growing == a.growing else (low, share)
+    off = abs(float(b.z[-1] - a.z[-1])) * (high - low) * tracer.unit
+    return None if point is None else FoundOrbit("torus", point, off)
+
+
+# Singular values of the equations below this fraction of the largest count as zero.
+DEPENDENT = 1e-7
+# The period of a drive counts as constant if its logarithm changes by less.
+CONSTANT = 1e-9
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
+
+
+def continue_orbits(
+    orbit: PeriodicOrbit, *, along: str, to: float, rtol: float | None = None, most_points: int = 1000
+) -> OrbitBranch:
+    """Follow a periodic orbit as a parameter changes, through folds, with its stability.
+
+    >>> import jax.numpy as jnp
+    >>> import lagjax as lj
+    >>> pendulum = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    >>> orbit = lj.periodic_orbit(pendulum, (1.0, 0.0), 6.7, {"g": 1.0})
+    >>> branch = lj.continue_orbits(orbit, along="q", to=2.0)
+    >>> print(branch.period[[0, -1]].round(6))
+    [6.699976 8.349753]
+
+    **Arguments:**
+
+    - `orbit`: the result of `lj.periodic_orbit` at which the branch begins; it may have switches. Then the branch ends
+      where other switches occur in its cycles, as where a motion grazes, and `status` says so.
+    - `along`: what changes, by its name in the orbit's parameters: `"omega"`, `"spring.k"`, `"k[1]"`. For a system that
+      does not depend on time also `"period"`, or a coordinate or velocity of the start, `"theta"`, `"v.theta"`; where
+      it is conserved, `"energy"` (the Jacobi integral). Along a number in the parameters the orbits hold what `orbit`
+      was found with. The period of a drive follows its parameters.
+    - `to`: its last value; the first is that of the orbit. The branch is followed within this range.
+    - `rtol`: as in `lj.periodic_orbit`. `most_points`: the largest number of points of the branch.
+
+    **Returns:** an `OrbitBranch`, with all points found before the branch ended; its `status` says why it ended.
+
+    **Raises:**
+
+    - `TypeError` for an `orbit` that is not a periodic orbit, and inside `jax.jit`, `vmap` or `grad`, because the
+      number of points depends on values.
+    - `ValueError` for an orbit that did not converge, for an `along` that names nothing or a held quantity, and where
+      it changes the period of a drive that only guards, or other phases than the first, contain.
+
+    Source: Seydel, *Practical Bifurcation and Stability Analysis*, ch. 7; Doedel, Keller & Kernévez, Int. J.
+    Bifurcation Chaos 1 (1991) 745.
+    """
+    _check(orbit)
+    system, s = orbit.system, State(orbit.t, orbit.q, orbit.v, orbit.params)
+    if not system.in_phases and system.elements is None:
+        # Integers in the parameters become floats, so that a branch may follow them too.
+        system, s = checked(system, s)
+    problem = any_problem_of(system, s)
+    place, asked = _along(along, orbit, problem)
+    frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
+    first, last = float(z[-1] * frame.unit), float(to)
+    low, high = sorted((float(z[-1]), last / float(frame.unit)))
+    tracer, path, found = _traced(frame, z, low, high, np.sign(last - first), most_points)
+    return _result(orbit, problem, place, tracer, path, found, along, first, last)
+
+
+def _check(orbit):
+    if not isinstance(orbit, PeriodicOrbit):
+        raise TypeError(
+            f"lj.continue_orbits needs a periodic orbit, not {type(orbit).__name__}.\n"
+            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
+            'along="...", to=...).'
+        )
+    if not is_eager() or is_traced(orbit):
+        raise TypeError(
+            "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
+            "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."
+        )
+    if np.ndim(orbit.period):
+        raise ValueError(
+            f"this is a batch of orbits, of shape {np.shape(orbit.period)}: a branch begins at a single orbit.\n"
+            "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
+        )
+    if not bool(orbit.converged):
+        raise ValueError(
+            f"this orbit does not close: its end is {float(orbit.residual):.2g} of its size away from its start.\n"
+            "Usual cause: lj.periodic_orbit did not converge, and warned about it.\n"
+            "Fix: another start or period, until orbit.converged."
+        )
+
+
+def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, OrbitRequest]:
+    """What changes along the branch, and what the orbits still hold."""
+    asked, reasons, names = orbit.asked, problem.reasons, coordinates.names(orbit.q)
+    numbers = numbers_in(problem.state.params)
+    if along in numbers:
+        return Along(along, NUMBER, numbers[along]), asked
+    entries = [*names, *(f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}" for name in names)]
+    if along not in (ENERGY, PERIOD, *entries):
+        more = '"period", "energy", or a coordinate or velocity of the start, such as "' + names[0] + '"'
+        raise no_such_number(along, problem.state.params, more)
+    if not reasons.autonomous:
+        raise ValueError(
+            f"along={along!r}: the system depends on time, so its orbits are isolated, with the period of the drive.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    if along != PERIOD and not reasons.energy:
+        raise ValueError(
+            f"along={along!r}: the Jacobi integral is not conserved here, so the orbits at given parameters are "
+            "isolated.\nUsual cause: a force or dissipation.\n"
+            f"Fix: a number in the parameters, along={next(iter(numbers), 'omega')!r}."
+        )
+    free = asked._replace(free=True, energy=False, held=())
+    if along == ENERGY:
+        return Along(along, ENERGY), free
+    if along == PERIOD:
+        if not reasons.energy:
+            raise ValueError(
+                "along='period': the system itself determines the period of its cycles.\n"
+                f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
+            )
+        return Along(along, PERIOD), free._replace(free=False)
+    return Along(along, ENTRY, None, entries.index(along)), free
+
+
+@compiled
+def _guess(flow, t, z, period, asked):
+    return guessed(flow, t, z, period, asked, 1, None).scale
+
+
+def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, np.ndarray]:
+    """The units, the held quantities, and the point at which the branch begins."""
+    s, system = problem.state, problem.system
+    params = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, s.params)
+    flow = any_flow(system, coordinates.state(s.t, s.q, s.v, params), rtol, problem.rows)
+    nodes, period = np.asarray(orbit.nodes, s.t.dtype), np.asarray(orbit.period, s.t.dtype)
+    flat = coordinates.vector
+    nodes = np.concatenate([np.concatenate([flat(s.q), flat(s.v)])[None], nodes[1:]])
+    scale = _guess(flow, s.t, nodes[0], period, asked._replace(free=False))
+    integral, slope, sizes, drive = sizes_at(flow.start, s.t, nodes[0], period, scale)
+    first = {ENERGY: integral, PERIOD: period, ENTRY: nodes[0][place.entry]}.get(place.kind)
+    first = place.number.get(s.params) if place.number is not None else first
+    first, last = float(first), float(to)
+    if not np.isfinite(last) or first == last:
+        raise ValueError(
+            f"to={to} leaves the parameter {place.name!r} no range: it starts at {first:.6g}.\n"
+            f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
+        )
+    unit = np.asarray(abs(last - first), s.t.dtype)
+    y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
+    no_rows = jnp.zeros((0, y.size), s.t.dtype)
+    frame = OrbitFrame(
+        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
+        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
+    )  # fmt: skip
+    z = np.append(y, first / unit)
+    if not problem.reasons.autonomous and place.kind == NUMBER:
+        with_drive = replace(frame, drive=drive)
+        moved = float(drive_by_parameter(with_drive, z))
+        frame = with_drive if abs(moved) > CONSTANT else frame
+    return frame, z
+
+
+def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, BranchPath, list[FoundOrbit]]:
+    """Trace the branch from its start."""
+    size = frame.scale.size
+    guide = Guide(z[:size], np.zeros(size, z.dtype))
+    tracer = OrbitTracer(frame, low, high, guide, True)
+    tracer.guide = tracer.evaluated(z).guide
+    if frame.drive is None and frame.along.kind == NUMBER and not tracer.repeats(z)[1]:
+        raise ValueError(
+            f"along={frame.along.name!r}: the period of the drive changes with it, and is seen only in guards, resets "
+            "or other phases than the first.\nUsual cause: a moving wall, whose frequency is the parameter.\n"
+            "Fix: time in units of the period, with a drive such as cos(t) and the frequency in L; or "
+            "lj.periodic_orbit for each value."
+        )
+    free = _free_directions(tracer, z)
+    if len(free):
+        # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
+        frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
+        tracer = OrbitTracer(frame, low, high, tracer.guide, _free_are_trivial(frame, len(free)))
+    row = np.eye(z.size)[-1]
+    corrected = tracer.corrected(z, row)
+    begin = tracer.point(z if corrected is None else corrected, towards * row)
+    if isinstance(begin, str):
+        raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
+    tracer.moved_to(begin)
+    follower = _Follower(tracer)
+    path = tracer.trace(begin, most, follower.step)
+    if path.status == "infinity":
+        path.status = f"infinity, near {frame.along.name} = {path.points[-1].outputs.parameter:.6g}"
+    return tracer, path, follower.found
+
+
+def _free_directions(tracer, z):
+    """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
+    _, jacobian, _ = tracer.at(z)
+    _, sizes, right = np.linalg.svd(jacobian)
+    rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
+    kernel = right[rank:]
+    if len(kernel) < 2:
+        return np.zeros((0, z.size - 1))
+    # One direction of the kernel changes the parameter, the others do not.
+    lead = kernel[:, -1] / max(np.linalg.norm(kernel[:, -1]), 1e-300)
+    across = np.linalg.svd(lead[None])[2][1:] @ kernel
+    return across[:, :-1]
+
+
+def _free_are_trivial(frame, count):
+    """Whether all free directions belong to multipliers that are known to be trivial."""
+    shifts = sum(frame.reasons.ignorable)
+    known = frame.reasons.energy + shifts * (1 + frame.reasons.momenta)
+    return count <= known
+
+
+class _Follower:
+    """Inspects each step of a branch, and collects its critical points."""
+
+    def __init__(self, tracer: OrbitTracer):
+        self.tracer, self.found = tracer, []
+
+    def step(self, before: BranchPoint, after: BranchPoint, path: BranchPath) -> str | None:
+        """Put the critical points between two points into the path; return why the branch ends, or None."""
+        tracer, name = self.tracer, self.tracer.frame.along.name
+        if tracer.frame.asked.moves:
+            largest = max(point.outputs.moves for point in path.points)
+            shrinks = after.outputs.moves < AT_REST * largest
+            if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
+                if before.outputs.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
+                return f"a period that grows without end, near {name} = {before.outputs.parameter:.6g}"
+        if after.outputs.period > ENDLESS * float(tracer.frame.period):
+            return f"a period that grows without end, near {name} = {after.outputs.parameter:.6g}"
+        all_critical, earlier = between(tracer, before, after), path.points[-2:-1]
+        self._insert(path, all_critical, before, after)
+        if not all_critical and earlier and earlier[0].critical is None and before.critical is None:
+            self._insert(path, dips(tracer, earlier[0], before, after), before, after)
+        return None
+
+    def _insert(self, path, all_critical, before, after):
+        """Insert points into the path, each before or after its last point."""
+        place = len(path.points) - 1
+        along = self.tracer.weights * (after.z - before.z)
+        for critical in all_critical:
+            point = critical.point if isinstance(critical, FoundOrbit) else critical
+            if isinstance(critical, FoundOrbit):
+                point.critical = len(self.found)
+                # A multiplier has size 1 there, so the nearest other point decides the stability.
+                point.growing = None
+                self.found.append(critical)
+            if along @ (point.z - before.z) < 0:
+                path.points.insert(place, point)
+                place += 1
+            else:
+                path.points.append(point)
+
+    def _at_rest(self, points):
+        """The parameter, extrapolated to a motion of size zero.
+
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
+        """
+        frame, b = self.tracer.frame, points[-1].outputs
+        parameter, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
+        if len(points) > 1:
+            a = points[-2].outputs
+            m, n = a.moves**power, b.moves**power
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * float(frame.unit) else parameter
+
+
+def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
+    """The result in the user's structure."""
+    outputs = [p.outputs for p in path.points]
+
+    def trees(rows: list[np.ndarray]):
+        return coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
+
+    n = len(coordinates.names(orbit.q))
+    known = [i for i, p in enumerate(path.points) if p.growing is not None]
+    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
+    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(outputs))
+    critical = [
+        CriticalOrbit(
+            found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
+            p.outputs.multipliers, found[p.critical].located,
+        ) for i, p in enumerate(path.points) if p.critical is not None
+    ]  # fmt: skip
+
+    return OrbitBranch(
+        *tracer.cast([s.parameter for s in outputs], [s.period for s in outputs]),
+        trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
+        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
+        np.stack([s.multipliers for s in outputs]),
+        np.stack(tracer.cast(*(s.nodes for s in outputs))), critical, _with_floats(orbit, problem), place, along,
+        first, last, path.status,
+    )  # fmt: skip
+
+
+def _with_floats(orbit, problem) -> PeriodicOrbit:
+    """The orbit with its parameters as floats, as the branch has them."""
+    arrays, static = hashable_partition((user_system(problem), coordinates.state(*problem.state).params))
+    return replace(orbit, arrays=arrays, static=static)

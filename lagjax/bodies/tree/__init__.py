@@ -1,5 +1,0 @@
-"""Trees of bodies in joint coordinates."""
-
-from lagjax.bodies.tree.tree import Tree
-
-__all__ = ["Tree"]

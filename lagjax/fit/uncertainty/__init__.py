@@ -1,1 +1,0 @@
-"""What the data say, and do not."""

@@ -1,1 +1,0 @@
-"""Small dense, banded and rank-deficient linear algebra."""

@@ -1,1 +1,0 @@
-"""One-step methods in diffrax's interface."""
