@@ -212,7 +212,7 @@ def test_a_cycle_of_both():
         lj.Switch("low", to="high", when=lambda t, q, v, p: 1 - q),
     ]
     orbit = lj.periodic_orbit(lj.Hybrid({"high": high, "low": low}, ways), (1.5, 0.0), 0.83, G, hold="q")
-    fast = np.sqrt(2 * 2 * G * 0.5)
+    fast = np.sqrt(2 * 2 * G * (orbit.q - 1) + orbit.v**2)
     flights = fast / (2 * G) + (np.sqrt(fast**2 + 2 * G) - fast) / G
     np.testing.assert_allclose(orbit.period, 2 * flights, rtol=1e-9)
     assert len(orbit.switches) == 3
