@@ -176,8 +176,10 @@ def _action(model: Model, ends: Ends, found: FoundPath) -> Float[Array, ""]:
     return jnp.sum(jax.vmap(of_element)(t, h, nodes))
 
 
-def why_not_variational(model: Model) -> str:
+def why_not_variational(model: Model, ends: Ends) -> str:
     """Why there is no action principle; empty where there is one."""
+    if ends.switching is not None:
+        return "there are " + ("phases" if ends.switching.in_phases else "elements")
     of = [name for name in ("force", "dissipation") if getattr(model.system, name) is not None]
     of += [] if model.holonomic.all() else ["velocity constraint"]
     return f"there is a {' and a '.join(of)}" if of else ""
@@ -188,7 +190,7 @@ def answer_from(
 ) -> tuple[SolvedPath | FoundVelocity, Connection | None, str]:
     """The path from one start, the answer if it is one, and what became of it in words."""
     x, parts = nodes_of(model, ends, guess, count, DEGREE)
-    if shoots_alone(model):
+    if shoots_alone(model, ends.switching):
         shot = found_by_shooting(model, ends, x, parts, outputs, rtol)
         if not float(shot.part) >= 1:
             return shot, None, f"Newton's method by integration failed beyond {float(shot.part):.2g} of the way"
@@ -207,7 +209,7 @@ def answer_from(
     if not error < COARSE:
         return solved, None, f"{len(solved.errors)} elements do not follow the path"
     at_nodes = np.asarray(solved.index)
-    if not why_not_variational(model) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
+    if not why_not_variational(model, ends) and (at_nodes.min() < 0 or np.any(np.diff(at_nodes[:-1]) < 0)):
         return solved, None, "a path through a singular point"
     shot = shoot.shot(model, ends, solved.course, solved.aim, solved.response, outputs, rtol)
     # A motion that amplifies errors needs a start that is as good as the path can be.
@@ -262,7 +264,7 @@ def _connection(
     else:
         t = shoot.times(ends, aim, outputs)
         q, v, multipliers = _states(model, ends, solved.found, t)
-    why = why_not_variational(model)
+    why = why_not_variational(model, ends)
     at_nodes = np.asarray(solved.index)
     times = None if why or ends.kind == COMPLETE else path_mesh.conjugate_times(model, ends, solved.found, at_nodes)
     last = jax.tree.map(lambda x: x[-1], v)
@@ -284,7 +286,7 @@ def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, r
     return Connection(
         trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
         jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim), unknown, jnp.asarray(-1), unknown,
-        missed, unknown, there, None, (), "", 0, why_not_variational(model),
+        missed, unknown, there, None, (), "", 0, why_not_variational(model, ends),
     )  # fmt: skip
 
 
@@ -328,14 +330,14 @@ def is_same(a: Connection, b: Connection) -> bool:
 def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int, rtol) -> Connection:
     """The answer from one start in a program, with derivatives in both modes."""
     start = stop_gradient(nodes_of(*stop_gradient((model, ends)), guess, count, DEGREE))
-    if shoots_alone(model):
+    if shoots_alone(model, ends.switching):
         found = found_by_shooting(model, ends, *start, 2, rtol)
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
     met = shot.size < shoot.MET.get(np.dtype(ends.x_a.dtype), 1e-3)
     good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE) & met & ended_well(shot.trajectory.result)
     aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)
-    why, trajectory = why_not_variational(model), shot.trajectory
+    why, trajectory = why_not_variational(model, ends), shot.trajectory
     return Connection(
         trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
         jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim),

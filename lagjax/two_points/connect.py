@@ -19,6 +19,7 @@ from lagjax.mechanics import describe, listed
 from lagjax.system import (
     OF_STATE,
     Call,
+    Hybrid,
     Model,
     State,
     System,
@@ -51,7 +52,7 @@ class ConnectWarning(UserWarning):
 
 
 def connect(
-    system: System,
+    system: System | Hybrid,
     q_a: PyTree[ArrayLike],
     q_b: PyTree[ArrayLike],
     t_a: ArrayLike,
@@ -76,7 +77,8 @@ def connect(
 
     **Main arguments:**
 
-    - `system`, `params`: a `System`, with or without constraints, forces and dissipation; its parameters.
+    - `system`, `params`: a `System`, with or without constraints, forces, dissipation and elements, or a `Hybrid`; its
+      parameters. With elements or phases the start velocity is sought by integrating alone, and there is no action.
     - `q_a`, `q_b`: the ends, alike; `[q]`. An angle that goes round differs by its turns. They lie on the constraints.
     - `t_a`, `t_b`: the times of the ends, `[t]`, t_b > t_a.
 
@@ -117,11 +119,11 @@ def connect(
 
 
 def connected(
-    system: System, configurations: tuple, times: tuple, params: PyTree, end: Callable | None, free_time: bool,
+    system: System | Hybrid, configurations: tuple, times: tuple, params: PyTree, end: Callable | None, free_time: bool,
     starts: Starts, elements: int, outputs: int, rtol: ArrayLike | None, quiet: bool, goes_down: bool,
 ) -> Connection:  # fmt: skip
     """`connect`; with `goes_down` what lies below saddles, and below starts that lead nowhere, is looked for too."""
-    check_system(system, *configurations, params, states=False)
+    check_system(system, *configurations, params, phases=True, states=False, elements=True)
     model, ends = _problem(system, *configurations, *times, params, end, free_time)
     dtype = np.dtype(ends.x_a.dtype)
     rtol = TOLERANCE.get(dtype, 1e-5) if rtol is None else rtol
@@ -129,7 +131,7 @@ def connected(
     if not is_eager() or is_traced((model, ends)):
         return inside(model, ends, guesses[0], elements, outputs, rtol)
     found, tried, first, launched, most = [], [], None, False, MOST_STARTS * len(guesses)
-    descends = not why_not_variational(model) and descent.can_descend(model, ends, elements)
+    descends = not why_not_variational(model, ends) and descent.can_descend(model, ends, elements)
     # A straight line may lead through a singular point, as the centre of a sphere: others follow.
     while guesses and not (starts == 1 and found and not goes_down) and len(tried) < most:
         guess = guesses.pop(0)
@@ -143,7 +145,7 @@ def connected(
         if goes_down and not guesses and not found and not launched:
             guesses, launched = launches_of(model, ends, LAUNCHES, rtol), True
     words = "; ".join(tried)
-    if not why_not_variational(model):
+    if not why_not_variational(model, ends):
         found.sort(key=lambda answer: float(answer.action))
     if not quiet and not (found and bool(found[0].converged)):
         _warn(model, ends, found[0] if found else None, words)
@@ -188,11 +190,12 @@ def _warn(model: Model, ends: Ends, nearest: Connection | None, words: str):
 
 
 def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model, Ends]:
-    system, s = checked(system, State(t_a, q_a, q_a, params))
+    switching = system if system.in_phases or system.elements is not None else None
+    system, s = checked(system.first_phase, State(t_a, q_a, q_a, params))
     model = model_of(system, *s)
     _check_alike(q_a, q_b)
     other = coordinates.state(t_b, q_b, q_b, s.params)
-    alone = shoots_alone(model)
+    alone = shoots_alone(model, switching)
     if alone and end is None and (free_time or not model.holonomic.all()):
         raise ValueError(_too_many(model, free_time))
     dtype = s.t.dtype
@@ -206,12 +209,14 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
         )
     condition, kind, count = None, FIXED, 0
     if end is not None:
-        condition, kind, count = _conditions(model, s, end, free_time)
-    x_a, x_b = _on_constraints(model, t_a, x_a, "q_a"), (
-        _on_constraints(model, t_a + duration, x_b, "q_b") if kind == FIXED
-        else _onto_constraints(model, t_a + duration, x_b)
-    )  # fmt: skip
-    return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count)
+        condition, kind, count = _conditions(model, s, end, free_time, alone)
+    x_a = _on_constraints(model, t_a, x_a, "q_a")
+    # In another phase other constraints may hold at the end.
+    if kind == FIXED and switching is None:
+        x_b = _on_constraints(model, t_a + duration, x_b, "q_b")
+    elif switching is None:
+        x_b = _onto_constraints(model, t_a + duration, x_b)
+    return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count, switching)
 
 
 def _check_alike(q_a: PyTree, q_b: PyTree):
@@ -234,7 +239,7 @@ class EndCondition(NamedTuple):
         return jnp.atleast_1d(self.function(t, self.model.tree(x), self.model.tree(u), self.model.params))
 
 
-def _conditions(model: Model, s: State, end: Callable, free_time: bool):
+def _conditions(model: Model, s: State, end: Callable, free_time: bool, alone: bool):
     """The condition on vectors, its kind, and how many equations it is."""
     call = Call("end", end, OF_STATE)
     function = traced_call(call, dict(zip(OF_STATE, s)), _check_condition)
@@ -243,7 +248,7 @@ def _conditions(model: Model, s: State, end: Callable, free_time: bool):
     count = jax.eval_shape(condition, s.t, x, u).shape[0]
     of_velocity = _depends_on_velocity(condition, s.t, x, u)
     left = model.n - model.m
-    if not of_velocity and not shoots_alone(model):
+    if not of_velocity and not alone:
         if count > left:
             raise ValueError(_count(count, f"at most {left}", model, "conditions of positions"))
         return condition, NATURAL, count
@@ -287,7 +292,9 @@ def _too_many(model: Model, free_time: bool) -> str:
     """Why all of q_b cannot be asked for."""
     free, m = model.n - model.m, int(np.sum(~model.holonomic))
     names = [residual.name for residual in model.form.residuals if not residual.of_positions]
-    because = f"{listed(names)} restricts velocities" if m else "the force depends on multipliers"
+    because = "no path leads there"
+    if m or model.reacts:
+        because = f"{listed(names)} restricts velocities" if m else "the force depends on multipliers"
     return (
         f"q_b has {free + m} free coordinates, and the motion {free} free start velocities"
         f"{' and a free time' if free_time else ''}: {because}, and no transversality completes what is missing.\n"

@@ -23,7 +23,7 @@ old).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,7 +43,8 @@ FIXED, NATURAL, COMPLETE = "fixed", "natural", "complete"
 class Ends(eqx.Module):
     """The ends of a path. `condition(t, x, u)` -> conditions on the end, in vector form; None for a fixed one.
 
-    `x_b`: the fixed end, or a guess. `duration`: T, or a guess.
+    `x_b`: the fixed end, or a guess. `duration`: T, or a guess. `switching`: the hybrid, or system with elements, whose
+    motion it is, where the model is that of its first phase.
     """
 
     t_a: Float[Array, ""]
@@ -54,6 +55,7 @@ class Ends(eqx.Module):
     kind: str = eqx.field(static=True)
     free_time: bool = eqx.field(static=True)
     conditions: int = eqx.field(static=True)
+    switching: Any = None
 
     @property
     def border(self) -> int:

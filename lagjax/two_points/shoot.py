@@ -10,8 +10,8 @@ by the implicit function theorem.
 
 **Shooting alone**, where the ends do not complete the equations of a path.
 
-With velocity constraints, or forces that depend on multipliers, Newton's method looks for the start velocity v_a and a
-free time T by `integrate` itself. For z = (v_a, T)
+With velocity constraints, forces that depend on multipliers, phases or elements, Newton's method looks for the start
+velocity v_a and a free time T by `integrate` itself. For z = (v_a, T)
 
     ρ(z) = (conditions on the end of the motion; what v_a misses of the constraints) = 0
 
@@ -27,7 +27,7 @@ Nonholonomic Systems* (1972), ch. 1 (how many velocities are free).
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -162,7 +162,8 @@ def times(ends: Ends, aim: Aim, outputs: int):
 def motion(model: Model, ends: Ends, aim: Aim, outputs: int, rtol, **options) -> Trajectory:
     """The motion from the start."""
     q, v = model.tree(ends.x_a), model.tree(aim.u)
-    return integrate(model.system, q, v, model.params, ts=times(ends, aim, outputs), rtol=rtol, **options)
+    system = model.system if ends.switching is None else ends.switching
+    return integrate(system, q, v, model.params, ts=times(ends, aim, outputs), rtol=rtol, **options)
 
 
 def last_of(trajectory: Trajectory):
@@ -370,9 +371,9 @@ STEPS, STEP_SHRINKS, SHORTEST, MOST = 8, 0.5, 1e-3, 120
 DIFFERENCE = {np.dtype("float64"): 1e-5, np.dtype("float32"): 3e-3}
 
 
-def shoots_alone(model: Model) -> bool:
-    """Whether the ends do not complete the equations of a path."""
-    return model.reacts or not bool(model.holonomic.all())
+def shoots_alone(model: Model, switching: Any) -> bool:
+    """Whether the ends do not complete the equations of a path, or the motion has switches (`Ends.switching`)."""
+    return switching is not None or model.reacts or not bool(model.holonomic.all())
 
 
 class Place(NamedTuple):
