@@ -82,13 +82,13 @@ equinox.nn
     output_size qk_size vo_size use_query_bias use_key_bias use_value_bias use_output_bias
 lagjax.system.coordinates
   State: t q v params
-lagjax.integrate.trajectory.trajectory
+lagjax.integrate.trajectory
   Snapshot: t q v multipliers
 lagjax.integrate.events.event
   Crossings: t q v multipliers count uncertain
-lagjax.integrate.trajectory.hybrid_trajectory
+lagjax.integrate.hybrid_trajectory
   Switches: t way to q v q_after v_after impulse count uncertain names ways
-lagjax.integrate.trajectory.error_report
+lagjax.integrate.error_report
   Errors: q v multipliers events result steps
 lagjax.analysis.poincare
   PoincareSection: trajectory event

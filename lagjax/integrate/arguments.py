@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate.error_report import account_of, warning_of
+from lagjax.integrate.replay import Replay
+from lagjax.integrate.results import RESULTS
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
-from lagjax.integrate.trajectory.error_report import account_of, warning_of
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import AccuracyWarning, Trajectory
+from lagjax.integrate.trajectory import AccuracyWarning, Trajectory
 from lagjax.jaxtools import is_traced, numpy_of, once
 from lagjax.mechanics import departures
 from lagjax.numerics import EqualSteps

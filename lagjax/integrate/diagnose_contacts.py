@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array
 
 from lagjax.integrate.arguments import REFUSED, check_finite
-from lagjax.integrate.trajectory.results import RESULTS, is_among, message
+from lagjax.integrate.results import RESULTS, is_among, message
 from lagjax.mechanics import consistent_state, describe, explain_failure, listed
 from lagjax.system import Holonomic, State, System, constraints, coordinates, model_of
 

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from lagjax.integrate.events.event import EventWarning, Guards
-from lagjax.integrate.trajectory.hybrid_trajectory import SWITCHES, HybridTrajectory
-from lagjax.integrate.trajectory.results import RESULTS, is_among
+from lagjax.integrate.hybrid_trajectory import SWITCHES, HybridTrajectory
+from lagjax.integrate.results import RESULTS, is_among
 from lagjax.mechanics import describe, listed
 from lagjax.system import State, warn
 

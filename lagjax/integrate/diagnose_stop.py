@@ -26,16 +26,16 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.integrate.diagnose_guard import rejected_by_guards
-from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.error_report import of_a_step
+from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
+from lagjax.integrate.projected_solver import Field
+from lagjax.integrate.results import ENDED_WELL, RESULTS, is_among
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
-from lagjax.integrate.stepping.projected_solver import Field
-from lagjax.integrate.stepping.tolerances import tolerances_at
-from lagjax.integrate.trajectory.error_report import of_a_step
-from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, is_among
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.tolerances import tolerances_at
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import jitted
 from lagjax.mechanics import (
     IndefiniteMass,

@@ -17,14 +17,14 @@ from lagjax.integrate import arguments
 from lagjax.integrate.diagnose_contacts import of_elements
 from lagjax.integrate.diagnose_guard import of_guards
 from lagjax.integrate.diagnose_stop import stopped_early
+from lagjax.integrate.error_report import columns
+from lagjax.integrate.parts import pack
 from lagjax.integrate.problem import Problem
+from lagjax.integrate.results import RESULTS, ended_well, is_among, message
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
-from lagjax.integrate.stepping.tolerances import tolerances_at
-from lagjax.integrate.trajectory.error_report import columns
-from lagjax.integrate.trajectory.parts import pack
-from lagjax.integrate.trajectory.results import RESULTS, ended_well, is_among, message
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.tolerances import tolerances_at
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import as_usual, compiled, primitive
 from lagjax.mechanics import accelerations, describe, explain_failure
 from lagjax.system import OF_STATE, Hybrid, State, coordinates, takes_of

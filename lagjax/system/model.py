@@ -107,7 +107,7 @@ class Form(NamedTuple):
 class InModes(NamedTuple):
     """The parameters of a system some of whose constraints hold only in some of its `modes`.
 
-    - `modes` (k,): of each element's law, as in `integrate/elements/laws.py`.
+    - `modes` (k,): of each element's law, as in `integrate/laws.py`.
     - `off` (m,): which of the stacked constraint equations do not hold now; their multipliers are zero.
     - `slack` (k,): how far the guard of each mode may be below zero by round-off, and by its sign more of some modes.
     """

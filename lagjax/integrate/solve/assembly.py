@@ -7,9 +7,9 @@ import numpy as np
 from jax import dtypes
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.elements.in_modes import in_modes
-from lagjax.integrate.elements.laws import Laws
-from lagjax.integrate.elements.meeting import Meeting, Met
+from lagjax.integrate.in_modes import in_modes
+from lagjax.integrate.laws import Laws
+from lagjax.integrate.meeting import Meeting, Met
 from lagjax.jaxtools import compiled, without_init
 from lagjax.system import Elements, Hybrid, InModes, State, System, replace_fields, traced_system
 

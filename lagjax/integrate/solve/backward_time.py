@@ -26,11 +26,11 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.integrate.parts import Snapshot, pack
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.trajectory.parts import Snapshot, pack
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.numerics import EqualSteps
 from lagjax.system import System, is_traced, takes_of
 

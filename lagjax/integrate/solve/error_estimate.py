@@ -24,9 +24,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from lagjax.integrate.trajectory.error_report import Errors, columns, scaled_error
-from lagjax.integrate.trajectory.results import ENDED_WELL, RESULTS, ended_well, is_among
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.error_report import Errors, columns, scaled_error
+from lagjax.integrate.results import ENDED_WELL, RESULTS, ended_well, is_among
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import is_eager, stop_gradient
 
 # The tightest tolerance that is not below round-off.

@@ -14,9 +14,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.results import RESULTS
 from lagjax.integrate.settings import PATIENCE
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import (
     REGULAR_FIRST,
     WATCHED,

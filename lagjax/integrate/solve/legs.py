@@ -23,10 +23,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.brackets import uneven
 from lagjax.integrate.events.event import Crossings, Guards
+from lagjax.integrate.parts import Snapshot
+from lagjax.integrate.results import RESULTS, ended_well
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import solved
-from lagjax.integrate.trajectory.parts import Snapshot
-from lagjax.integrate.trajectory.results import RESULTS, ended_well
 from lagjax.jaxtools import apart, like, stop_gradient, where
 from lagjax.system import System, coordinates
 

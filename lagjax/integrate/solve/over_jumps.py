@@ -4,13 +4,13 @@ In a mode (`jumps/find.py`) the equations are smooth, and each leg ends where th
 zero. There the mode changes and the state does not; the time and the state carry their derivatives (`event_times.py`)
 into the next leg, so that derivatives of all orders get the jump: with the flows φ₋ and φ₊ of both sides and the time τ
 at which a neighbouring motion crosses, the neighbour goes on from φ₊(-τ) φ₋(τ). If both sides push the motion back it
-goes along the jump (`integrate/jumps/sliding.py`), until a share of the mixture leaves [0, 1].
+goes along the jump (`integrate/sliding.py`), until a share of the mixture leaves [0, 1].
 
 After very many jumps, and where a mode turns out to be wrong, the rest of the motion is integrated with the comparisons
 as they are, which is right too, with more steps and without the jumps' part of the derivatives; `stats["lost_jumps"]`
 says so.
 
-Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`integrate/jumps/find.py`).
+Jumps that depend on t alone are ends of steps inside a leg, like `jump_ts` (`integrate/jumps.py`).
 
 Source: Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000) 204 (trajectory sensitivities through switches).
 """
@@ -25,11 +25,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.elements.in_modes import WithElements
 from lagjax.integrate.events.event import LONG, EventKind, Guards
-from lagjax.integrate.jumps.find import Jumps, OfParams, Smooth
-from lagjax.integrate.jumps.sliding import Mixed, Sliding, slidable
+from lagjax.integrate.in_modes import WithElements
+from lagjax.integrate.jumps import Jumps, OfParams, Smooth
+from lagjax.integrate.parts import Snapshot
+from lagjax.integrate.results import RESULTS, ended_well
 from lagjax.integrate.settings import Settings
+from lagjax.integrate.sliding import Mixed, Sliding, slidable
 from lagjax.integrate.solve.legs import (
     AT_ONCE,
     Leg,
@@ -45,10 +47,8 @@ from lagjax.integrate.solve.legs import (
     unknown,
 )
 from lagjax.integrate.solve.one_motion import resolution
-from lagjax.integrate.stepping.tolerances import DIED_OUT
-from lagjax.integrate.trajectory.parts import Snapshot
-from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.tolerances import DIED_OUT
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import IN_TIME, apart, stop_gradient, where
 from lagjax.system import WITH_MULTIPLIERS, Given, System, model_of, warn
 

@@ -18,7 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import Guards
-from lagjax.integrate.jumps.find import Jumps
+from lagjax.integrate.hybrid_trajectory import OF_PHASES, SWITCHES, Switches
+from lagjax.integrate.jumps import Jumps
+from lagjax.integrate.parts import NO_PHASE, Snapshot
+from lagjax.integrate.results import RESULTS
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     Ending,
@@ -35,9 +38,6 @@ from lagjax.integrate.solve.legs import (
 )
 from lagjax.integrate.solve.one_motion import resolution
 from lagjax.integrate.solve.over_jumps import over_jumps
-from lagjax.integrate.trajectory.hybrid_trajectory import OF_PHASES, SWITCHES, Switches
-from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
-from lagjax.integrate.trajectory.results import RESULTS
 from lagjax.jaxtools import apart, like, where
 from lagjax.mechanics import all_finite
 from lagjax.system import Hybrid, System, model_of
