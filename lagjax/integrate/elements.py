@@ -1,6 +1,9 @@
-"""The laws of a system's elements, with all functions of the user's checked and traced, and places among the modes.
+"""A motion with elements: their laws, checked and traced, and with them in each phase one system in modes.
 
 Modes are those of gaps first, then of sliding velocities, of springs, and of sampled controls.
+
+In a system in modes constraints are on or off, and forces depend on the modes. Its functions take `InModes` in place of
+the parameters, so that one program serves all modes.
 """
 
 from collections.abc import Callable
@@ -12,28 +15,48 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import dtypes
 from jaxtyping import Array, PyTree
 
-from lagjax.integrate.coefficients import is_fixed, takes_of_coefficient
-from lagjax.integrate.compliant import Compliant
-from lagjax.integrate.laws import Normal, Tangent
-from lagjax.integrate.sampled import Sampled
-from lagjax.jaxtools import depends, is_linear, varies
+from lagjax.integrate.jumps import OfParams
+from lagjax.integrate.laws import (
+    CLOSED,
+    STICKS,
+    Compliant,
+    Laws,
+    Normal,
+    Sampled,
+    Tangent,
+    is_fixed,
+    takes_of_coefficient,
+)
+from lagjax.integrate.meeting import Meeting, Met
+from lagjax.jaxtools import compiled, depends, is_linear, varies, without_init
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
+    WITH_MULTIPLIERS,
     Call,
     CompliantContact,
     Contact,
     Elements,
     Friction,
+    Holonomic,
+    Hybrid,
+    InModes,
+    Nonholonomic,
     SampledControl,
     State,
     System,
     Traced,
+    check_use,
     coordinates,
     depends_on,
+    model_of,
+    replace_fields,
+    takes_of,
     traced_call,
+    traced_system,
 )
 
 WITH_GAPS = (Contact, CompliantContact)
@@ -251,3 +274,190 @@ def _check(call: Call, value, shape: tuple | None):
             "\nUsual cause: the velocity of a point in space.\n"
             "Fix: its component along the contact."
         )
+
+
+class Masked(eqx.Module):
+    """A gap, or a sliding velocity, as the residual of a constraint: zero where it does not hold."""
+
+    function: Callable
+    at: tuple[int, int] = eqx.field(static=True)
+    holds: int = eqx.field(static=True)
+
+    def __call__(self, *arguments):
+        *state, given = arguments
+        value = self.function(*state, given.params)
+        on = given.modes[slice(*self.at)] == self.holds
+        return jnp.where(on.reshape(jnp.shape(value)), value, 0.0)
+
+
+class WithElements(eqx.Module):
+    """The force of a system with those of everything that slides, or is pressed."""
+
+    force: Callable | None
+    tangents: tuple[Tangent, ...]
+    compliant: tuple[Compliant, ...]
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        params = given.params
+        total = jax.tree.map(jnp.zeros_like, q) if self.force is None else self.force(t, q, v, params)
+        for force in self.by_element(t, q, v, multipliers, given).values():
+            total = jax.tree.map(jnp.add, total, force)
+        return total
+
+    def by_element(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        """The forces that elements add, each like q, by the names of their modes: of friction, while it slides."""
+        found, params, forces = {}, given.params, dict(multipliers)
+        for law in self.compliant:
+            forces[law.name], found[law.name] = law.push(t, q, v, given)
+        for law in self.tangents:
+            slip, back = jax.vjp(lambda v, law=law: law.slips(t, q, v, params), v)
+            found[law.name] = back(law.friction(t, q, slip, v, forces, given))[0]
+        return found
+
+
+class OneGuard(eqx.Module):
+    """The guards of all modes as one: the least of them, each in units of its slack.
+
+    Guards are followed one by one, so that many of them would take long to compile. One that rests at zero counts as
+    far from its end: else the least of all would be that, until another one is as near to zero.
+    """
+
+    laws: Laws
+    takes: tuple[str, ...] = eqx.field(static=True, default=WITH_MULTIPLIERS)
+
+    def __call__(self, t: Array, q: PyTree, v: PyTree, multipliers: dict[str, Array], given: InModes):
+        slack, last = self.laws.slack(given), self.laws.last(t, q, v, multipliers, given)
+        size = jnp.where(slack > 0, slack, 1.0)
+        values, far = (last + slack) / size, 1 / jnp.finfo(last.dtype).eps
+        return jnp.min(jnp.where(self.laws.rests(given) & (values > 0.5), jnp.maximum(values, far), values))
+
+
+def in_modes(system: System, start: State) -> tuple[System, Laws]:
+    """A system with elements as a system of `InModes`, with its laws; all functions checked and traced."""
+    assert system.elements is not None
+    plain = traced_system(replace(system, elements=None), start)
+    if plain.force is not None and takes_of(plain.force) == WITH_MULTIPLIERS:
+        raise ValueError(
+            "a force that takes multipliers cannot stand beside elements.\n"
+            'Fix: lj.Friction(sliding, coefficient, normal="name of the constraint") among the elements.'
+        )
+    normals, tangents, owners, compliant, sampled = laws_of(system.elements, plain, start)
+    # As constraints are, contacts are no place for states.
+    as_constraints = {law.name: Holonomic(law.gap) for law in (*normals, *compliant)}
+    as_constraints |= {law.name: Nonholonomic(law.sliding) for law in tangents}
+    check_use(replace(plain, constraints=as_constraints, force=None))
+    always = plain.map(lambda function, role: OfParams(function))
+    constraints: dict[str, Any] = dict(always.constraints)
+    constraints |= {law.name: Holonomic(Masked(law.gap, law.at, CLOSED)) for law in normals}
+    constraints |= {law.name: Nonholonomic(Masked(law.sliding, law.at, STICKS)) for law in tangents}
+    force = WithElements(plain.force, tangents, compliant) if tangents or compliant else always.force
+    masked = replace(always, constraints=constraints, force=force)
+    guarded = [law.at[1] for law in (*normals, *tangents, *compliant)]
+    guarded += [law.side[1] for law in tangents if law.side]
+    count = max(guarded, default=0) + len(sampled)
+    # The order of the stacked equations is known only with their shapes.
+    none = np.zeros(count, dtypes.canonicalize_dtype(int)), np.zeros(0, bool), np.zeros(count, start.t.dtype)
+    given = InModes(start.params, *none)
+    form = model_of(masked, *start[:3], given).form
+    places, first = {}, 0
+    for residual in form.residuals:
+        places[residual.name] = range(first, first + residual.size)
+        first += residual.size
+    rows = tuple(place for law in (*normals, *tangents) for place in places[law.name])
+    return masked, Laws(normals, tangents, compliant, sampled, rows, owners, form.m, system.elements.impacts)
+
+
+MOTION = "motion"
+
+
+class InElements(Hybrid):
+    """The motion of `user`, a system with elements or a hybrid some of whose phases have some, as a hybrid whose
+    functions take modes in these phases. `laws`: those of each phase, or None."""
+
+    laws: tuple[Laws | None, ...]
+    user: System | Hybrid
+
+    @property
+    def elements(self) -> Elements | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.user.elements
+
+    @property
+    def places(self) -> tuple[tuple[int, int], ...]:
+        """Where the modes of each phase are among those of all."""
+        ends = np.cumsum([0, *(0 if laws is None else laws.size for laws in self.laws)]).tolist()
+        return tuple(zip(ends, ends[1:]))
+
+    @property
+    def modes(self) -> list[tuple[str, str]]:
+        """The name and the kind of each mode, in the order of the phases."""
+        several = isinstance(self.user, Hybrid) and len(list(filter(None, self.laws))) > 1
+        return [
+            (f"{phase}: {name}" if several else name, kind)
+            for phase, laws in zip(self.names, self.laws)
+            if laws is not None
+            for name, kind in zip(laws.names, laws.kinds)
+        ]
+
+    def given(self, params: PyTree, modes: Array | None = None, phase: int = 0) -> Any:
+        """What the functions of a phase take as `params`, in these modes of all phases, or rows of them; without any,
+        with all gaps open."""
+        laws = self.laws[phase]
+        if laws is None or isinstance(params, InModes):
+            return params
+        open_ones = np.zeros(laws.size, dtypes.canonicalize_dtype(int))
+        return laws.given(params, open_ones if modes is None else modes[..., slice(*self.places[phase])])
+
+    @property
+    def first_phase(self) -> System:
+        """The user's system without its elements."""
+        return self.user.first_phase
+
+    def cases(self, params: PyTree, phase: int = 0) -> dict[str, PyTree]:
+        """The parameters where every contact holds, and where every one that can slide does."""
+        laws = self.laws[phase]
+        if laws is None:
+            return {"": params}
+        return {f" {words}": laws.given(params, modes) for words, modes in laws.all_closed().items()}
+
+    def laws_in_numbers(self, state: State) -> dict[str, np.ndarray]:
+        found: dict[str, Any] = {}
+        for phase, laws in zip(self.names, self.laws):
+            if laws is None:
+                continue
+            of = "" if isinstance(self.user, System) else f" of phase '{phase}'"
+            numbers = {f"elements, impacts {laws.impacts}": np.zeros(0)}
+            numbers |= jax.tree.map(np.asarray, laws.in_numbers(state))
+            found |= {f"{role}{of}": x for role, x in numbers.items()}
+        return found
+
+    def __repr__(self):
+        return repr(self.user)
+
+
+def assembled(user: System | Hybrid, start: State, ts: Array | np.ndarray | None) -> InElements:
+    """The assembly for a motion over these times, with the functions of all phases checked and traced."""
+    hybrid = user if isinstance(user, Hybrid) else Hybrid({MOTION: user})
+    most, systems, laws = hybrid.most_switches if isinstance(user, Hybrid) else 0, [], []
+    for system in hybrid.systems:
+        if system.elements is None:
+            systems.append(traced_system(system, start))
+            laws.append(None)
+            continue
+        masked, of_phase = in_modes(system, start)
+        systems.append(masked)
+        laws.append(of_phase)
+        most += system.elements.most_switches
+        if ts is not None and (instants := of_phase.instants(ts, start.params)):
+            # A power of two, so that a few instants more do not compile again.
+            most = 1 << (most + instants - 1).bit_length()
+    hybrid = replace_fields(hybrid, systems=tuple(systems), most_switches=most)
+    return without_init(InElements, vars(hybrid) | {"laws": tuple(laws), "user": user})
+
+
+@compiled
+def modes_at(assembly: InElements, start: State) -> Met:
+    """The modes that fit a state, and the velocities on what holds in them; of a system with elements."""
+    (laws,) = assembly.laws
+    assert laws is not None
+    return Meeting(assembly.systems[0], laws).first(*start)[1]

@@ -1,9 +1,9 @@
-"""The laws of elements: what holds in which mode, and the guards at which modes end.
+"""The laws of contacts, friction and sampled controls: what holds in which mode, and the guards at which modes end.
 
 A gap is open (0) or closed (1): a closed one is a holonomic constraint. A sliding velocity is free (0), slides to one
 side (1, -1), with a force -μ N, or sticks (2): then it is a velocity constraint. Or it rests since others hold it (3),
-with a force of size μ N and a fixed direction (`redundant.py`), that of its slack. Where others hold it no more it
-begins to move, and the mode ends. A spring behind a gap is apart (0) or pressed (1), with a force (`compliant.py`).
+with a force of size μ N and a fixed direction (`complementarity.py`), that of its slack. Where others hold it no
+more it begins to move, and the mode ends. A spring behind a gap is apart (0) or pressed (1), with a force.
 
 A sliding velocity in a plane is two rows with one mode: it slides (1) with a force -μ N s/|s|, which has no limit at
 s = 0. Its sliding ends at a speed δ, the slack of its mode, and begins with 2 δ in the direction of the acceleration: a
@@ -18,9 +18,24 @@ A normal force that is a multiplier of a constraint presses from either side (1,
 ± λ. One that is a function presses from one side, and its guard is N: where it ends, so does the motion. What
 rests without friction, since μ or N is zero in the whole motion, is free.
 
-Sampled controls (`sampled.py`) have the number of their next instant as a mode, and no guard: legs end at instants.
+A contact with a spring and a damper has the force F = k d + c d' at the depth d = -gap, while both d and F are above
+zero. One function decides between the two modes, of the unit of d:
+
+    m = d + (c/k) min(d', 0)        pressed while m > 0, apart while m < 0
+
+since F has the sign of d + (c/k) d', and is above zero where d is and d' is. At m = 0 a contact that comes is pressed,
+and a contact that goes has F = 0: accelerations are the same in both modes, so that none leads back to the other. For
+k ~ d^½ and c ~ d^(3/2), Hertz's and Hunt and Crossley's, m goes through zero as steeply as d does, and F does not.
+
+Source: Schwager & Pöschel, Granular Matter 9 (2007) 465.
+
+With sampled controls, at the instants offset + k every a held output becomes what its controller says. The mode is the
+number k of the next instant, and its guard the time until then: legs end at instants.
+
+Source: Åström & Wittenmark, *Computer-Controlled Systems*, §2.3.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -31,13 +46,140 @@ import numpy as np
 from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.coefficients import coefficient, fixed, is_fixed
-from lagjax.integrate.complementarity import directions, lengths
-from lagjax.integrate.compliant import PRESSED, Compliant
 from lagjax.integrate.parts import HELD_BY_OTHERS, mode_in_words
-from lagjax.integrate.sampled import Sampled
 from lagjax.jaxtools import is_traced, numpy_of, stop_gradient
 from lagjax.system import InModes, State
+
+
+def is_fixed(law) -> bool:
+    """Whether a law is the same in all of a motion: a number, or a function of the parameters alone."""
+    return not callable(law) or takes_of_coefficient(law) == ("params",)
+
+
+def fixed(law, params: PyTree) -> Array:
+    """The value of one that is."""
+    return jnp.asarray(law(params) if callable(law) else law)
+
+
+def coefficient(law, of: Array, params: PyTree) -> Array:
+    """The coefficient for each of the speeds, or depths, `of`."""
+    found = fixed(law, params) if is_fixed(law) else jax.vmap(lambda x: law(x, params))(of)
+    return jnp.broadcast_to(jnp.asarray(found, of.dtype), of.shape)
+
+
+def takes_of_coefficient(law: Callable, of: str = "speed") -> tuple[str, ...]:
+    """What a coefficient takes: the parameters, or `of` before them."""
+    known = getattr(law, "takes", None)
+    if known is not None:
+        return known
+    needed = [x for x in inspect.signature(law).parameters.values() if x.default is x.empty]
+    return ("params",) if len(needed) == 1 else (of, "params")
+
+
+APART, PRESSED = 0, 1
+# m is zero below so many round-offs of what it is made of; and where its guard was found to be zero.
+ZERO_BELOW, AT_ZERO = 16, 1000
+
+
+class Compliant(eqx.Module):
+    """The springs and dampers behind the gaps of an element; `at`: their places among the modes."""
+
+    name: str = eqx.field(static=True)
+    gap: Callable
+    stiffness: Any
+    damping: Any
+    at: tuple[int, int] = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def forces(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Float[Array, " k"]:
+        """F of each, zero where it is apart."""
+        depth, speed = self._depths(t, q, v, given.params)
+        k, c = self._law(depth, given.params)
+        return jnp.where(given.modes[slice(*self.at)] == PRESSED, k * depth + c * speed, 0.0)
+
+    def push(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> tuple[Float[Array, " k"], PyTree]:
+        """F, and the generalized force, like q."""
+        _, back = jax.vjp(lambda q: jnp.ravel(self.gap(t, q, given.params)), q)
+        forces = self.forces(t, q, v, given)
+        return forces, back(forces)[0]
+
+    def last(self, t: Array, q: PyTree, v: PyTree, given: InModes) -> Float[Array, " k"]:
+        """The guard of each mode."""
+        m = self._pressed(t, q, v, given.params)
+        return jnp.where(given.modes[slice(*self.at)] == PRESSED, m, -m)
+
+    def after(
+        self, t: Array, q: PyTree, v: PyTree, given: InModes, fired: Bool[Array, " k"], sizes: Float[Array, "2 n"]
+    ) -> tuple[Array, Float[Array, " k"]]:
+        """The modes after a meeting, and how far one round-off may take m; `sizes`: of coordinates and velocities.
+
+        Where m is zero within that, a guard that has fired ends its mode; else what comes, or stays, is pressed.
+        """
+        t, q, v, params = stop_gradient((t, q, v, given.params))
+        depth, speed = self._depths(t, q, v, params)
+        k, c = self._law(depth, params)
+        slope = jax.jacobian(lambda x: jnp.ravel(self.gap(t, x, params)))(q)
+        by_row = jnp.concatenate([jnp.reshape(x, (depth.size, -1)) for x in jax.tree.leaves(slope)], axis=1)
+        gaps, rates = sizes @ jnp.abs(by_row).T
+        slack = jnp.finfo(t.dtype).eps * (gaps + jnp.abs(depth) + c / jnp.where(k > 0, k, jnp.inf) * rates)
+        m = self._pressed(t, q, v, params)
+        now = given.modes[slice(*self.at)] == PRESSED
+        unclear = jnp.abs(m) <= jnp.where(fired, AT_ZERO, ZERO_BELOW) * slack
+        presses = jnp.where(unclear, jnp.where(fired, ~now, speed >= 0), m > 0)
+        return jnp.where(presses, PRESSED, APART), ZERO_BELOW * slack
+
+    def _depths(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[Array, Array]:
+        """d and d'."""
+        gap, rate = jax.jvp(lambda t, q: jnp.ravel(self.gap(t, q, params)), (t, q), (jnp.ones_like(t), v))
+        return -gap, -rate
+
+    def _law(self, depth: Array, params: PyTree) -> tuple[Array, Array]:
+        # Above zero, where powers have derivatives; without a comparison, which would count as a kink of the force.
+        depth = jnp.sqrt(depth**2 + jnp.finfo(depth.dtype).tiny)
+        return coefficient(self.stiffness, depth, params), coefficient(self.damping, depth, params)
+
+    def _pressed(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> Array:
+        """m."""
+        depth, speed = self._depths(t, q, v, params)
+        k, c = self._law(depth, params)
+        return depth + c / jnp.where(k > 0, k, jnp.inf) * jnp.minimum(speed, 0.0)
+
+
+# Instants within this many round-offs of a time are at that time.
+AT_ONCE = 8
+
+
+class Sampled(eqx.Module):
+    """A controller with its instants; `place`: that of its mode."""
+
+    name: str = eqx.field(static=True)
+    controller: Callable
+    every: Any
+    offset: Any
+    place: int = eqx.field(static=True)
+
+    def instant(self, k: Int[Array, ""], t: Array, params: PyTree) -> Float[Array, ""]:
+        """The time of the k-th instant."""
+        every, offset = (coefficient(x, t, params) for x in (self.every, self.offset))
+        return offset + k * every
+
+    def first(self, t: Array, params: PyTree) -> Int[Array, ""]:
+        """The number of the first instant that is not before t."""
+        t, params = stop_gradient((t, params))
+        every, offset = (coefficient(x, t, params) for x in (self.every, self.offset))
+        return jnp.maximum(jnp.ceil((t - offset - self.slack(t, params)) / every), 0.0).astype(int)
+
+    def acts(self, k: Int[Array, ""], t: Array, params: PyTree) -> Bool[Array, ""]:
+        """Whether the k-th instant is at t, or before."""
+        t, params = stop_gradient((t, params))
+        return self.instant(k, t, params) - t <= self.slack(t, params)
+
+    def slack(self, t: Array, params: PyTree) -> Float[Array, ""]:
+        """How far apart round-off may take two times that are one."""
+        t, params = stop_gradient((t, params))
+        sizes = jnp.abs(t) + jnp.abs(coefficient(self.offset, t, params))
+        return AT_ONCE * jnp.finfo(t.dtype).eps * (sizes + coefficient(self.every, t, params))
+
 
 OPEN, CLOSED = 0, 1
 FREE, STICKS, LEANS = 0, 2, HELD_BY_OTHERS
@@ -439,6 +581,22 @@ class Laws(eqx.Module):
             t = t + stop_gradient(jnp.where(jnp.any(near), output - t, 0.0))
             found = jnp.where((t < ts[-1]) & (t < found), t, found)
         return found
+
+
+def lengths(x: Float[Array, " k"], partners: np.ndarray) -> Float[Array, " k"]:
+    """|x|: of each number by itself, or of both components of a plane; the derivative at zero is zero."""
+    in_plane = partners != np.arange(x.size)
+    if not in_plane.any():
+        return jnp.abs(x)
+    square = x**2 + x[partners] ** 2
+    root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return jnp.where(in_plane, root, jnp.abs(x))
+
+
+def directions(x: Float[Array, " k"], partners: np.ndarray) -> Float[Array, " k"]:
+    """x / |x|: the sign of a number, the direction in a plane; zero at zero."""
+    size = lengths(x, partners)
+    return x / jnp.where(size > 0, size, 1.0)
 
 
 def at_most_one(dtype) -> float:

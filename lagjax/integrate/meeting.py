@@ -1,8 +1,8 @@
 """What happens where the modes of elements change: contacts that touch are solved together, in three steps.
 
-1. Impact: where a gap closes, velocities jump by the impulses of the contacts (`impact_law.py`).
+1. Impact: where a gap closes, velocities jump by the impulses of the contacts (`complementarity.py`).
 2. Forces: with the accelerations W λ + b of all contacts, the forces λ obey for each gap that touches, and each sliding
-   velocity on it (`complementarity.py`)
+   velocity on it
 
        0 ≤ λ_N ⊥ a_N ≥ 0        |λ_T| ≤ μ N        a_T = 0 or λ_T against it, of size μ N
 
@@ -25,11 +25,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.complementarity import ContactProblem, Forces, directions, lengths, pseudo_inverse
-from lagjax.integrate.impact_law import Struck
-from lagjax.integrate.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws
+from lagjax.integrate.complementarity import (
+    AtBound,
+    ContactProblem,
+    Forces,
+    HeldByForces,
+    HeldRows,
+    Struck,
+    pseudo_inverse,
+    within_laws,
+)
+from lagjax.integrate.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws, directions, lengths
 from lagjax.integrate.parts import Snapshot
-from lagjax.integrate.redundant import AtBound, HeldByForces, HeldRows, within_laws
 from lagjax.integrate.tolerances import FROM_NOTHING, Forced, rounding
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
@@ -170,7 +177,7 @@ class AsFound(NamedTuple):
 class ContactForces(NamedTuple):
     """Forces that obey the laws, if `found`, with the accelerations `a`; below which size either is zero, for each.
 
-    `bound`: what has the bound of its law though it does not move (`redundant.py`).
+    `bound`: what has the bound of its law though it does not move (`complementarity.py`).
     """
 
     problem: ContactProblem

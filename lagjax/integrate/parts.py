@@ -11,7 +11,7 @@ from lagjax.numerics import EqualSteps
 
 # The phase of an output that was not reached, and the number in unused places for switches.
 NO_PHASE = -1
-# The mode of a sliding velocity that rests since others hold it (`elements/redundant.py`).
+# The mode of a sliding velocity that rests since others hold it (`complementarity.py`).
 HELD_BY_OTHERS = 3
 
 

@@ -7,12 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax as lj
-from lagjax.integrate.compliant import Compliant
-from lagjax.integrate.impact_law import Struck
-from lagjax.integrate.in_modes import in_modes
-from lagjax.integrate.laws import Laws, Normal
-from lagjax.integrate.meeting import Meeting, Rows
-from lagjax.integrate.sampled import Sampled
+from lagjax.integrate.elements import in_modes
+from lagjax.integrate.laws import Compliant, Laws, Normal, Sampled
+from lagjax.integrate.meeting import Meeting, Rows, Struck
 from lagjax.system import State
 
 OPEN, CLOSED, FREE, SLIDES, STICKS = 0, 1, 0, 1, 2

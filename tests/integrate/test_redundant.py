@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.complementarity import ContactProblem, lengths
-from lagjax.integrate.in_modes import in_modes
-from lagjax.integrate.redundant import HeldRows, within_laws
+from lagjax.integrate.complementarity import ContactProblem, HeldRows, within_laws
+from lagjax.integrate.laws import lengths
+from lagjax.integrate.elements import in_modes
 from lagjax.system import State
 from tests.integrate.elements.test_motions import moved
 

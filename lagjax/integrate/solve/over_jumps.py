@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.integrate.elements import WithElements
 from lagjax.integrate.events.event import LONG, EventKind, Guards
-from lagjax.integrate.in_modes import WithElements
 from lagjax.integrate.jumps import Jumps, OfParams, Smooth
 from lagjax.integrate.parts import Snapshot
 from lagjax.integrate.results import RESULTS, ended_well

@@ -12,12 +12,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from lagjax.integrate.elements import InElements, OneGuard, assembled
 from lagjax.integrate.events.event import Crossing, EventKind, Guards, guards_of, left_to_diffrax, traced_guard
 from lagjax.integrate.hybrid_trajectory import SWITCHES
-from lagjax.integrate.in_modes import OneGuard
 from lagjax.integrate.jumps import OfParams
 from lagjax.integrate.meeting import Meeting
-from lagjax.integrate.solve.assembly import InElements, assembled
 from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.segments import Phase
 from lagjax.mechanics import velocity_change

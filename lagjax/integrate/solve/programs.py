@@ -22,6 +22,7 @@ import numpy as np
 
 from lagjax.display import waiting
 from lagjax.integrate.both_modes import solve_in_both_modes
+from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.hybrid_trajectory import HybridTrajectory
 from lagjax.integrate.jumps import Jumps, with_jumps_in_time
@@ -30,7 +31,6 @@ from lagjax.integrate.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.sliding import slidable
-from lagjax.integrate.solve.assembly import InElements
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.one_motion import solved
