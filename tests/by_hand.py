@@ -9,8 +9,7 @@ from scipy.special import ellipj, ellipk
 
 import lagjax as lj
 from lagjax.integrate import Trajectory
-from lagjax.integrate.error_report import Errors
-from lagjax.integrate.parts import Snapshot, SolveInfo, SolveOptions, pack
+from lagjax.integrate.results import Errors, Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.solve.programs import trajectory_of
 
 ASKED = SolveOptions(None, None, None, np.asarray(np.inf), None, "project")

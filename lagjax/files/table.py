@@ -86,9 +86,9 @@ lagjax.integrate.trajectory
   Snapshot: t q v multipliers
 lagjax.integrate.events.event
   Crossings: t q v multipliers count uncertain
-lagjax.integrate.hybrid_trajectory
+lagjax.integrate.trajectory
   Switches: t way to q v q_after v_after impulse count uncertain names ways
-lagjax.integrate.error_report
+lagjax.integrate.results
   Errors: q v multipliers events result steps
 lagjax.analysis.poincare
   PoincareSection: trajectory event

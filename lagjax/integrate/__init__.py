@@ -3,27 +3,22 @@
 from lagjax.integrate import arguments
 from lagjax.integrate.both_modes import solve_in_both_modes
 from lagjax.integrate.contacts import releases, slips, sticks, touches
+from lagjax.integrate.data import described, parts
 from lagjax.integrate.dense_output import in_one_solve
-from lagjax.integrate.drawing import curves
 from lagjax.integrate.elements import InElements, Masked, WithElements, modes_at
 from lagjax.integrate.equal_steps.loop import is_suited
-from lagjax.integrate.error_report import angle_mask
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning, crossings_of, traced_guard
-from lagjax.integrate.films import film_of_lanes
-from lagjax.integrate.hybrid_trajectory import HybridTrajectory, Switches
 from lagjax.integrate.integrate import integrate
 from lagjax.integrate.jumps import found
 from lagjax.integrate.load import check_is_system, described_system, load_trajectory, same_system, trajectory_from
+from lagjax.integrate.pictures import curves, draw, drawn, film_of_lanes, still, subject_of
 from lagjax.integrate.replay import Replay
-from lagjax.integrate.results import ENDED_WELL, RESULTS, ended_well, in_words, is_among, message
-from lagjax.integrate.save import described, parts
+from lagjax.integrate.results import ENDED_WELL, RESULTS, angle_mask, ended_well, in_words, is_among, message
 from lagjax.integrate.settings import PATIENCE
-from lagjax.integrate.solve.backward_time import runs_backward
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.solve.harvest import Report, in_turn, reported, reporting, watched
-from lagjax.integrate.solve.over_jumps import JumpWarning
-from lagjax.integrate.solve.phases import phases_in, traced_phases
+from lagjax.integrate.solve.legs import JumpWarning
+from lagjax.integrate.solve.phases import phases_in, runs_backward, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for
 from lagjax.integrate.solve.segments import switches_before_any
-from lagjax.integrate.subject import draw, drawn, still, subject_of
-from lagjax.integrate.trajectory import AccuracyWarning, Snapshot, Trajectory
+from lagjax.integrate.trajectory import AccuracyWarning, HybridTrajectory, Snapshot, Switches, Trajectory

@@ -46,7 +46,7 @@ import numpy as np
 from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.parts import HELD_BY_OTHERS, mode_in_words
+from lagjax.integrate.results import HELD_BY_OTHERS, mode_in_words
 from lagjax.jaxtools import is_traced, numpy_of, stop_gradient
 from lagjax.system import InModes, State
 

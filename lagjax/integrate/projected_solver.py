@@ -18,8 +18,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.integrate.step_to_outputs import between_jumps
-from lagjax.integrate.tolerances import Tolerances
+from lagjax.integrate.step_sizes import Tolerances, between_jumps
 from lagjax.jaxtools import kept_as_call, one_function
 from lagjax.mechanics import Equations, all_finite, to_manifold
 from lagjax.numerics import Interpolation, Quintic, Radau5

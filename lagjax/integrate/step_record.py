@@ -24,7 +24,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.projected_solver import ProjectedSolver
-from lagjax.integrate.step_to_outputs import StepToOutputs
+from lagjax.integrate.step_sizes import StepToOutputs
 from lagjax.jaxtools import like, where
 from lagjax.numerics import Quintic
 

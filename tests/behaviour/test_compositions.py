@@ -14,7 +14,7 @@ import pytest
 from jax import lax
 
 import lagjax as lj
-from lagjax.integrate import second_order, step_record
+from lagjax.integrate import step_record
 from lagjax.integrate.replay import Replay
 
 TS, NODES = np.array([0.0, 0.4, 0.9]), 11

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import Snapshot
-from lagjax.integrate.diagnose_stop import Steps, _fast, _rounded_up, _singularity, stopped_early
+from lagjax.integrate.diagnosis import Steps, _fast, _rounded_up, _singularity, stopped_early
 from tests.by_hand import by_hand
 from tests.systems import PARAMS, pendulum
 

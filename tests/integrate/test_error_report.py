@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.error_report import in_units_of, scaled_error, warning_of
+from lagjax.integrate.results import in_units_of, scaled_error, warning_of
 from tests.by_hand import HOW, by_hand
 from tests.by_numpy import by_numpy
 

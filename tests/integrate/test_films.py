@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import Snapshot
-from lagjax.integrate.films import hermite
+from lagjax.integrate.pictures import hermite
 from tests.by_hand import by_hand, swing
 from tests.systems import PARAMS, pendulum
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.input_warnings import _in_order, warn_of_odd_dissipation
+from lagjax.integrate.arguments import _in_order, warn_of_odd_dissipation
 from lagjax.system import coordinates
 from tests.systems import PARAMS, TS, motion, pendulum
 

@@ -9,8 +9,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.complementarity import ContactProblem, HeldRows, within_laws
-from lagjax.integrate.laws import lengths
 from lagjax.integrate.elements import in_modes
+from lagjax.integrate.laws import lengths
 from lagjax.system import State
 from tests.integrate.elements.test_motions import moved
 

@@ -8,7 +8,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.results import message
-from lagjax.integrate.step_to_outputs import WHOLE_STEPS, StepToOutputs
+from lagjax.integrate.step_sizes import WHOLE_STEPS, StepToOutputs
 from tests.by_hand import swing
 from tests.systems import PARAMS, pendulum
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.tolerances import (
+from lagjax.integrate.step_sizes import (
     Forced,
     PerCoordinateTolerance,
     Tolerances,

@@ -8,7 +8,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.display import CUBE, CYLINDER, SPHERE, InSpace
-from lagjax.integrate.subject import subject_of
+from lagjax.integrate.pictures import subject_of
 from lagjax.models.shapes import LinkShape, looks_of, mesh_of
 
 ARM = """<robot name="arm">

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory, failure
-from lagjax.integrate.hybrid_trajectory import Switches
+from lagjax.integrate.trajectory import Switches
 from lagjax.system import State
 
 G = 9.81

@@ -24,8 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from lagjax.integrate.error_report import Errors, columns, scaled_error
-from lagjax.integrate.results import ENDED_WELL, RESULTS, ended_well, is_among
+from lagjax.integrate.results import ENDED_WELL, RESULTS, Errors, columns, ended_well, is_among, scaled_error
 from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import is_eager, stop_gradient
 

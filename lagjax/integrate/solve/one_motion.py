@@ -24,23 +24,24 @@ from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
-from lagjax.integrate.parts import Snapshot
 from lagjax.integrate.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
 from lagjax.integrate.replay import Replay, replayed
-from lagjax.integrate.results import RESULTS, ended_well
+from lagjax.integrate.results import RESULTS, Snapshot, ended_well
 from lagjax.integrate.settings import Settings, is_recorded
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.step_record import Recorded, StepProblem, with_room
-from lagjax.integrate.step_to_outputs import StepToOutputs, apart_from_jumps, together
-from lagjax.integrate.tolerances import (
+from lagjax.integrate.step_sizes import (
     AsNothing,
     PerCoordinateTolerance,
     Scales,
+    StepToOutputs,
     Tolerances,
+    apart_from_jumps,
     rounding,
     scales_of,
     shared,
     span_of,
+    together,
     tolerances_at,
 )
 from lagjax.integrate.trajectory import worst_drift

@@ -24,19 +24,17 @@ from lagjax.display import waiting
 from lagjax.integrate.both_modes import solve_in_both_modes
 from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
-from lagjax.integrate.hybrid_trajectory import HybridTrajectory
-from lagjax.integrate.jumps import Jumps, with_jumps_in_time
+from lagjax.integrate.jumps import Jumps, slidable, with_jumps_in_time
 from lagjax.integrate.jumps import found as jumps_found
-from lagjax.integrate.parts import SolveInfo, SolveOptions, pack
 from lagjax.integrate.problem import Problem
+from lagjax.integrate.results import SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
-from lagjax.integrate.sliding import slidable
 from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
 from lagjax.integrate.solve.harvest import report_settled
+from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
-from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.segments import solved_in_phases
-from lagjax.integrate.trajectory import Trajectory
+from lagjax.integrate.trajectory import HybridTrajectory, Trajectory
 from lagjax.jaxtools import (
     HashablePart,
     as_usual,

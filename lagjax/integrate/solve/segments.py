@@ -18,10 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import Guards
-from lagjax.integrate.hybrid_trajectory import OF_PHASES, SWITCHES, Switches
 from lagjax.integrate.jumps import Jumps
-from lagjax.integrate.parts import NO_PHASE, Snapshot
-from lagjax.integrate.results import RESULTS
+from lagjax.integrate.results import NO_PHASE, RESULTS, Snapshot
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     Ending,
@@ -32,12 +30,13 @@ from lagjax.integrate.solve.legs import (
     before_any,
     ending_of,
     nothing,
+    over_jumps,
     sizes_of,
     times_of,
     unknown,
 )
 from lagjax.integrate.solve.one_motion import resolution
-from lagjax.integrate.solve.over_jumps import over_jumps
+from lagjax.integrate.trajectory import OF_PHASES, SWITCHES, Switches
 from lagjax.jaxtools import apart, like, where
 from lagjax.mechanics import all_finite
 from lagjax.system import Hybrid, System, model_of

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import lagjax as lj
-from lagjax.integrate.solve.backward_time import backward_trajectory_of, reflect_system
+from lagjax.integrate.solve.phases import backward_trajectory_of, reflect_system
 from tests.by_numpy import by_numpy
 from tests.systems import DRIVEN_PARAMS, HORIZONTAL, PARAMS, driven, pendulum, rod_pendulum
 
