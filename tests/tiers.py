@@ -9,7 +9,7 @@ NAMES = """
     analysis.formulations.action analysis.periodic_orbit.periodic_orbit analysis.poincare.poincare
     analysis.poincare.turning_points exchange.standalone_programs.export fit.fit.fit fit.fit.fit_loss
     fit.fit.fit_residuals fit.fit.load_fit fit.uncertainty.identifiability integrate.replay.Replay
-    integrate.contacts.touches integrate.events.event.Crossing numerics.radau.Radau5
+    guards.touches integrate.events.event.Crossing numerics.radau.Radau5
     numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting sweep.sweep.sweep
     system.constraints.CompliantContact system.constraints.Contact system.constraints.SampledControl
     system.hybrid.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic

@@ -2,10 +2,9 @@
 
 from lagjax.integrate import arguments
 from lagjax.integrate.both_modes import solve_in_both_modes
-from lagjax.integrate.contacts import releases, slips, sticks, touches
 from lagjax.integrate.data import described, parts
 from lagjax.integrate.dense_output import in_one_solve
-from lagjax.integrate.elements import InElements, Masked, WithElements, modes_at
+from lagjax.integrate.elements import InElements, Masked, WithElements, check_linear, modes_at
 from lagjax.integrate.equal_steps.loop import is_suited
 from lagjax.integrate.events.event import Crossing, Crossings, EventWarning, crossings_of, traced_guard
 from lagjax.integrate.integrate import integrate
@@ -18,7 +17,7 @@ from lagjax.integrate.settings import PATIENCE
 from lagjax.integrate.solve.error_estimate import ROUND_OFFS
 from lagjax.integrate.solve.harvest import Report, in_turn, reported, reporting, watched
 from lagjax.integrate.solve.legs import JumpWarning
-from lagjax.integrate.solve.phases import phases_in, runs_backward, traced_phases
+from lagjax.integrate.solve.phases import OfPhases, Plastic, phases_in, runs_backward, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for
 from lagjax.integrate.solve.segments import switches_before_any
 from lagjax.integrate.trajectory import AccuracyWarning, HybridTrajectory, Snapshot, Switches, Trajectory
