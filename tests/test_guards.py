@@ -14,7 +14,7 @@ import pytest
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
 from tests.by_numpy import by_numpy
-from tests.system.test_hybrid import G, in_phases
+from tests.system.test_system import G, in_phases
 
 R = 0.25
 PARAMS = {"m": 2.0, "R": R, "g": G, "mu": 0.2, "e": 0.5, "disk": 0.4}

@@ -14,10 +14,9 @@ from lagjax.integrate.pictures import curves, draw, drawn, film_of_lanes, still,
 from lagjax.integrate.replay import Replay
 from lagjax.integrate.results import ENDED_WELL, RESULTS, angle_mask, ended_well, in_words, is_among, message
 from lagjax.integrate.settings import PATIENCE
-from lagjax.integrate.solve.error_estimate import ROUND_OFFS
-from lagjax.integrate.solve.harvest import Report, in_turn, reported, reporting, watched
 from lagjax.integrate.solve.legs import JumpWarning
 from lagjax.integrate.solve.phases import OfPhases, Plastic, phases_in, runs_backward, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for
+from lagjax.integrate.solve.reports import ROUND_OFFS, Report, in_turn, reported, reporting, watched
 from lagjax.integrate.solve.segments import switches_before_any
 from lagjax.integrate.trajectory import AccuracyWarning, HybridTrajectory, Snapshot, Switches, Trajectory

@@ -20,7 +20,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.integrate.replay import Replay
 from lagjax.integrate.results import RESULTS, account_of, warning_of
-from lagjax.integrate.solve.error_estimate import ROUND_OFFS
+from lagjax.integrate.solve.reports import ROUND_OFFS
 from lagjax.integrate.trajectory import AccuracyWarning, Trajectory
 from lagjax.jaxtools import at_once, compiled, is_traced, numpy_of, once
 from lagjax.mechanics import departures

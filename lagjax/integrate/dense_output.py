@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.results import ENDED_WELL, HELD_BY_OTHERS, NO_PHASE, Snapshot, SolveOptions, in_words
 from lagjax.integrate.settings import Settings, patient
-from lagjax.integrate.step_sizes import WHOLE_STEPS, Forced, rounded, span_of
+from lagjax.integrate.stepping import WHOLE_STEPS, Forced, rounded, span_of
 from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of, to_jax
 from lagjax.mechanics import accelerations
 from lagjax.system import InModes, System, given_in

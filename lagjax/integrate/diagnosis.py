@@ -29,12 +29,11 @@ from jaxtyping import PyTree
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
-from lagjax.integrate.projected_solver import Field
 from lagjax.integrate.results import ENDED_WELL, RESULTS, is_among, of_a_step
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import method_alone
 from lagjax.integrate.solve.programs import method_of
-from lagjax.integrate.step_sizes import tolerances_at
+from lagjax.integrate.stepping import Field, tolerances_at
 from lagjax.integrate.trajectory import SWITCHES, HybridTrajectory, Trajectory
 from lagjax.jaxtools import jitted
 from lagjax.mechanics import (

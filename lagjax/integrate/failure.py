@@ -33,7 +33,7 @@ from lagjax.integrate.problem import Problem
 from lagjax.integrate.results import RESULTS, columns, ended_well, is_among, message, pack
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import START_TOLERANCES
-from lagjax.integrate.step_sizes import tolerances_at
+from lagjax.integrate.stepping import tolerances_at
 from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import as_usual, compiled, primitive
 from lagjax.mechanics import accelerations, consistent_state, describe, explain_failure, listed

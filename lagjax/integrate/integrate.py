@@ -19,9 +19,9 @@ from lagjax.integrate.prepare import MANY_STEPS, prepare
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.replay import Replay
 from lagjax.integrate.results import ENDED_WELL, is_among
-from lagjax.integrate.solve.harvest import report
 from lagjax.integrate.solve.legs import warn_of_lost
 from lagjax.integrate.solve.phases import run
+from lagjax.integrate.solve.reports import report
 from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
 from lagjax.numerics import EqualSteps
@@ -76,7 +76,7 @@ def integrate(
       method, except as `outputs` says. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
       by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
-      (`lagjax/integrate/step_sizes.py`): at a zero crossing by its size at the end of the step, at rest by
+      (`lagjax/integrate/stepping.py`): at a zero crossing by its size at the end of the step, at rest by
       its change in a step, and a decaying one over three decades. Give `atol` if small numbers do not matter, such as
       the stretching of a stiff spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. The
       size of an angle (a coordinate that enters only through sines and cosines) counts at most as one turn.

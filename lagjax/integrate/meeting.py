@@ -37,7 +37,7 @@ from lagjax.integrate.complementarity import (
 )
 from lagjax.integrate.laws import CLOSED, FREE, LEANS, OPEN, STICKS, Laws, directions, lengths
 from lagjax.integrate.results import Snapshot
-from lagjax.integrate.step_sizes import FROM_NOTHING, Forced, rounding
+from lagjax.integrate.stepping import FROM_NOTHING, Forced, rounding
 from lagjax.jaxtools import stop_gradient
 from lagjax.mechanics import mass_and_forcing, resolved, solve_saddle_point, with_first_order
 from lagjax.numerics import independent_rows
@@ -134,7 +134,7 @@ class Rows(NamedTuple):
         velocities that they have had, zero where nothing has moved.
 
         A motion that is at rest now, at x, has velocities of the size √(a x). What rests at zero, but for the round-off
-        of accelerations `a` in the time `span`, has the size that a motion from there is given (`step_sizes.py`).
+        of accelerations `a` in the time `span`, has the size that a motion from there is given (`stepping.py`).
         """
         forced, free = jnp.max(self.root_mass * a), jnp.max(self.root_mass * jnp.abs(self.acceleration))
         least, faster = rounding(forced * jnp.stack([span**2, span])), jnp.maximum(free, forced)

@@ -37,7 +37,6 @@ from jax import lax
 from jax.core import ShapedArray
 from jaxtyping import Array, Int, PyTree
 
-from lagjax.integrate.projected_solver import ProjectedSolver
 from lagjax.integrate.step_record import (
     Recorded,
     RecordRows,
@@ -47,6 +46,7 @@ from lagjax.integrate.step_record import (
     recorded,
     recorded_again,
 )
+from lagjax.integrate.stepping import ProjectedSolver
 from lagjax.jaxtools import (
     PRODUCT,
     ad,

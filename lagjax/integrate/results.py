@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.step_sizes import TURN
+from lagjax.integrate.stepping import TURN
 from lagjax.jaxtools import HashablePart, hashable_partition, to_jax
 from lagjax.mechanics import are_angles
 from lagjax.numerics import EqualSteps

@@ -23,8 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate.projected_solver import ProjectedSolver
-from lagjax.integrate.step_sizes import StepToOutputs
+from lagjax.integrate.stepping import ProjectedSolver, StepToOutputs
 from lagjax.jaxtools import like, where
 from lagjax.numerics import Quintic
 

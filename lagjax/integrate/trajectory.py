@@ -35,7 +35,7 @@ from lagjax.integrate.results import (
     message,
     mode_in_words,
 )
-from lagjax.integrate.step_sizes import rounded
+from lagjax.integrate.stepping import rounded
 from lagjax.jaxtools import compiled, is_traced, jitted, numpy_of
 from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
 from lagjax.system import Hybrid, InModes, Model, System, UnknownSystem, known_system, model_of

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.display import Faces, triangles
 from lagjax.models.links_and_joints import (
+    LinkShape,
     Loop,
     MergedLinks,
     Placement,
@@ -22,7 +23,6 @@ from lagjax.models.links_and_joints import (
     merged,
 )
 from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
-from lagjax.models.shapes import LinkShape
 
 KIND = {"mjJNT_HINGE": "revolute", "mjJNT_SLIDE": "prismatic", "mjJNT_BALL": "spherical", "mjJNT_FREE": "floating"}
 # What is listed as not taken, by the names of MuJoCo's lists.

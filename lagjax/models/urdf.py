@@ -20,16 +20,17 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import unit_vector
 from lagjax.models.links_and_joints import (
+    LinkShape,
     Placement,
     RobotJoint,
     RobotLink,
     fault_of_inertia,
     inertia_along,
     merged,
+    mesh_of,
     unmoved,
 )
 from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
-from lagjax.models.shapes import LinkShape, mesh_of
 
 # What an element may have inside, and in which words what the model leaves out is listed; "" where nothing is.
 LEFT_OUT = {

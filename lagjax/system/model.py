@@ -26,8 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.jaxtools import compiled, shape_of, without_init
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System, rate_of
+from lagjax.system.system import Hybrid, System, rate_of
 from lagjax.system.traced import WITH_MULTIPLIERS, Traced, takes_of
 
 

@@ -43,7 +43,7 @@ from lagjax.integrate.jumps import Jumps, Mixed, OfParams, Sliding, Smooth, slid
 from lagjax.integrate.results import RESULTS, Snapshot, ended_well
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.one_motion import resolution, solved
-from lagjax.integrate.step_sizes import DIED_OUT
+from lagjax.integrate.stepping import DIED_OUT
 from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import IN_TIME, apart, like, stop_gradient, where
 from lagjax.system import WITH_MULTIPLIERS, Given, System, coordinates, model_of, warn

@@ -24,19 +24,22 @@ from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
-from lagjax.integrate.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
 from lagjax.integrate.replay import Replay, replayed
 from lagjax.integrate.results import RESULTS, Snapshot, ended_well
 from lagjax.integrate.settings import Settings, is_recorded
-from lagjax.integrate.solve.error_estimate import ROUND_OFFS
+from lagjax.integrate.solve.reports import ROUND_OFFS
 from lagjax.integrate.step_record import Recorded, StepProblem, with_room
-from lagjax.integrate.step_sizes import (
+from lagjax.integrate.stepping import (
     AsNothing,
+    FastField,
+    Field,
     PerCoordinateTolerance,
+    ProjectedSolver,
     Scales,
     StepToOutputs,
     Tolerances,
     apart_from_jumps,
+    forward_differentiable,
     rounding,
     scales_of,
     shared,

@@ -29,10 +29,9 @@ from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
 from lagjax.integrate.results import SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
-from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
-from lagjax.integrate.solve.harvest import report_settled
 from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
+from lagjax.integrate.solve.reports import report_settled, with_errors, with_errors_inside
 from lagjax.integrate.solve.segments import solved_in_phases
 from lagjax.integrate.trajectory import HybridTrajectory, Trajectory
 from lagjax.jaxtools import (

@@ -9,7 +9,7 @@ import pytest
 import lagjax as lj
 from lagjax.display import CUBE, CYLINDER, SPHERE, InSpace
 from lagjax.integrate.pictures import subject_of
-from lagjax.models.shapes import LinkShape, looks_of, mesh_of
+from lagjax.models.links_and_joints import LinkShape, looks_of, mesh_of
 
 ARM = """<robot name="arm">
   <link name="base"><visual><geometry><box size="0.4 0.4 0.1"/></geometry></visual></link>

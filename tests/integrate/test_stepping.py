@@ -1,8 +1,11 @@
 """Tolerances from a motion's own size: the same motion in any units, and numbers without a size of their own.
 
 Outputs are ends of steps: they are exact, and cost only the steps that they shorten.
+
+Steps end on the constraints; without projection they drift.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import diffrax
@@ -13,7 +16,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.results import message
-from lagjax.integrate.step_sizes import (
+from lagjax.integrate.stepping import (
     WHOLE_STEPS,
     Forced,
     PerCoordinateTolerance,
@@ -26,7 +29,7 @@ from lagjax.integrate.step_sizes import (
 )
 from tests.by_hand import by_hand, swing
 from tests.by_numpy import by_numpy
-from tests.systems import PARAMS, TS, driven, motion, pendulum, rod_pendulum
+from tests.systems import HORIZONTAL, PARAMS, TS, driven, motion, pendulum, rod_pendulum
 
 # The units of length and of time are powers of four, so that scaling by them is exact, also in square roots.
 UNITS = {"nanometres": (2.0**-30, 1.0), "light years": (2.0**54, 1.0), "years": (1.0, 2.0**-24)}
@@ -299,3 +302,19 @@ def test_long_honest_motions_go_on():
     far, speed = np.array([2.0, 0.0]), np.array([0.0, np.sqrt(1e-6)])
     back = lj.integrate(comet, far, speed, ts=np.array([0.0, 2 * np.pi]), max_steps=2**14, estimate_error=False)
     np.testing.assert_allclose(back.q[-1], far, atol=1e-4)
+
+
+def test_constraints_hold_at_every_output():
+    """Position and velocity residuals are at round-off at a loose tolerance; twin: off by a little they are not."""
+    traj = lj.integrate(rod_pendulum, *HORIZONTAL, PARAMS, ts=5 * TS, rtol=1e-6)
+    assert float(traj.residual()) < 1e-14
+    for name in ("q", "v"):
+        of = getattr(traj, name)
+        assert float(replace(traj, **{name: of | {"x": of["x"] + 1e-7}}).residual()) > 1e-8
+
+
+def test_multipliers_belong_to_the_projected_states():
+    """λ at every output is the tension of the state there: -3 g cos(angle) / (2 l) for a release at 90 degrees."""
+    traj = motion("rod pendulum")
+    tension = 3 * PARAMS["g"] * np.asarray(traj.q["y"]) / PARAMS["l"] / (2 * PARAMS["l"])
+    np.testing.assert_allclose(traj.multipliers["rod"], tension, atol=1e-7)

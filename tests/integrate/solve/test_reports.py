@@ -1,4 +1,7 @@
-"""Estimated errors compared with true ones: Kepler's motion, whose position is known at any time, and chaos."""
+"""Estimated errors compared with true ones: Kepler's motion, whose position is known at any time, and chaos.
+
+Reports on the integrations inside programs.
+"""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -12,8 +15,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.solve.error_estimate import _closer, _of_times, steps_to_repeat, with_errors
+from lagjax.integrate.solve.reports import _closer, _of_times, reporting, steps_to_repeat, with_errors
 from tests import by_hand
+from tests.sweep.test_sweep import swing
 from tests.systems import PARAMS, TS, motion, pendulum
 
 ECCENTRICITY = 0.6
@@ -193,3 +197,18 @@ def test_an_error_that_is_not_known():
     failed = found.error._replace(q=nothing, v=nothing, result=lj.RESULTS.max_steps_reached)
     assert "not known: of a second, more precise motion" in repr(replace(found, error=failed))
     assert "not known" not in repr(found)
+
+
+@pytest.mark.exhaustive
+def test_reports_are_found_in_every_kind_of_program():
+    """Reports are found in plain, jitted, differentiated and batched programs; the worst of several counts."""
+    program = lambda wrap: jax.jit(reporting(lambda point: wrap(lambda g: swing({"g": g, "angle": 1.0}).q[-1])(point)))
+    _, alone, _ = program(lambda f: f)(4.0)
+    assert int(alone.steps) > 0
+    for wrap in (jax.jit, jax.grad, lambda f: jax.jit(jax.jit(f)), jax.value_and_grad):
+        assert int(program(wrap)(4.0)[1].steps) == int(alone.steps)
+    twice = program(lambda f: lambda g: f(g) + f(g))(4.0)[1]
+    assert int(twice.steps) == 2 * int(alone.steps)
+    some = program(lambda f: lambda g: jax.vmap(f)(jnp.array([g, jnp.nan])))(4.0)[1]
+    assert int(some.result) == int(lj.RESULTS.start_not_finite._value)
+    assert jax.jit(reporting(lambda x: 2 * x))(1.0)[1] is None
