@@ -135,8 +135,9 @@ class Hybrid(eqx.Module):
     **Arguments:**
 
     - `phases`: by name, `System`s over the same coordinates, with or without elements. A constraint of the same name in
-      several phases has the same shape in all; so has an element, and each phase has its own. Motions start in the first one, or with `lj.integrate(..., start=name)`; `start` may be the
-      phase's number, which can differ from lane to lane.
+      several phases has the same shape in all; so has an element, and each phase has its own. Motions start in the
+      first one, or with `lj.integrate(..., start=name)`; `start` may be the phase's number, which can differ from lane
+      to lane.
     - `switches`: `Switch`es, or lists of them. Where two guards cross at the same time, the one listed first takes
       effect; the other one does so at once in the next phase, if it belongs to that phase.
     - `most_switches`: the largest number of switches in a motion; memory is reserved for so many.
