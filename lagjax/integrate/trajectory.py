@@ -13,7 +13,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.display import Animation, by_line, printable
+from lagjax.display import Animation, by_line, labelled
 from lagjax.display import plots as plot
 from lagjax.integrate import pictures, results
 from lagjax.integrate.data import dataset, save
@@ -304,7 +304,7 @@ class Trajectory(eqx.Module):
         if is_traced(self):
             return f"Trajectory({self.static.method}, being traced, t: {self.t.shape})"
         lanes = self.t.shape[:-1]
-        return "\n".join(_batch_lines(self, lanes) if lanes else _lines(self))
+        return _batch_in_words(self, lanes) if lanes else _in_words(self)
 
 
 @jitted
@@ -330,8 +330,8 @@ def worst_drift(model: Model, t: Array, q: PyTree, v: PyTree):
 _worst_drift, _worst_residual = compiled(worst_drift), compiled(worst_residual)
 
 
-def _lines(traj) -> list[str]:
-    """The printed lines of one motion."""
+def _in_words(traj) -> str:
+    """What one motion prints."""
     rows = [
         ("method", f"{traj.static.method}, {_lengths(traj)}"),
         ("result", message(traj.result) + _ended(traj)),
@@ -343,7 +343,7 @@ def _lines(traj) -> list[str]:
         times = f"{float(traj.scaled_error):.2g} times"
         rows.append(("WARNING", f"the error at the outputs is {times} what the tolerance lets expect"))
     rows += _shape_rows(traj)
-    return ["Trajectory", *_aligned(rows)]
+    return labelled("Trajectory", rows)
 
 
 def _of_slope(traj):
@@ -386,8 +386,8 @@ def _absolute(atol):
     return _pair(atol) if np.ndim(atol) == 1 else "by size"
 
 
-def _batch_lines(traj, lanes: tuple[int, ...]) -> list[str]:
-    """The printed lines of a batch; `lanes`: its shape."""
+def _batch_in_words(traj, lanes: tuple[int, ...]) -> str:
+    """What a batch prints; `lanes`: its shape."""
     values, counts = np.unique(np.asarray(traj.result._value), return_counts=True)
     words = [f"{n} {message(item(traj.result, v))}" for v, n in zip(values, counts)]
     steps, errors = np.asarray(traj.stats["num_steps"]), np.asarray(traj.scaled_error)
@@ -400,7 +400,7 @@ def _batch_lines(traj, lanes: tuple[int, ...]) -> list[str]:
         ("steps a lane", f"{steps.min()} to {steps.max()}, {int(steps.sum())} in all" if steps.size else "no lanes"),
         *_shape_rows(traj),
     ]
-    return ["Trajectory, a batch", *_aligned(rows)]
+    return labelled("Trajectory, a batch", rows)
 
 
 def _ended(traj):
@@ -416,11 +416,6 @@ def _shape_rows(traj):
             shown = [f"{jax.tree_util.keystr(p, simple=True, separator='.')} {x.shape}".strip() for p, x in leaves]
             rows.append((label, ", ".join(shown)))
     return rows
-
-
-def _aligned(rows):
-    width = max(len(label) for label, _ in rows)
-    return [printable(f"  {label:<{width}}  {value}") for label, value in rows]
 
 
 # What is struck jumps by more than so many round-offs of the velocities in the motion.
