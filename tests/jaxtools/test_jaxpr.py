@@ -41,7 +41,7 @@ TABLES = {
     f"{module.__name__.removeprefix('lagjax.')}.{name}": set(table)
     for module in (jaxpr, fuse, scalarize, dependence)
     for name, table in vars(module).items()
-    if name.isupper() and name not in ("ONE_KERNEL", "STAYS_A_CALL") and isinstance(table, (set, dict))
+    if name.isupper() and name not in ("ONE_KERNEL", "RULES", "STAYS_A_CALL") and isinstance(table, (set, dict))
     if all(isinstance(key, str) for key in table)
 }
 
