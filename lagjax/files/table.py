@@ -44,10 +44,10 @@ integrate.events.event: Crossings
 integrate.results: Errors Snapshot
 integrate.trajectory: Switches
 learned: Network SameMotion
+numerics.newton: Unknowns Covariance
 numerics.radau: Radau5 SimplifiedNewton
 numerics.runge_kutta: Dopri8 Tsit5 RK4 Nystrom8 Nystrom12
 numerics.symplectic: Gauss Splitting
-numerics.windowed_least_squares: Unknowns Covariance
 sweep.engine: Status
 system.coordinates: State
 """
