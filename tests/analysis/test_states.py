@@ -7,7 +7,7 @@ import pytest
 from scipy import linalg
 
 import lagjax as lj
-from tests.analysis.orbits.test_switching_flow import BELT, stick_slip
+from tests.analysis.test_flow import BELT, stick_slip
 
 # A driven oscillator that a filter of its own position pulls, and the integral of its square.
 FILTERED = {"k": 0.3, "tau": 0.7, "c": 0.2, "f": 0.5, "omega": 1.3}

@@ -11,7 +11,7 @@ from lagjax.analysis.arclength import BranchPoint
 from lagjax.analysis.cycle_equations import extent
 from lagjax.analysis.cycles import CriticalOrbit, _zero
 from tests.analysis import closed_forms as known
-from tests.analysis.orbits.test_switching_flow import BELT, FLIPS, block, bounce_of, bouncing, stick_slip
+from tests.analysis.test_flow import BELT, FLIPS, block, bounce_of, bouncing, stick_slip
 from tests.systems import PARAMS, pendulum, rod_pendulum
 
 UNIT = {"g": 1.0, "l": 1.0}

@@ -11,7 +11,7 @@ from lagjax.analysis.linearise import Raw, _changed, _least_squares, _singular
 from lagjax.scenes import cross_rails
 from lagjax.system import coordinates
 from tests.analysis import small_systems as small
-from tests.analysis.modes.test_normal_modes import EQUAL
+from tests.analysis.test_normal_modes import EQUAL
 from tests.by_numpy import by_numpy
 from tests.systems import rod_pendulum
 

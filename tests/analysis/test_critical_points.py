@@ -7,7 +7,7 @@ import pytest
 import lagjax as lj
 from lagjax.scenes import bead_on_hoop
 from tests.analysis import steady_systems as steady
-from tests.analysis.continuation.test_equilibria import check
+from tests.analysis.test_branches import check
 
 UPRIGHT, STILL = steady.UPRIGHT, np.zeros(2)
 TURNING, DRIVEN = {"omega": 0.2, "g": 4.0}, bead_on_hoop.PARAMS | {"omega": 1.0}

@@ -8,7 +8,7 @@ import pytest
 import lagjax as lj
 from lagjax.analysis.monodromy import any_problem_of
 from lagjax.system import State
-from tests.analysis.orbits.test_switching_flow import BELT, block, bouncing, bouncing_by_element, wheel
+from tests.analysis.test_flow import BELT, block, bouncing, bouncing_by_element, wheel
 
 DRIVEN = {"A": 0.1, "omega": 2.0, "e": 0.5}
 WALKS = {"l": 1.0, "g": 9.8125, "slope": 0.1, "alpha": 0.3}
