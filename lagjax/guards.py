@@ -245,7 +245,7 @@ def touches(
       little, in the metric of M, as the constraints of the phase allow. None: the velocities become the nearest, in
       that metric, that the constraints of the *next* phase allow (a perfectly plastic impact, which sticks if they do).
     - `friction`: the coefficient of friction in the impact, a number or a function of `params`; without one it is
-      smooth. The contact sticks, or slides with the impulse of friction on the cone; see `impacts.py`. The guards of
+      smooth. The contact sticks, or slides with the impulse of friction on the cone; see `guards.py`. The guards of
       the phases decide between these: let the switch go to the phase that slides; its own guard, `lj.guards.sticks`,
       ends that at once if the contact does not slide in its direction.
     - `sliding`: `sliding(t, q, v, params)`, the velocity at which the contact slides, linear in v.

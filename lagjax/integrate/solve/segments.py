@@ -48,7 +48,7 @@ class Phase(NamedTuple):
     `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
     `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
     the recorded events, whose guards come last. `meeting`: of the elements of the phase, which changes their modes
-    (`elements/meeting.py`); these have their `places` among the modes of all phases, and one guard, after those of
+    (`meeting.py`); these have their `places` among the modes of all phases, and one guard, after those of
     switches.
     """
 
