@@ -16,21 +16,17 @@ ROOT = Path(lagjax.__file__).parent
 PAGE = Path(__file__).parent.parent / "generated" / "errors.md"
 # Folder or module, and its theme; the first match counts.
 THEMES = {
-    "system/hybrid": "Phases, contacts and impacts",
     "guards": "Phases, contacts and impacts",
     "integrate/solve/phases": "Phases, contacts and impacts",
     "integrate/solve/legs": "Phases, contacts and impacts",
+    "integrate/elements": "Phases, contacts and impacts",
     "integrate/meeting": "Phases, contacts and impacts",
     "integrate/solve/segments": "Phases, contacts and impacts",
-    "analysis/phase_graph": "Phases, contacts and impacts",
     "integrate/events": "Events and sections",
     "analysis/poincare": "Events and sections",
-    "analysis/works": "Energy and conserved quantities",
     "analysis/energy": "Energy and conserved quantities",
     "mechanics/noether": "Energy and conserved quantities",
-    "mechanics/generators": "Energy and conserved quantities",
-    "mechanics/consistent_state": "States and constraints",
-    "mechanics/projection": "States and constraints",
+    "mechanics/constrained_state": "States and constraints",
     "system/constraints": "States and constraints",
     "system": "A system and its Lagrangian",
     "mechanics": "A system and its Lagrangian",
