@@ -240,8 +240,9 @@ class EquallyLong(NamedTuple):
             there = where(new.unsolved, way._replace(unsolved=jnp.asarray(True)), new)
             return jnp.where(new.unsolved, k, k + 1), where(whole | new.unsolved, there, way), there
 
+        # An interval without steps ends where it begins.
         k, way, there = self.loop(
-            goes_on, one, (jnp.asarray(0), way, way), lambda state: span.start + state[0] * span.h
+            goes_on, one, (jnp.asarray(0), way, there), lambda state: span.start + state[0] * span.h
         )
         used_up = begun & ~way.unsolved & span.used_up
         way, there = (x._replace(unsolved=x.unsolved | used_up) for x in (way, there))

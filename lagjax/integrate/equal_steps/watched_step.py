@@ -1,7 +1,7 @@
 """Steps of equal length, or at a pace, during which guards are watched.
 
-A crossing does not end a step: the steps are those of the motion without guards, to the last digit, so that what they
-keep they still keep. The guards are followed from node to node as in `events/detect.py`; a node inside a step is the
+A crossing does not end a step: the steps are those of the motion without guards, so that what they keep they still keep
+(in numbers too, but for the round-off with which XLA compiles one step in two programs). The guards are followed from node to node as in `events/detect.py`; a node inside a step is the
 end of one step of the method aside, from the start of the step, with a shorter length. A crossing has so the order of
 the method, and is on the guard to round-off. Of its time the derivative is that of the motion (`event_times.py`), and
 that of the steps only up to their error.
@@ -116,8 +116,9 @@ class WatchedSteps(NamedTuple):
             follows, since, at, watching.y, y, self.model.params, watching.watched, due.until
         )
         done = ~failed & whole & (takes | ~due.watched)
-        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before.
-        unsolved = failed & (whole | (at - since <= self.follower.resolution))
+        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before; one at NaN is
+        # what a guard that is NaN asks for.
+        unsolved = failed & (whole | ~(at - since > self.follower.resolution))
         nodes = jnp.where(failed, since + 0.5 * (at - since), onward)
         watching = Watching(
             watched,
