@@ -197,7 +197,9 @@ def between(spans: Span, ts: Float[Array, " T"], wanted: Float[Array, " W"]) -> 
     def passed(times: Array) -> Array:
         """The number of steps before these times, of those of the interval around."""
         steps = jnp.floor((times - whole.start + slack) / whole.h).astype(int)
-        return jnp.where(times <= ts[around], 0, jnp.where(times >= whole.end, whole.count, jnp.minimum(steps, whole.count)))
+        return jnp.where(
+            times <= ts[around], 0, jnp.where(times >= whole.end, whole.count, jnp.minimum(steps, whole.count))
+        )
 
     before, after, still, at_end = passed(starts), passed(ends), ends <= starts, ends >= whole.end
     left = jnp.where(at_end, whole.left, ends - (whole.start + after * whole.h))
@@ -248,7 +250,6 @@ class EquallyLong(NamedTuple):
         way, there = (x._replace(unsolved=x.unsolved | used_up) for x in (way, there))
         t = jnp.where(there.unsolved, jnp.minimum(span.start + k * span.h, span.end), span.end)
         return (way, there), (t, there.x, self.step.velocity(there, t), there.unsolved, k, used_up)
-
 
     def place(self, t: Array, x: Array, u: Array) -> Place:
         """The start of a motion that is watched (`watched_step.py`)."""
