@@ -1,10 +1,10 @@
 """Steps of equal length, or at a pace, during which guards are watched.
 
 A crossing does not end a step: the steps are those of the motion without guards, so that what they keep they still keep
-(in numbers too, but for the round-off with which XLA compiles one step in two programs). The guards are followed from node to node as in `events/detect.py`; a node inside a step is the
-end of one step of the method aside, from the start of the step, with a shorter length. A crossing has so the order of
-the method, and is on the guard to round-off. Of its time the derivative is that of the motion (`event_times.py`), and
-that of the steps only up to their error.
+(in numbers too, but for the round-off with which XLA compiles one step in two programs). The guards are followed from
+node to node as in `events/detect.py`; a node inside a step is the end of one step of the method aside, from the start
+of the step, with a shorter length. A crossing has so the order of the method, and is on the guard to round-off. The
+derivative of its time is that along the motion (`event_times.py`), and so that of the steps only up to their error.
 
 All looks, whole steps and those aside, are passes of one loop: a program has one copy of the step, and in a batch no
 lane waits for one that looks closer. Steps aside to outputs are not watched, since the step around them is; only the
@@ -116,8 +116,8 @@ class WatchedSteps(NamedTuple):
             follows, since, at, watching.y, y, self.model.params, watching.watched, due.until
         )
         done = ~failed & whole & (takes | ~due.watched)
-        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before; one at NaN is
-        # what a guard that is NaN asks for.
+        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before; unless it is
+        # at NaN.
         unsolved = failed & (whole | ~(at - since > self.follower.resolution))
         nodes = jnp.where(failed, since + 0.5 * (at - since), onward)
         watching = Watching(

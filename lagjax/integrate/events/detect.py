@@ -136,8 +136,8 @@ class Follower(eqx.Module):
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
     def follow(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
-        """Whether a part of a step, from t0 to t1, is taken, where the next one ends, whether the motion ends now, and the
-        new `Watched`; nothing changes unless `keep`. `until`: where the step ends."""
+        """Whether a part of a step, from t0 to t1, is taken, where the next one ends, whether the motion ends now, and
+        the new `Watched`; nothing changes unless `keep`. `until`: where the whole step ends."""
         fixed, part = stop_gradient(self), watched.part
         known = stop_gradient((t0, t1, y0, y1, args, watched._replace(y=None), until))
         move, a, values = fixed._move(keep, *known)
