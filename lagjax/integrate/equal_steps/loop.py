@@ -181,13 +181,6 @@ def spans(ts: Float[Array, " T"], dt: Float[Array, ""], most: int | None) -> Spa
 def between(spans: Span, ts: Float[Array, " T"], wanted: Float[Array, " W"]) -> Span:
     """The same steps in rows (W - 1,) between other outputs, which are increasing times: each is the end of one more
     step aside, unless it is one of `ts`. The last one may be before the end of the motion.
-
-    >>> def of(*ts):
-    ...     ts = jnp.stack(ts)
-    ...     return between(spans(ts, 0.4, None), ts, jnp.asarray([0.0, 0.5, 1.0, 1.1, 1.1]))
-    >>> found = jax.jit(of)(0.0, 1.0, 2.0)
-    >>> print(found.count, found.left.__array__().round(2))
-    [1 2 0 0] [0.17 0.   0.1  0.  ]
     """
     slack = ROUND_OFFS_OF_TIMES * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
     starts, ends = wanted[:-1], wanted[1:]

@@ -116,8 +116,8 @@ class WatchedSteps(NamedTuple):
             follows, since, at, watching.y, y, self.model.params, watching.watched, due.until
         )
         done = ~failed & whole & (takes | ~due.watched)
-        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before; unless it is
-        # at NaN.
+        # A node inside a step that fails, though the whole step did not, is tried nearer to the one before.
+        # `at` is NaN where a guard misleads.
         unsolved = failed & (whole | ~(at - since > self.follower.resolution))
         nodes = jnp.where(failed, since + 0.5 * (at - since), onward)
         watching = Watching(

@@ -40,19 +40,24 @@ LEVELS = {
 NEAR = np.arccos(0.999)
 
 
-def test_all_that_a_step_may_hold():
+IN_A_STEP = [["down", "top"], pytest.param(list(LEVELS), marks=pytest.mark.exhaustive)]
+
+
+@pytest.mark.parametrize("names", IN_A_STEP, ids=len)
+def test_what_a_step_may_hold(names):
     """Crossings from above only, two in one step, at the end of a step, and turns, where the start is not one."""
-    traj = run(oscillator, 1.0, 0.0, 1.0, np.linspace(0.0, 10.0, 5), lj.Splitting(8), 0.25, events=LEVELS)
+    ts, events = np.linspace(0.0, 10.0, 5), {name: LEVELS[name] for name in names}
+    traj = run(oscillator, 1.0, 0.0, 1.0, ts, lj.Splitting(8), 0.25, events=events)
     exact = {
         "down": [np.pi / 3, 7 * np.pi / 3],
         "top": [NEAR, 2 * np.pi - NEAR, 2 * np.pi + NEAR],
         "end of a step": [5.0],
         "turn": [np.pi, 2 * np.pi, 3 * np.pi],
     }
-    for name, times in exact.items():
+    for name in names:
         found = traj.events[name].found()
-        np.testing.assert_allclose(found.t, times, atol=1e-9, err_msg=name)
-        assert int(found.count) == len(times) and not bool(found.uncertain)
+        np.testing.assert_allclose(found.t, exact[name], atol=1e-9, err_msg=name)
+        assert int(found.count) == len(exact[name]) and not bool(found.uncertain)
     # Each state is on its guard, which a polynomial through the ends of the step would miss.
     np.testing.assert_allclose(traj.events["down"].found().q, 0.5, atol=1e-15)
 
