@@ -79,7 +79,9 @@ def test_steps_between_other_outputs():
 def test_steps_stay_the_same(method, ts):
     """Outputs, the end and energy as without events; a splitting's to the last digit."""
     plain, watched = (run(swing, 1.0, 0.0, 1.0, ts, method, events=events) for events in (None, LEVELS))
-    assert watched.stats["num_steps"] == plain.stats["num_steps"]
+    if method.pace is None:
+        # At a pace a motion without events also counts the outputs that fill up an array.
+        assert watched.stats["num_steps"] == plain.stats["num_steps"]
     within = 1e-14 if isinstance(method, lj.Gauss) else 0.0
     for a, b in ((watched.q, plain.q), (watched.v, plain.v), (watched.end.q, plain.end.q)):
         np.testing.assert_allclose(a, b, rtol=0, atol=within)
