@@ -79,7 +79,7 @@ def check_equal_steps(method: EqualSteps, dt0: Any, system: System | Hybrid, **o
     if system.in_phases or getattr(system, "elements", None) is not None:
         raise ValueError(
             f"lj.{method.label} makes steps of equal length, and a motion in phases has steps that end at switches.\n"
-            "Fix: leave method out."
+            "Fix: leave method out; or events=, which are found inside the steps, and may end the motion."
         )
     for name, given in others.items():
         if given is not None:

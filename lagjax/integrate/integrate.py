@@ -109,8 +109,8 @@ def integrate(
       times are right.
     - `events`: by name, a `lj.Crossing` each: where a function of the state crosses zero, recorded in `traj.events` or
       ending the motion. Crossings are also found inside steps, several in one, and located to round-off: such a step
-      is taken in parts that end there, but its controller sees it as one. A value that jumps over zero at a switch of
-      a `Hybrid`, as a velocity does in an impact, does not cross it.
+      is taken in parts that end there, but its controller sees it as one; steps of equal length stay whole. A value
+      that jumps over zero at a switch of a `Hybrid`, as a velocity does in an impact, does not cross it.
     - `event`: a `diffrax.Event` that ends the motion; its condition takes `(t, (q, v), params, **kwargs)`. It is found
       like `events`, under the name "event".
     - `adjoint`: any diffrax adjoint. Without one, forward and reverse mode both work; so they do with `lj.Replay`,

@@ -34,11 +34,12 @@ def prepare(
     """The motion that `integrate` is asked for, with its arguments checked and the user's functions traced."""
     check_system(system, q0, v0, params, phases=True, elements=True)
     arguments.check_method(method)
+    crossings, left = crossings_of(events, event), left_to_diffrax(event)
     if isinstance(method, EqualSteps):
         fixed = isinstance(stepsize_controller, diffrax.ConstantStepSize)
         arguments.check_equal_steps(
             method, dt0, system, stepsize_controller=None if fixed else stepsize_controller, max_step=max_step,
-            jump_ts=jump_ts, events=events, event=event, adjoint=adjoint, outputs=outputs, start=start,
+            jump_ts=jump_ts, event=left, adjoint=adjoint, outputs=outputs, start=start,
             drift=drift if drift == "baumgarte" else None,
         )  # fmt: skip
         stepsize_controller = diffrax.ConstantStepSize()
@@ -58,7 +59,6 @@ def prepare(
         params = system.given(state.params, phase=i) if isinstance(system, Hybrid) else state.params
         given = state._replace(params=params)
         warn_of_odd_dissipation(phase.dissipation, given)
-    crossings, left = crossings_of(events, event), left_to_diffrax(event)
     if system.in_phases:
         refuse_beside_switches(system, state, ts, adjoint, event)
         guards = phases_in(system, state, crossings)

@@ -639,13 +639,6 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         y1, _, rates, *_ = self._robust_step(t0, t1, y0, None, True)
         return (y1, rates), jnp.asarray(True)
 
-    def rates(self, t: Array, y: PyTree):
-        """The accelerations, and the multipliers by name."""
-        a, multipliers = self.equations.rates(t, *y)
-        if self.feedback is not None:
-            a, _ = self.equations.accelerations(t, *y, self.feedback)
-        return a, multipliers
-
     def acceptable(self, y0: PyTree, y1: PyTree, error):
         """Whether an output's error is not far above the tolerance; the controller does not check steps to outputs.
 

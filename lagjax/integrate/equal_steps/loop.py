@@ -21,6 +21,9 @@ from lagjax.integrate.equal_steps.gauss_step import GaussStep
 from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
 from lagjax.integrate.equal_steps.rattle_step import RattleStep
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
+from lagjax.integrate.equal_steps.watched_step import Due, Place, WatchedSteps
+from lagjax.integrate.events.detect import Follower
+from lagjax.integrate.events.event_times import locate
 from lagjax.integrate.settings import Settings
 from lagjax.jaxtools import one_function, where
 from lagjax.mechanics import sees_velocities, structure, with_first_order
@@ -39,23 +42,31 @@ SHOWN = 200
 
 def stepped(
     model: Model, settings: Settings, pace: Pace | None, q: PyTree, v: PyTree, ts: Float[Array, " T"], adjoint: Any,
-    meter: diffrax.AbstractProgressMeter,
+    meter: diffrax.AbstractProgressMeter, follower: Follower | None = None, wanted: Float[Array, " W"] | None = None,
 ):  # fmt: skip
-    """The states (q, v) at `ts`, which of these were reached, the number of steps, the last time and state (1,), and
-    the result. `meter` is shown unless the motion is run for reverse mode."""
+    """The states (q, v) at `ts`, which of these were reached, the number of steps, the last time and state (1,), the
+    result, and where the guards of a `follower` are zero. `meter` is shown unless the motion is run for reverse mode.
+
+    `wanted`: where states are returned, if not at `ts`, which say how the steps are made: increasing times, all of `ts`
+    up to the end of the motion among them, which is the last one.
+    """
     method, dt = settings.method, settings.dt0
     assert isinstance(method, EqualSteps) and dt is not None
     forward = isinstance(adjoint, diffrax.ForwardMode)
     shown = forward and not isinstance(meter, diffrax.NoProgressMeter)
 
-    def steps(model: Model, pace: Pace | None, q: PyTree, v: PyTree, ts: Array, dt: Array):
+    def steps(model: Model, pace: Pace | None, q: PyTree, v: PyTree, ts: Array, dt: Array, follower, wanted):
         x, u = model.vectors(q, v)
         step = _step_of(method, model, ts[0], x, u, settings.differentiated)
         loop = _forward if forward else _checkpointed
         if pace is None:
             steps, rows = EquallyLong(step, loop), spans(ts, dt, settings.max_steps)
+            rows = rows if wanted is None else between(rows, ts, wanted)
         else:
-            steps, rows = PacedSteps(step, pace, dt, loop, settings.max_steps), (ts[:-1], ts[1:])
+            times = ts if wanted is None else wanted
+            steps, rows = PacedSteps(step, pace, dt, loop, settings.max_steps), (times[:-1], times[1:])
+        if follower is not None:
+            steps = WatchedSteps(steps, model, follower, loop)
 
         def interval(carried: tuple[Any, Any], row: Any):
             state, bar = carried
@@ -65,24 +76,30 @@ def stepped(
 
         interval = interval if forward else jax.checkpoint(interval, prevent_cse=False)
         first = steps.first(ts[0], x, u), meter.init() if shown else None
-        (_, bar), (times, xs, us, unsolved, counts, used_up) = lax.scan(interval, first, rows)
+        (last_state, bar), (times, xs, us, unsolved, counts, used_up) = lax.scan(interval, first, rows)
         if shown:
             meter.close(bar)
         states = jax.tree.map(
             lambda first, rows: jnp.concatenate([first[None], rows]), (q, v), (model.tree(xs), model.tree(us))
         )
         reached = jnp.concatenate([jnp.ones(1, bool), ~unsolved])
-        last = jnp.minimum(jnp.sum(reached), ts.size - 1)[None]
+        last = jnp.minimum(jnp.sum(reached), reached.size - 1)[None]
         end = jnp.concatenate([ts[:1], times])[last], jax.tree.map(lambda x: x[last], states)
-        return states, reached, jnp.sum(counts), end, jnp.any(used_up)
+        found = states, reached, jnp.sum(counts), end, jnp.any(used_up)
+        if follower is None:
+            return *found, None, None
+        watching = last_state[-1]
+        return *found, watching.ended, locate(follower, watching.watched)
 
-    arguments = model, pace, q, v, ts, dt
+    arguments = model, pace, q, v, ts, dt, follower, wanted
     found = one_function(steps, *arguments) if forward and not shown else steps(*arguments)
-    states, reached, count, end, used_up = found
+    states, reached, count, end, used_up, ended, located = found
     results = diffrax.RESULTS
     failed = results.where(used_up, results.max_steps_reached, results.nonlinear_divergence)
     result = results.where(jnp.all(reached), results.successful, failed)
-    return states, reached, count, end, result
+    if ended is not None:
+        result = results.where(ended, results.event_occurred, result)
+    return states, reached, count, end, result, located
 
 
 def _forward(goes_on: Callable, one: Callable, state: tuple, time: Callable):
@@ -161,6 +178,31 @@ def spans(ts: Float[Array, " T"], dt: Float[Array, ""], most: int | None) -> Spa
     return Span(start, h, jnp.minimum(count, free), left, ends, still, count > free)
 
 
+def between(spans: Span, ts: Float[Array, " T"], wanted: Float[Array, " W"]) -> Span:
+    """The same steps in rows (W - 1,) between other outputs, which are increasing times: each is the end of one more
+    step aside, unless it is one of `ts`. The last one may be before the end of the motion.
+    """
+    slack = ROUND_OFFS_OF_TIMES * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
+    starts, ends = wanted[:-1], wanted[1:]
+    around = jnp.clip(jnp.searchsorted(ts, starts, side="right") - 1, 0, ts.size - 2)
+    whole: Span = jax.tree.map(lambda x: x[around], spans)
+
+    def passed(times: Array) -> Array:
+        """The number of steps before these times, of those of the interval around."""
+        steps = jnp.floor((times - whole.start + slack) / whole.h).astype(int)
+        return jnp.where(
+            times <= ts[around], 0, jnp.where(times >= whole.end, whole.count, jnp.minimum(steps, whole.count))
+        )
+
+    before, after, still, at_end = passed(starts), passed(ends), ends <= starts, ends >= whole.end
+    left = jnp.where(at_end, whole.left, ends - (whole.start + after * whole.h))
+    left = jnp.where(still | ~at_end & (jnp.abs(left) <= slack), 0.0, left)
+    return Span(
+        whole.start + before * whole.h, whole.h, jnp.where(still, 0, after - before), left, ends, still,
+        whole.used_up & at_end,
+    )  # fmt: skip
+
+
 class EquallyLong(NamedTuple):
     """Steps by `step` of equal length.
 
@@ -193,13 +235,40 @@ class EquallyLong(NamedTuple):
             there = where(new.unsolved, way._replace(unsolved=jnp.asarray(True)), new)
             return jnp.where(new.unsolved, k, k + 1), where(whole | new.unsolved, there, way), there
 
+        # An interval without steps ends where it begins.
         k, way, there = self.loop(
-            goes_on, one, (jnp.asarray(0), way, way), lambda state: span.start + state[0] * span.h
+            goes_on, one, (jnp.asarray(0), way, there), lambda state: span.start + state[0] * span.h
         )
         used_up = begun & ~way.unsolved & span.used_up
         way, there = (x._replace(unsolved=x.unsolved | used_up) for x in (way, there))
         t = jnp.where(there.unsolved, jnp.minimum(span.start + k * span.h, span.end), span.end)
         return (way, there), (t, there.x, self.step.velocity(there, t), there.unsolved, k, used_up)
+
+    def place(self, t: Array, x: Array, u: Array) -> Place:
+        """The start of a motion that is watched (`watched_step.py`)."""
+        return Place(self.step.first(t, x, u))
+
+    def due(self, k: Array, place: Place, span: Span, last: Array) -> Due:
+        """Step k of an interval of a motion that ends at `last`."""
+        total = span.count + ((span.left != 0) & ~span.used_up)
+        whole, arrives, t0 = k < span.count, k + 1 >= total, span.start + k * span.h
+        h = jnp.where(whole, span.h, span.left)
+        return Due(
+            t0, h, jnp.where(arrives, span.end, t0 + h), whole, arrives & ~span.used_up, whole | (span.end >= last),
+            span.used_up & ~whole,
+        )  # fmt: skip
+
+    def onward(self, place: Place, new: Any, due: Due) -> Place:
+        """The place after a step."""
+        return Place(new)
+
+    def is_still(self, span: Span) -> Array:
+        """Whether nothing is to be done in an interval."""
+        return (span.count == 0) & (span.left == 0) & ~span.used_up
+
+    def end(self, span: Span) -> Array:
+        """The end of an interval."""
+        return span.end
 
 
 def _step_of(method: EqualSteps, model: Model, t: Array, x: Array, u: Array, differentiated: bool):

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax.integrate.equal_steps.gauss_step import added
+from lagjax.integrate.equal_steps.watched_step import Due
 from lagjax.jaxtools import where
 from lagjax.numerics import EqualSteps
 from lagjax.system import OF_POSITION, OF_STATE, Call, Form, State, traced_call
@@ -113,13 +114,42 @@ class PacedSteps(NamedTuple):
         k, line = state
         h = self._length(line)
         way = self.step.advanced(line.way, line.t, h)
+        new, unsolved = self._after(line, way, h, k)
+        before = line._replace(way=line.way._replace(unsolved=jnp.asarray(True)))
+        return jnp.where(unsolved, k, k + 1), where(unsolved, before, new)
+
+    def _after(self, line: Line, way: Any, h: Array, k: Array) -> tuple[Line, Array]:
+        """The line after step k of the length h, and whether it ends there."""
         t, t_rest = added(line.t, line.t_rest + h)
         log_pace = line.log_pace + self.dt * self.pace.rate(t, way.x, self.step.velocity(way, t))
         new = Line(way, t, t_rest, log_pace, k + 1)
         # A step that was not solved, or does not move t, is where the motion ends.
-        unsolved = way.unsolved | ~jnp.isfinite(log_pace) | (t <= line.t)
-        before = line._replace(way=line.way._replace(unsolved=jnp.asarray(True)))
-        return jnp.where(unsolved, k, k + 1), where(unsolved, before, new)
+        return new, way.unsolved | ~jnp.isfinite(log_pace) | (t <= line.t)
+
+    def place(self, t: Array, x: Array, u: Array) -> Line:
+        """The start of a motion that is watched (`watched_step.py`)."""
+        return self.first(t, x, u)
+
+    def due(self, k: Array, line: Line, row: tuple[Array, Array], last: Array) -> Due:
+        """The next step of a motion that ends at `last`."""
+        h, left = self._length(line), self._left(line, row[1])
+        ahead = left > h
+        spent = jnp.asarray(False) if self.most is None else ahead & (line.count >= self.most)
+        h, until = jnp.where(ahead, h, left), jnp.where(ahead, line.t + h, row[1])
+        return Due(line.t, h, until, ahead, ~ahead, ahead | (row[1] >= last), spent)
+
+    def onward(self, line: Line, way: Any, due: Due) -> Line:
+        """The line after a step."""
+        new, unsolved = self._after(line, way, due.h, line.count)
+        return new._replace(way=way._replace(unsolved=unsolved))
+
+    def is_still(self, row: tuple[Array, Array]) -> Array:
+        """Whether nothing is to be done in an interval."""
+        return row[1] <= row[0]
+
+    def end(self, row: tuple[Array, Array]) -> Array:
+        """The end of an interval."""
+        return row[1]
 
     def _length(self, line: Line) -> Array:
         return self.dt * jnp.exp(line.log_pace)

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import EventKind, Guards
-from lagjax.integrate.stepping import ProjectedSolver
+from lagjax.mechanics import Equations
 
 # Where an interval is divided; not in the middle, since half a period after an extremum there is another one.
 SHARES = (0.0, 0.45, 1.0)
@@ -340,15 +340,27 @@ TOUCHES = 10.0
 
 
 class Sight(eqx.Module):
-    """The guards along a motion; `resolution`: the smallest difference of two times that can be told apart."""
+    """The guards along a motion; `resolution`: the smallest difference of two times that can be told apart.
+
+    `feedback`: the rate of Baumgarte's feedback, if there is any; `rtol`: the tolerance of the motion.
+    """
 
     guards: Guards
-    motion: ProjectedSolver
+    equations: Equations
+    feedback: Float[Array, ""] | None
+    rtol: Float[Array, ""]
     resolution: Float[Array, ""]
+
+    def rates(self, t: Array, y: PyTree):
+        """The accelerations, and the multipliers by name."""
+        a, multipliers = self.equations.rates(t, *y)
+        if self.feedback is not None:
+            a, _ = self.equations.accelerations(t, *y, self.feedback)
+        return a, multipliers
 
     def value(self, t: Array, y: PyTree, args: PyTree):
         """The value of each guard at one state."""
-        multipliers = self.motion.rates(t, y)[1] if self.guards.take_multipliers else {}
+        multipliers = self.rates(t, y)[1] if self.guards.take_multipliers else {}
         return self.guards(t, *y, multipliers, args)
 
     def sample(self, left: Node, right: Node, args: PyTree):
@@ -425,7 +437,7 @@ class Sight(eqx.Module):
             pairs = zip(by_both[:count], by_both[count:])
             off = [tuple(SAFETY * jnp.abs(x - z) for x, z in zip(*pair)) for pair in pairs]
             steepest = jnp.maximum(*(jnp.where(jnp.isfinite(x.rate), jnp.abs(x.rate), 0.0) for x in (begin, end)))
-            touches = TOUCHES * self.motion.tolerances.rtol[0] * h * steepest
+            touches = TOUCHES * self.rtol * h * steepest
             # What neither opens nor closes stays where it is; what opens may begin a little below.
             zero = jnp.maximum(jnp.maximum(self.at_zero(begin), self.at_zero(end)), -begin.g)
             zero = jnp.where(begin.still & end.still, jnp.inf, zero)
@@ -453,7 +465,7 @@ class Sight(eqx.Module):
     def touches(self, value: GuardValue):
         """Whether an extremum with this value may be on either side of zero."""
         eps = ROUNDED * jnp.finfo(value.g.dtype).eps
-        return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.motion.tolerances.rtol[0] / eps, 1.0)
+        return jnp.abs(value.g) <= value.noise * jnp.maximum(TOUCHES * self.rtol / eps, 1.0)
 
 
 def uneven(y: PyTree):

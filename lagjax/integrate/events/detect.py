@@ -103,13 +103,9 @@ class Segment(NamedTuple):
     root: GuardRoot
 
 
-class EventController(diffrax.AbstractStepSizeController):
-    """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
+class Follower(eqx.Module):
+    """Follow the guards from one node of the motion to the next, whatever makes the steps. `last`: the final time."""
 
-    The controller's state is that of the wrapped one and a `Watched`, with the crossings. `last`: the final time.
-    """
-
-    controller: diffrax.AbstractStepSizeController
     sight: Sight
     last: Float[Array, ""]
 
@@ -123,14 +119,9 @@ class EventController(diffrax.AbstractStepSizeController):
         """The smallest difference of two times that can be told apart."""
         return self.sight.resolution
 
-    def wrap(self, direction):
-        """The same for time in this direction, which is always forward."""
-        return EventController(self.controller.wrap(direction), self.sight, self.last)
-
-    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1, y0: PyTree, dt0, args: PyTree, func, error_order):
-        """The first step."""
-        t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        t, (_, v) = stop_gradient((t0, y0))
+    def first(self, t: Array, y: PyTree) -> Watched:
+        """What is known at the start: nothing."""
+        t, (_, v) = stop_gradient((t, y))
         places, count = self.sight.guards.owners.size, len(self.kinds)
         no, zero, none = jnp.asarray(False), jnp.asarray(0), jnp.asarray(-1)
         part = StepPart(
@@ -138,53 +129,15 @@ class EventController(diffrax.AbstractStepSizeController):
             turns=(no,) * count, turns_at=t, root=GuardRoot(none, t, t, t, t, t), moved=t,
         )  # fmt: skip
         followed = (Followed(jnp.zeros_like(t), zero, no),) * count
-        rows = jtu.tree_map(lambda x: jnp.broadcast_to(x, (places, *x.shape)), y0)
+        rows = jtu.tree_map(lambda x: jnp.broadcast_to(x, (places, *x.shape)), y)
         a, values = jtu.tree_map(jnp.zeros_like, v), self.sight.unseen(t).values
-        return t1, (inner, Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part))
-
-    def adapt_step_size(
-        self, t0: Array, t1, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order,
-        controller_state: PyTree,
-    ):  # fmt: skip
-        """Whether to keep a step, or a part of one, and the next."""
-        inner, watched = controller_state
-        parted, resolution = watched.part.parted, self.resolution
-        keep, next_t0, next_t1, jumped, asked, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        # A part that fails, though the whole step did not, is halved: the controller has already accepted the step.
-        failed = parted & ~all_finite(y_error)
-        # With fixed steps `keep` is Python's True.
-        keep = jnp.where(parted, ~failed, keep)
-        before = watched.part.until, watched.part.following, watched.part.jumps
-        until, following, jumps = _where(parted, before, (t1, next_t1, jnp.asarray(jumped)))
-        state = t0, t1, y0, y1_candidate, args, watched, until
-        unchanged = jnp.asarray(False), t1, jnp.asarray(False), watched
-        takes, at, ended, watched = lax.cond(
-            eqxi.unvmap_any(keep), lambda: self._follow(keep, *state), lambda: unchanged
-        )
-        done = takes & (t1 >= until)
-        ours = keep | failed
-        # `until` replaces an equal `at`: the end of the whole step has derivatives by the output times.
-        at = jnp.where(done, following, jnp.where(failed, t0 + 0.5 * (t1 - t0), jnp.where(at >= until, until, at)))
-        part = watched.part._replace(parted=ours & ~done, until=until, following=following, jumps=jumps)
-        result = diffrax.RESULTS.where(parted, diffrax.RESULTS.successful, result)
-        result = diffrax.RESULTS.where(failed & (t1 - t0 <= resolution), diffrax.RESULTS.dt_min_reached, result)
-        ended = ended & (result == diffrax.RESULTS.successful)
-        return (
-            takes,
-            jnp.where(ours, jnp.where(takes, t1, t0), next_t0),
-            jnp.where(ours, at, next_t1),
-            # If False while tracing, diffrax omits what it does after a jump.
-            jumped if jumped is False else done & jumps,
-            (_where(parted, inner, asked), watched._replace(part=part)),
-            diffrax.RESULTS.where(ended, diffrax.RESULTS.event_occurred, result),
-        )
+        return Watched(no, a, values, followed, jnp.full(places, jnp.nan, t.dtype), rows, part)
 
     # Jitted, so that it is traced once: diffrax traces the body of its loop three times.
     @eqx.filter_jit
-    def _follow(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
-        """Whether a part is taken, where the next one ends, whether the motion ends now, and the new `Watched`."""
+    def follow(self, keep, t0: Array, t1, y0: PyTree, y1: PyTree, args: PyTree, watched: Watched, until):
+        """Whether a part of a step, from t0 to t1, is taken, where the next one ends, whether the motion ends now, and
+        the new `Watched`; nothing changes unless `keep`. `until`: where the whole step ends."""
         fixed, part = stop_gradient(self), watched.part
         known = stop_gradient((t0, t1, y0, y1, args, watched._replace(y=None), until))
         move, a, values = fixed._move(keep, *known)
@@ -229,7 +182,7 @@ class EventController(diffrax.AbstractStepSizeController):
         part, begins, kinds = watched.part, ~watched.begun, self.kinds
         # The first step is used to evaluate the guards at the start, and then taken again.
         t, y = _where(begins, (t0, y0), (t1, y1))
-        a, _ = self.sight.motion.rates(t, y)
+        a, _ = self.sight.rates(t, y)
         left = Node(t0, y0, watched.a, watched.values)
         right = self.sight.unseen(t)._replace(y=y, a=a)
         turns = [x & (t == part.turns_at) for x in part.turns]
@@ -379,6 +332,64 @@ class EventController(diffrax.AbstractStepSizeController):
             touches = turns & self.sight.touches(value) & ~self.sight.is_on(before)
             doubtful.append(f._replace(uncertain=f.uncertain | touches))
         return again, at, tuple(mine), tuple(doubtful)
+
+
+class EventController(diffrax.AbstractStepSizeController):
+    """Wrap `controller`: follow the guards through each step that it accepts, and end the solve at a terminal one.
+
+    The controller's state is that of the wrapped one and a `Watched`, with the crossings.
+    """
+
+    controller: diffrax.AbstractStepSizeController
+    follower: Follower
+
+    def wrap(self, direction):
+        """The same for time in this direction, which is always forward."""
+        return EventController(self.controller.wrap(direction), self.follower)
+
+    def init(self, terms: diffrax.AbstractTerm, t0: Array, t1, y0: PyTree, dt0, args: PyTree, func, error_order):
+        """The first step."""
+        t1, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return t1, (inner, self.follower.first(t0, y0))
+
+    def adapt_step_size(
+        self, t0: Array, t1, y0: PyTree, y1_candidate: PyTree, args: PyTree, y_error: PyTree, error_order,
+        controller_state: PyTree,
+    ):  # fmt: skip
+        """Whether to keep a step, or a part of one, and the next."""
+        inner, watched = controller_state
+        parted, resolution = watched.part.parted, self.follower.resolution
+        keep, next_t0, next_t1, jumped, asked, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
+        )
+        # A part that fails, though the whole step did not, is halved: the controller has already accepted the step.
+        failed = parted & ~all_finite(y_error)
+        # With fixed steps `keep` is Python's True.
+        keep = jnp.where(parted, ~failed, keep)
+        before = watched.part.until, watched.part.following, watched.part.jumps
+        until, following, jumps = _where(parted, before, (t1, next_t1, jnp.asarray(jumped)))
+        state = t0, t1, y0, y1_candidate, args, watched, until
+        unchanged = jnp.asarray(False), t1, jnp.asarray(False), watched
+        takes, at, ended, watched = lax.cond(
+            eqxi.unvmap_any(keep), lambda: self.follower.follow(keep, *state), lambda: unchanged
+        )
+        done = takes & (t1 >= until)
+        ours = keep | failed
+        # `until` replaces an equal `at`: the end of the whole step has derivatives by the output times.
+        at = jnp.where(done, following, jnp.where(failed, t0 + 0.5 * (t1 - t0), jnp.where(at >= until, until, at)))
+        part = watched.part._replace(parted=ours & ~done, until=until, following=following, jumps=jumps)
+        result = diffrax.RESULTS.where(parted, diffrax.RESULTS.successful, result)
+        result = diffrax.RESULTS.where(failed & (t1 - t0 <= resolution), diffrax.RESULTS.dt_min_reached, result)
+        ended = ended & (result == diffrax.RESULTS.successful)
+        return (
+            takes,
+            jnp.where(ours, jnp.where(takes, t1, t0), next_t0),
+            jnp.where(ours, at, next_t1),
+            # If False while tracing, diffrax omits what it does after a jump.
+            jumped if jumped is False else done & jumps,
+            (_where(parted, inner, asked), watched._replace(part=part)),
+            diffrax.RESULTS.where(ended, diffrax.RESULTS.event_occurred, result),
+        )
 
 
 def _any(conditions):

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.brackets import Watched, uneven
-from lagjax.integrate.events.detect import EventController
+from lagjax.integrate.events.detect import Follower
 from lagjax.integrate.events.event import Crossings, Guards
 from lagjax.jaxtools import like
 from lagjax.mechanics import Equations
@@ -45,10 +45,10 @@ class Located(NamedTuple):
     uncertain: Bool[Array, " m"]
 
 
-def locate(watching: EventController, watched: Watched) -> Located:
+def locate(follower: Follower, watched: Watched) -> Located:
     """Return the recorded crossings, with the derivatives that follow from staying on the guards."""
-    sight = watching.sight
-    equations, guards = sight.motion.equations, sight.guards
+    sight = follower.sight
+    equations, guards = sight.equations, sight.guards
 
     def exact(owner: Array, there: Array, row):
         t, y = _exact((guards, equations), *row, owner, there, sight.resolution, _flow)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.integrate.equal_steps.loop import stepped
 from lagjax.integrate.equal_steps.pace import Pace
 from lagjax.integrate.events.brackets import Sight
-from lagjax.integrate.events.detect import EventController
+from lagjax.integrate.events.detect import EventController, Follower
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
 from lagjax.integrate.replay import Replay, replayed
@@ -117,10 +117,9 @@ def solved(
     if settings.dt0 is not None:
         # A motion with dt0 <= 0 is refused; diffrax's own check would end the program.
         settings = replace(settings, dt0=jnp.where(settings.dt0 > 0, settings.dt0, 1.0))
-    if isinstance(settings.method, EqualSteps):
-        solution = _in_equal_steps(equations, start, ts, settings, adjoint)
-    elif guards is None or isinstance(adjoint, diffrax.ForwardMode):
-        solution = _loop(equations, start, ts, guards, settings, adjoint)
+    if guards is None or isinstance(adjoint, diffrax.ForwardMode):
+        loop = _in_equal_steps if isinstance(settings.method, EqualSteps) else _loop
+        solution = loop(equations, start, ts, guards, settings, adjoint)
     else:
         solution = _loop_twice(equations, start, ts, guards, settings, adjoint)
     if guards is not None and solution.located is not None:
@@ -235,7 +234,7 @@ def _loop(
         subs = diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)
         saveat = diffrax.SaveAt(subs=subs, controller_state=guards is not None)
     if guards is not None:
-        controller = EventController(controller, Sight(guards, solver, resolution(ts)), ts[-1])
+        controller = EventController(controller, _follower(equations, guards, feedback, ts, settings))
     silent = not _user_calls_python(equations, terms, first, guards, settings, controller)
     if isinstance(adjoint, Replay):
         assert isinstance(controller, StepToOutputs | diffrax.ConstantStepSize)
@@ -257,7 +256,7 @@ def _loop(
             event=event, max_steps=settings.max_steps, throw=False, progress_meter=_progress_meter(settings.progress),
         )  # fmt: skip
         watching = isinstance(controller, EventController)
-        located = locate(controller, cast(tuple, solution.controller_state)[1]) if watching else None
+        located = locate(controller.follower, cast(tuple, solution.controller_state)[1]) if watching else None
         return solution.ts, solution.ys, solution.stats, solution.result, located
 
     arguments = (
@@ -278,17 +277,23 @@ def _loop(
     return Solution(reached, outputs, end, *rest)
 
 
-def _in_equal_steps(equations: Equations, start: Start, ts: Array, settings: Settings, adjoint: Any) -> Solution:
-    """The same in steps of equal length."""
+def _in_equal_steps(
+    equations: Equations, start: Start, ts: Array, guards: Guards | None, settings: Settings, adjoint: Any,
+    wanted: Float[Array, " W"] | None = None,
+) -> Solution:  # fmt: skip
+    """The same in steps of equal length. `wanted`: the times of the outputs, if not `ts`, which lay out the steps."""
     assert isinstance(settings.method, EqualSteps) and settings.dt0 is not None
     state = jax.tree.map(lambda x: jnp.where(start.refused, 0.0, x), (start.q, start.v))
     at = jnp.where(start.refused, ts[0], ts)
     form, model = equations.users or equations.model.form, equations.model
     pace = None if settings.method.pace is None else Pace(settings.method.pace, form, model.params)
     meter = _progress_meter(settings.progress, often=1)
-    states, reached, count, end, result = stepped(model, settings, pace, *state, at, adjoint, meter)
+    follower = None if guards is None else _follower(equations, guards, None, at, settings)
+    found = stepped(model, settings, pace, *state, at, adjoint, meter, follower, wanted)
+    states, reached, count, end, result, located = found
     stats = {"num_steps": count, "num_accepted_steps": count, "num_rejected_steps": jnp.zeros_like(count)}
-    return Solution(jnp.where(reached, ts, jnp.inf), states, end, stats, result, None)
+    times = ts if wanted is None else wanted
+    return Solution(jnp.where(reached, times, jnp.inf), states, end, stats, result, located)
 
 
 def _loop_twice(
@@ -297,7 +302,9 @@ def _loop_twice(
 ) -> Solution:  # fmt: skip
     """The same in reverse mode, where diffrax differentiates only outputs: crossings, once their times are known,
     become outputs."""
-    first = _loop(*stop_gradient((equations, start, ts, guards, settings)), diffrax.ForwardMode())
+    equal = isinstance(settings.method, EqualSteps)
+    loop = _in_equal_steps if equal else _loop
+    first = loop(*stop_gradient((equations, start, ts, guards, settings)), diffrax.ForwardMode())
     # Crossings must be ends of steps, and so are then the outputs among them.
     settings = replace(settings, outputs="exact")
     end = jnp.minimum(first.end[0][0], first_end(guards, first.located.t))
@@ -305,7 +312,10 @@ def _loop_twice(
     times = jnp.minimum(jnp.where(jnp.isfinite(times), times, end), end)
     order = jnp.argsort(times)
     without = eqx.tree_at(lambda s: s.event, settings, None, is_leaf=lambda x: x is None)
-    second = _loop(equations, start, times[order], None, without, adjoint, repeated=True)
+    if equal:
+        second = _in_equal_steps(equations, start, ts, None, without, adjoint, times[order])
+    else:
+        second = _loop(equations, start, times[order], None, without, adjoint, repeated=True)
     place, bent = jnp.argsort(order), not isinstance(adjoint, Replay) or adjoint.bent
     of_outputs, of_crossings = (
         jax.tree.map(lambda x: x[place[part]], second.outputs) for part in (slice(ts.size), slice(ts.size, None))
@@ -518,6 +528,10 @@ def _controller(equations: Equations, ts: Array, settings: Settings, scales, bar
         return StepToOutputs(controller, ends, settings.shares, settings.max_steps) if arriving else controller
     jumps = ts[-1:] if settings.jump_ts is None else settings.jump_ts
     return StepToOutputs(controller, together(ends, jumps), settings.shares, settings.max_steps)
+
+
+def _follower(equations: Equations, guards: Guards, feedback: Array | None, ts: Array, settings: Settings) -> Follower:
+    return Follower(Sight(guards, equations, feedback, settings.rtol[0], resolution(ts)), ts[-1])
 
 
 def resolution(ts: Array):

@@ -1,5 +1,6 @@
 """Methods of equal steps: what they keep over long motions, their derivatives, and what they refuse."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,8 +116,10 @@ SLED = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), constraints=KNIFE)
 REFUSED = {
     "no length": (kepler, ellipse(0.3), lj.Gauss(2), {"dt0": None},
                   "makes steps of equal length, which is not given.*dt0=0.01"),
-    "events": (kepler, ellipse(0.3), lj.Splitting(), {"events": {"low": lj.Crossing(lambda t, q, v, p: q[0])}},
-               r"events has no meaning for lj.Splitting\(4\)"),
+    "rest": (kepler, ellipse(0.3), lj.Splitting(), {"event": diffrax.Event(diffrax.steady_state_event())},
+             r"event has no meaning for lj.Splitting\(4\)"),
+    "phases": (lj.Hybrid({"up": kepler, "down": kepler}, [lj.Switch("up", to="down", when=lambda t, q, v, p: q[0])]),
+               ellipse(0.3), lj.Splitting(), {}, "a motion in phases has steps that end at switches"),
     "mass": (POLAR, ({"r": 1.0, "a": 0.0}, {"r": 0.0, "a": 1.0}), lj.Splitting(), {},
              r"the mass matrix depends on r.*lj.Gauss\(3\)"),
     "state": (COST, ({"x": 1.0, "z": 0.0}, {"x": 0.0}), lj.Splitting(), {}, r"'z' have none.*method=lj.Gauss\(3\)"),
