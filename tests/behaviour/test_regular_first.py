@@ -141,7 +141,7 @@ def test_motions_that_nobody_is_told_of(what, compiled, monkeypatch):
     run = lambda point: HIDDEN[what](point["k"])
     np.testing.assert_allclose(quiet(run).values, exact(BOTH["k"]), rtol=1e-7)
     assert regular_alone(run)[2] is None and compiled["robust"] == 0
-    monkeypatch.setattr(harvest, "_hides", lambda jaxpr: False)
+    monkeypatch.setattr(reports, "_hides", lambda jaxpr: False)
     PROGRAMS.clear()
     np.testing.assert_array_equal(np.isnan(quiet(run).values), BOTH["k"] < 1)
 

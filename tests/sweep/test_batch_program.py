@@ -153,7 +153,7 @@ def test_a_second_sweep_compares_little(monkeypatch):
     # Programs inside it that earlier tests used are known already.
     jax.clear_caches()
     calls, whole = [], jaxpr.meaning_of
-    monkeypatch.setattr(identity, "meaning_of", lambda jaxpr: calls.append(jaxpr) or whole(jaxpr))
+    monkeypatch.setattr(jaxpr, "meaning_of", lambda program: calls.append(program) or whole(program))
     fall = lj.System(lambda t, q, v, p: 0.5 * v**2 - p * q)
     run = lambda point: lj.integrate(fall, 0.0, 0.0, point["x"], ts=jnp.array([0.0, 1.0])).q[-1]
     counts = []
