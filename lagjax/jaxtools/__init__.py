@@ -64,6 +64,7 @@ from lagjax.jaxtools.jaxpr import (
     stands_for,
     written,
 )
+from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,
@@ -75,6 +76,7 @@ from lagjax.jaxtools.open_jumps import (
     has_jumps,
     judging,
 )
+from lagjax.jaxtools.outline import NoOutline, outlined, rebuilt
 from lagjax.jaxtools.primitives import (
     ad,
     front,

@@ -133,13 +133,13 @@ class TracedProgram:
         self._fixed = [x if _is_small(x) else None for x in constants]
         self.arrays = (*(x for x in constants if not _is_small(x)), *jtu.tree_leaves(own))
         small = tuple((str(x.dtype), x.shape, np.asarray(x).tobytes()) for x in self._fixed if x is not None)
-        self._meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
+        self.meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
 
     def __hash__(self):
-        return hash(self._meaning)
+        return hash(self.meaning)
 
     def __eq__(self, other):
-        return self is other or isinstance(other, TracedProgram) and self._meaning == other._meaning
+        return self is other or isinstance(other, TracedProgram) and self.meaning == other.meaning
 
     def __call__(self, arrays: Sequence, args: tuple):
         """The function's result, given the arrays that it reads."""
