@@ -134,6 +134,10 @@ class _Writer:
             if x.sharding is not None:
                 raise NotKept("it is for several devices")
             self.all(b"shape", (x.shape, x.dtype, bool(x.weak_type)))
+        elif isinstance(x, (jax.sharding.Mesh, jax.sharding.AbstractMesh)):
+            if not x.empty:
+                raise NotKept("it is for several devices")
+            self.all(b"no mesh", (type(x),))
         elif isinstance(x, Primitive):
             self.add(b"primitive", _name_of_primitive(x).encode())
         elif isinstance(x, enum.Enum):

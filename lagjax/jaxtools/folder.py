@@ -13,13 +13,14 @@ import stat
 import time
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import platformdirs
 
 # The first bytes of a file, then a checksum of the rest, and the length of the header.
-MAGIC, SUFFIX, PARTIAL = b"lagjax program 1\n", ".program", ".partial"
+MAGIC, SUFFIX, PARTIAL, TRYING = b"lagjax program 1\n", ".program", ".partial", ".trying"
 CHECKSUM, LENGTH = hashlib.sha256().digest_size, 8
 # The bytes that all programs may take, the share that stays when it was more, and the longest file that is read.
 MOST, STAYS, LONGEST = 1_000_000_000, 0.8, 300_000_000
@@ -97,6 +98,47 @@ def read(path: Path, digest: str) -> tuple[dict[str, Any], memoryview] | None:
     return header, rest[end:]
 
 
+@contextmanager
+def tried(path: Path, digest: str) -> Iterator[tuple[dict[str, Any], memoryview] | None]:
+    """`read`, for a program that is run for the first time in this process, inside the context.
+
+    While it is, a file beside it has the number of this process. Where such a process is no more, it has ended in there,
+    perhaps by the program: that one is dropped, to be compiled anew.
+    """
+    mark = path / (digest + TRYING)
+    try:
+        before = int(mark.read_text())
+    except (OSError, ValueError):
+        before = None
+    if before is not None and not _is_running(before):
+        _remove(path / (digest + SUFFIX))
+        _remove(mark)
+    found = read(path, digest)
+    if found is not None and before is None:
+        try:
+            mark.write_text(str(os.getpid()))
+        except OSError:
+            pass
+    try:
+        yield found
+    finally:
+        if found is not None:
+            _remove(mark)
+
+
+def _is_running(process: int) -> bool:
+    if os.name != "posix":
+        # There `os.kill` ends a process.
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        pass
+    return True
+
+
 def write(path: Path, digest: str, header: dict[str, Any], program: bytes) -> bool:
     """Write a program under its digest; whether that went well. Once in a while the longest unused are dropped."""
     said = json.dumps({"digest": digest, **header}, allow_nan=False).encode()
@@ -121,7 +163,7 @@ def drop(path: Path, most: int = MOST) -> None:
     """Drop the longest unused programs if all take more than `most` bytes, and what killed processes left."""
     now, found = time.time(), []
     for file, seen in _files(path):
-        if file.endswith(PARTIAL) and now - seen.st_mtime > FORGOTTEN:
+        if file.endswith((PARTIAL, TRYING)) and now - seen.st_mtime > FORGOTTEN:
             _remove(Path(file))
         elif file.endswith(SUFFIX):
             found.append((seen.st_mtime, seen.st_size, file))
@@ -144,7 +186,7 @@ def size(path: Path) -> tuple[int, int]:
 def clear(path: Path) -> None:
     """Drop all programs, and nothing else that may be in the folder."""
     for file, _ in _files(path):
-        if file.endswith((SUFFIX, PARTIAL)):
+        if file.endswith((SUFFIX, PARTIAL, TRYING)):
             _remove(Path(file))
 
 

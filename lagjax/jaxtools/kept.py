@@ -6,8 +6,10 @@ of `folder.py`: a header in JSON, then XLA's executable. Nothing is pickled.
 
 JAX's public `serialize_executable` pickles, and so do its trees. So this module takes its executable and puts it into
 JAX's own call, which is private: `jax.stages.Compiled` with the fields of `_unloaded_executable` of
-`jax._src.interpreters.pxla`, and the client's `serialize_executable` and `deserialize_executable`. It is done with the
-versions of `TRIED` alone; where anything of it is missing or refuses, the program is compiled, as it would be anyway.
+`jax._src.interpreters.pxla`, and the client's `serialize_executable` and `deserialize_executable`. XLA's executables
+call LAPACK at addresses that JAX looks up when it lowers a call: without `initialize_lapack` a process would end. It is
+done with the versions of `TRIED` alone; where anything of it is missing or refuses, the program is compiled, as it
+would be anyway. A program in whose first run a process ended is not run again (`folder.tried`).
 
 Not kept: programs that call Python while they run (checks, callbacks, progress meters), those for several devices or in
 one of JAX's contexts, and those that depend on something which `digest.py` cannot write.
@@ -16,6 +18,7 @@ one of JAX's contexts, and those that depend on something which `digest.py` cann
 import atexit
 import json
 import queue
+import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -37,14 +40,17 @@ from lagjax.jaxtools.outline import NoOutline
 
 try:
     from jax._src.interpreters import pxla
+    from jax._src.lax.linalg import initialize_lapack
     from jax._src.lib import xla_client
 except ImportError:
-    pxla = xla_client = None
+    pxla = xla_client = initialize_lapack = None
 
 # The versions with which the tests of this module were run.
 TRIED = {"0.10.2"}
 # What a version of JAX without these parts raises, and XLA for an executable that it does not take.
 REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
+# What an executable may call: JAX's own LAPACK. Anything else may be there in one process and not in the next.
+CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
 # How long the end of a process waits for programs that are being written, in seconds.
 AT_THE_END = 5.0
 
@@ -114,8 +120,8 @@ class KeptProgram:
         except NotKept as reason:
             TALLY.not_kept[str(reason)] += 1
             return self._jit, None
-        entry = folder.read(where.path, digest)
-        found = None if entry is None else self._loaded(*entry, arrays)
+        with folder.tried(where.path, digest) as entry:
+            found = None if entry is None else self._loaded(*entry, arrays)
         if found is None:
             lowered = self._jit.lower(arrays)
             found = lowered.compile(), self._structure
@@ -186,12 +192,14 @@ def _parts_of(call: Any) -> tuple[dict[str, Any], bytes]:
         raise NotKept("it calls Python while it runs, as for a check or a callback")
     if parts.mut or call._params.const_args or len(parts.device_list) != 1:
         raise NotKept("it is more than a function of its arguments")
+    calls = {name for module in parts.xla_executable.hlo_modules() for name in CALLS.findall(module.to_string())}
+    if others := sorted(name for name in calls if not LAPACK.fullmatch(name)):
+        raise NotKept(f"it calls {others[0]}")
     program = parts.backend.serialize_executable(parts.xla_executable)
-    if b"callback" in program:
-        raise NotKept("it calls Python while it runs, as for a check or a callback")
     header = {
         "name": parts.name,
         "committed": bool(parts.committed),
+        "lapack": bool(calls),
         "reads": sorted(parts.kept_var_idx),
         "outputs": [_kind(x) for x in parts.output_avals],
     }
@@ -212,6 +220,8 @@ def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[
     sharding = jax.sharding.SingleDeviceSharding(device)
     given = [ShapedArray(arrays[i].shape, jnp.dtype(arrays[i].dtype)) for i in header["reads"]]
     results = [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
+    if header["lapack"]:
+        initialize_lapack()
     parts = pxla.UnloadedMeshExecutable(
         xla_executable=client.deserialize_executable(program, executable_devices=devices),
         device_list=devices,
