@@ -1,5 +1,6 @@
 """What lagjax does with JAX's programs, whatever they compute: jaxprs as data, compiling, caches."""
 
+from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import (
     FACTS,
     HashablePart,

@@ -47,8 +47,10 @@ except ImportError:
     trace_context = None
 
 # Classes and functions of these count by their names.
-LIBRARIES = {"builtins", "collections", "diffrax", "enum", "equinox", "functools", "jax", "jaxlib", "jaxtyping", "lagjax",
-             "lineax", "math", "ml_dtypes", "numpy", "operator", "optimistix"}  # fmt: skip
+LIBRARIES = {
+    "builtins", "collections", "diffrax", "enum", "equinox", "functools", "jax", "jaxlib", "jaxtyping", "lagjax",
+    "lineax", "math", "ml_dtypes", "numpy", "operator", "optimistix",
+}  # fmt: skip
 # JAX's settings that change no program: where it looks, what it prints, what it refuses.
 HARMLESS = (
     "jax_compilation_cache", "jax_persistent_cache", "jax_enable_compilation_cache", "jax_log_", "jax_logging",

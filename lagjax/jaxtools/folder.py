@@ -47,7 +47,10 @@ def wanted() -> Path | None:
 
 def place() -> Place:
     """The folder, made if there is none yet."""
-    path = wanted()
+    try:
+        path = wanted()
+    except (RuntimeError, OSError) as error:
+        return Place(None, f"there is no home folder: {error}")
     if path is None:
         return Place(None, f"LAGJAX_CACHE={os.environ['LAGJAX_CACHE']}")
     try:
@@ -102,8 +105,8 @@ def read(path: Path, digest: str) -> tuple[dict[str, Any], memoryview] | None:
 def tried(path: Path, digest: str) -> Iterator[tuple[dict[str, Any], memoryview] | None]:
     """`read`, for a program that is run for the first time in this process, inside the context.
 
-    While it is, a file beside it has the number of this process. Where such a process is no more, it has ended in there,
-    perhaps by the program: that one is dropped, to be compiled anew.
+    While it is, a file beside it has the number of this process. Where such a process is no more, it has ended in
+    there, perhaps by the program: that one is dropped, to be compiled anew.
     """
     mark = path / (digest + TRYING)
     try:
@@ -114,7 +117,8 @@ def tried(path: Path, digest: str) -> Iterator[tuple[dict[str, Any], memoryview]
         _remove(path / (digest + SUFFIX))
         _remove(mark)
     found = read(path, digest)
-    if found is not None and before is None:
+    marks = found is not None and before is None
+    if marks:
         try:
             mark.write_text(str(os.getpid()))
         except OSError:
@@ -122,7 +126,7 @@ def tried(path: Path, digest: str) -> Iterator[tuple[dict[str, Any], memoryview]
     try:
         yield found
     finally:
-        if found is not None:
+        if marks:
             _remove(mark)
 
 

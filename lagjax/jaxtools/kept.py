@@ -17,6 +17,7 @@ one of JAX's contexts, and those that depend on something which `digest.py` cann
 
 import atexit
 import json
+import os
 import queue
 import re
 import threading
@@ -283,3 +284,6 @@ class Later:
 
 LATER = Later()
 atexit.register(LATER.wait)
+if hasattr(os, "register_at_fork"):
+    # A forked process has neither the thread nor what it was about to do.
+    os.register_at_fork(after_in_child=LATER.__init__)
