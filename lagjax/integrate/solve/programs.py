@@ -135,7 +135,7 @@ class _Programs:
         """
         while True:
             program = self.regular or self.robust
-            with nullcontext() if program.is_ready(arrays) else waiting(shown, "compiling"):
+            with nullcontext() if program.is_ready else waiting(shown, "compiling"):
                 found, rows, well = program(arrays)
             if program is self.robust:
                 jax.block_until_ready((found, rows))
