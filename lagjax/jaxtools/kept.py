@@ -41,12 +41,15 @@ from lagjax.jaxtools.cache import compiler_options
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
 from lagjax.jaxtools.outline import NoOutline
 
+PRIVATE: Any = None
 try:
-    from jax._src.interpreters import pxla
+    from jax._src.interpreters.pxla import UnloadedMeshExecutable
     from jax._src.lax.linalg import initialize_lapack
-    from jax._src.lib import xla_client
+    from jaxlib._jax import DeviceList
+
+    PRIVATE = UnloadedMeshExecutable, DeviceList, initialize_lapack
 except ImportError:
-    pxla = xla_client = initialize_lapack = None
+    pass
 
 # The versions of jax and jaxlib with which the tests of this module were run.
 TRIED = {"0.10.2"}
@@ -188,7 +191,7 @@ def _signature(arrays: list) -> tuple:
 def _surely(arrays: list) -> tuple:
     """The kinds of arrays on the one device where programs are kept; or `NotKept`."""
     for name, version in (("jax", jax.__version__), ("jaxlib", jaxlib.version.__version__)):
-        if version not in TRIED or pxla is None:
+        if version not in TRIED or PRIVATE is None:
             raise NotKept(f"this was not tried with {name} {version}")
     if jax.default_backend() != "cpu":
         raise NotKept(f"this was not tried on a {jax.default_backend()}")
@@ -232,13 +235,14 @@ def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[
     """JAX's own call of a kept program."""
     device = jax.devices()[0]
     client: Any = device.client
-    devices = xla_client.DeviceList((device,))
+    unloaded, list_of, find_lapack = PRIVATE
+    devices = list_of((device,))
     sharding = jax.sharding.SingleDeviceSharding(device)
     given = [ShapedArray(arrays[i].shape, jnp.dtype(arrays[i].dtype)) for i in header["reads"]]
     results = [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
     if header["lapack"]:
-        initialize_lapack()
-    parts = pxla.UnloadedMeshExecutable(
+        find_lapack()
+    parts = unloaded(
         xla_executable=client.deserialize_executable(program, executable_devices=devices),
         device_list=devices,
         backend=client,
