@@ -94,6 +94,7 @@ from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.tracing import (
     REGULAR_FIRST,
     SILENT,
+    WARNED,
     WATCHED,
     as_usual,
     at_once,

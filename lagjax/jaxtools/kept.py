@@ -22,7 +22,6 @@ import os
 import queue
 import re
 import threading
-import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -40,6 +39,7 @@ from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import compiler_options
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
 from lagjax.jaxtools.outline import NoOutline
+from lagjax.jaxtools.tracing import WARNED
 
 PRIVATE: Any = None
 try:
@@ -59,10 +59,6 @@ REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, Runtime
 CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
 # How long the end of a process waits for programs that are being written, in seconds.
 AT_THE_END = 5.0
-
-
-# The warnings that were given while programs were traced, which Python then gives once.
-GIVEN: dict = {}
 
 
 class Tally(NamedTuple):
@@ -133,17 +129,14 @@ class KeptProgram:
         with folder.tried(where.path, digest) as entry:
             found = None if entry is None else self._loaded(*entry, arrays)
         if found is None:
-            with warnings.catch_warnings(record=True) as said:
-                warnings.simplefilter("always")
-                lowered = self._jit.lower(arrays)
+            before = WARNED.total()
+            lowered = self._jit.lower(arrays)
             found = lowered.compile(), self._structure
-            if said:
-                # Who finds the program would not hear them.
+            if WARNED.total() > before:
+                # Who finds the program would not hear it.
                 TALLY.not_kept["a warning is given while it is traced"] += 1
             else:
                 self._write(where.path, digest, *found, arrays)
-            for x in said:
-                warnings.warn_explicit(x.message, x.category, x.filename, x.lineno, registry=GIVEN, source=x.source)
         self._known[signature] = found
         return found
 

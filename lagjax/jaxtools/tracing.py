@@ -8,6 +8,7 @@ mishandles one it ends the process. `LAGJAX_PLAIN=0` compiles as ever with any.
 
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
@@ -59,6 +60,9 @@ WATCHED = jax.make_user_context(default_value=False)
 SILENT = jax.make_user_context(default_value=False)
 # Whether the caller solves again with the robust method when equations assumed regular turn out singular.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
+
+# How many warnings lagjax has given, by their kinds: what warns while it is traced has to be traced in each process.
+WARNED: Counter[type[Warning]] = Counter()
 
 
 def takes_for_regular() -> bool:

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import warnings
 from collections import Counter
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +18,7 @@ from lagjax.jaxtools import LATER, KeptProgram, Said, digest, folder, kept
 from lagjax.jaxtools.digest import NotKept, digest_of
 from lagjax.jaxtools.identity import Meaning, meaning_of
 from lagjax.jaxtools.outline import NoOutline, outlined, rebuilt
+from lagjax.system.user_errors import warn
 
 
 class Pair(NamedTuple):
@@ -241,7 +241,7 @@ def test_what_is_not_kept(place, monkeypatch):
         LATER.wait()
 
     def warns(x, y):
-        warnings.warn("of this x", UserWarning)
+        warn("of this x", UserWarning)
         return x
 
     with pytest.warns(UserWarning, match="of this x"):
