@@ -92,9 +92,9 @@ from lagjax.jaxtools.primitives import (
 )
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.tracing import (
+    HAPPENED,
     REGULAR_FIRST,
     SILENT,
-    WARNED,
     WATCHED,
     as_usual,
     at_once,

@@ -39,7 +39,7 @@ from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import compiler_options
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
 from lagjax.jaxtools.outline import NoOutline
-from lagjax.jaxtools.tracing import WARNED
+from lagjax.jaxtools.tracing import HAPPENED
 
 PRIVATE: Any = None
 try:
@@ -129,12 +129,11 @@ class KeptProgram:
         with folder.tried(where.path, digest) as entry:
             found = None if entry is None else self._loaded(*entry, arrays)
         if found is None:
-            before = WARNED.total()
+            before = HAPPENED.copy()
             lowered = self._jit.lower(arrays)
             found = lowered.compile(), self._structure
-            if WARNED.total() > before:
-                # Who finds the program would not hear it.
-                TALLY.not_kept["a warning is given while it is traced"] += 1
+            if HAPPENED != before:
+                TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
             else:
                 self._write(where.path, digest, *found, arrays)
         self._known[signature] = found

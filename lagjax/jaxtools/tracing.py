@@ -61,8 +61,9 @@ SILENT = jax.make_user_context(default_value=False)
 # Whether the caller solves again with the robust method when equations assumed regular turn out singular.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
 
-# How many warnings lagjax has given, by their kinds: what warns while it is traced has to be traced in each process.
-WARNED: Counter[type[Warning]] = Counter()
+# What has happened, and how often, that has to happen in each process: a program that does it while it is traced is
+# not kept for another one.
+HAPPENED: Counter[str] = Counter()
 
 
 def takes_for_regular() -> bool:

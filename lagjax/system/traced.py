@@ -34,6 +34,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.jaxtools import (
     ARITHMETIC,
     FACTS,
+    HAPPENED,
     ClosedJaxpr,
     Itself,
     Jaxpr,
@@ -158,6 +159,7 @@ class TracedProgram:
 
     def function_with(self, arrays: Sequence) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
+        HAPPENED["a function was called that is not a program"] += 1
         structure = jtu.tree_structure(eqx.filter(self.function, is_array))
         own = arrays[len(arrays) - structure.num_leaves :]
         return eqx.combine(jtu.tree_unflatten(structure, own), self._rest)
@@ -179,6 +181,7 @@ class Traced(eqx.Module):
     @property
     def function(self) -> Callable:
         """The user's function."""
+        HAPPENED["a function was called that is not a program"] += 1
         return self.program.function_with(self.arrays) if self.arrays else self.program.function
 
     @property

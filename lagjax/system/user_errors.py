@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from lagjax.jaxtools import WARNED
+from lagjax.jaxtools import HAPPENED
 
 # The code between the user's line and here: warnings skip it.
 PACKAGES = tuple(str(Path(str(module.__file__)).parent) + os.sep for module in (jax, eqx, diffrax))
@@ -36,7 +36,7 @@ BETWEEN = (*PACKAGES, __file__.rsplit("system", 1)[0])
 
 def warn(words: str, category: type[Warning]) -> None:
     """Warn at the innermost line outside this library and the libraries that it calls."""
-    WARNED[category] += 1
+    HAPPENED["a warning was given"] += 1
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(BETWEEN):
         frame = frame.f_back
