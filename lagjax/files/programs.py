@@ -59,5 +59,7 @@ def cache() -> Cache:
     anything in your name, so a folder that others may write is not used.
 
     **Returns:** a `Cache`, with `path`, `why_not`, `programs`, `size`, `found`, `written` and `not_kept`.
+
+    **Raises:** nothing.
     """
     return Cache()

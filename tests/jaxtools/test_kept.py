@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Primitive
 
 import lagjax as lj
 from lagjax.jaxtools import LATER, KeptProgram, Said, digest, folder, kept
@@ -89,7 +90,7 @@ def test_what_cannot_be_written():
 
     scale = 2.0
     called = lambda x: jax.pure_callback(lambda x: scale * x, jax.ShapeDtypeStruct((), x.dtype), x)
-    own = jax.extend.core.Primitive("add")
+    own = Primitive("add")
     things = [
         lambda x: x, partial(written), Unknown(), Unknown, object(), Method(), meaning(called, 1.0), own,
         np.array([None]), np.array([(1, 2.0)], "i4,f8"), [Unknown()], Pair(0.0, 1.0), iter([]),
