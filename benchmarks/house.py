@@ -166,16 +166,23 @@ def walk(call):
 
 
 def walks(wanted):
-    """Rows about the ways of a system through the house: a mass on a rod, and a pendulum on a cycle."""
+    """Rows about the ways of a system through the house: a mass on a rod, a pendulum, a ball on a floor."""
     rod = {"rod": lj.Holonomic(lambda t, q, params: q["x"] ** 2 + q["y"] ** 2 - params["l"] ** 2)}
     of_mass = lambda t, q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - params["g"] * q["y"]
     mass, params, ts = lj.System(of_mass, rod), {"g": 9.81, "l": 1.0}, np.linspace(0.0, 1.0, 11)
     start, at_rest = {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}
     swing = lj.System(lambda t, q, v, params: 0.5 * v**2 + params["g"] * jnp.cos(q))
+    floor = {"floor": lj.Contact(lambda t, q, params: q, restitution=0.5)}
+    ball = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q, elements=floor)
+    swung = lambda point: lj.integrate(swing, point["angle"], 0.0, params, ts=ts).q[-1]
+    angles = {"angle": np.linspace(0.1, 1.0, 8)}
     measured = lj.Record(ts, q={"x": np.cos(2 * ts)}, q0=start, v0=at_rest)
     doors = {
         "integrate": (lambda: lj.integrate(mass, start, at_rest, params, ts=ts), 35, 6, 15),
         "fit": (lambda: lj.fit(mass, measured, params, free="g", progress=False), 60, None, 30),
+        "sweep": (lambda: lj.sweep(swung, angles, progress=False), None, None, None),
+        "contact": (lambda: lj.integrate(ball, 1.0, 0.0, params, ts=ts), None, None, None),
+        "connect": (lambda: lj.connect(swing, 0.0, 1.0, 0.0, 1.0, params), None, None, None),
         "normal modes": (lambda: lj.normal_modes(mass, 0.0, {"x": 0.0, "y": -1.0}, at_rest, params), 35, None, 20),
         "periodic orbit": (lambda: lj.periodic_orbit(swing, (1.0, 0.0), 2.1, params), None, None, None),
     }

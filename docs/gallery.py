@@ -18,6 +18,8 @@ from PIL import Image
 import lagjax as lj
 from lagjax.display import plots
 from lagjax.mechanisms import MECHANISMS, andrews, bricard, car_axis, driven_crank, n_four_bar, slider_crank
+from lagjax.mechanisms.planar import driven_crank_exact, road
+from lagjax.mechanisms.spatial import closed, closure
 from lagjax.scenes import SCENES, woodpecker
 
 jax.config.update("jax_enable_x64", True)
@@ -64,7 +66,7 @@ def unit(angle):
 
 def draw_andrews(left, right):
     """The four chains to the point P; the energy that the motor has supplied."""
-    p, (ts, q, v, _) = andrews.PARAMS, moved(andrews.MECHANISM)
+    p, (ts, q, v, _) = andrews.params, moved(andrews)
     a, b, c = ([p["x" + k], p["y" + k]] for k in "abc")
     crank = p["rr"] * unit(q.beta)
     P = crank - p["d"] * unit(q.beta + q.theta)
@@ -75,7 +77,7 @@ def draw_andrews(left, right):
     stills(left, chains, len(ts))
     left.set(title="Seven bodies that meet in P", xlabel="x / m", ylabel="y / m")
     stretch = np.linalg.norm(D - c, axis=1) - p["l0"]
-    kinetic = jax.vmap(lambda t, q, v: andrews.lagrangian(t, q, v, {**p, "c0": 0.0, "mom": 0.0}))(ts, q, v)
+    kinetic = jax.vmap(lambda t, q, v: andrews.system.lagrangian(t, q, v, {**p, "c0": 0.0, "mom": 0.0}))(ts, q, v)
     stored = np.asarray(kinetic) + 0.5 * p["c0"] * stretch**2
     work = p["mom"] * (q.beta - q.beta[0])
     compared(right, ts * 1e3, work * 1e3, (stored - stored[0]) * 1e3, "work of the motor, M β",
@@ -84,15 +86,15 @@ def draw_andrews(left, right):
 
 def draw_car_axis(left, right):
     """Axle and springs; the slope of the left spring and of the road."""
-    p, (ts, q, _, _) = car_axis.PARAMS, moved(car_axis.MECHANISM, count=301)
-    wheel = np.stack(car_axis.road(ts, p), axis=1)
+    p, (ts, q, _, _) = car_axis.params, moved(car_axis, count=301)
+    wheel = np.stack(road(ts, p), axis=1)
     l, r = np.stack([q.xl, q.yl], axis=1), np.stack([q.xr, q.yr], axis=1)
     stills(left, [path(l, r), path([0, 0], l), path(wheel, r)], len(ts))
     left.set(title="A stiff axle on two springs", xlabel="x / m", ylabel="y / m")
     # The left spring is at right angles to the road.
     slope = -q.xl / q.yl
-    road = np.asarray(p["r"] * np.sin(p["omega"] * ts))
-    compared(right, ts, road / np.sqrt(p["L"] ** 2 - road**2), slope, "tan of the road's angle",
+    height = np.asarray(p["r"] * np.sin(p["omega"] * ts))
+    compared(right, ts, height / np.sqrt(p["L"] ** 2 - height**2), slope, "tan of the road's angle",
              xlabel="t / s", ylabel="-xl / yl", title="The left spring stands upright on the road")  # fmt: skip
 
 
@@ -105,7 +107,7 @@ def slider(q, left, count):
 
 def draw_slider_crank(left, right):
     """Thrown and then moving freely: the energy gives the speed of the crank."""
-    p, (ts, q, v, _) = slider_crank.PARAMS, moved(slider_crank.MECHANISM, end=0.05)
+    p, (ts, q, v, _) = slider_crank.params, moved(slider_crank, end=0.05)
     slider(q, left, len(ts))
     left.set(title="Thrown, and left alone")
     s, c, rho = np.sin(q.crank.angle), np.cos(q.crank.angle), p["l1"] / p["l2"]
@@ -121,16 +123,16 @@ def draw_slider_crank(left, right):
 
 def draw_driven_crank(left, right):
     """Driven at a constant rate: the motor's torque is the multiplier of the drive."""
-    p, (ts, q, _, multipliers) = driven_crank.PARAMS, moved(driven_crank.MECHANISM, end=0.0419)
+    p, (ts, q, _, multipliers) = driven_crank.params, moved(driven_crank, end=0.0419)
     slider(q, left, len(ts))
     left.set(title="Turned at a constant rate")
-    compared(right, np.degrees(q.crank.angle), driven_crank.exact(ts, p)[2], multipliers["motor"], "½ J′Ω² + V′",
+    compared(right, np.degrees(q.crank.angle), driven_crank_exact(ts, p)[2], multipliers["motor"], "½ J′Ω² + V′",
              xlabel="angle of the crank / °", ylabel="torque / N m", title="The motor's torque")  # fmt: skip
 
 
 def draw_n_four_bar(left, right):
     """A ladder that swings through its singular positions."""
-    p, (ts, q, v, _) = n_four_bar.PARAMS, moved(n_four_bar.MECHANISM, end=2.6)
+    p, (ts, q, v, _) = n_four_bar.params, moved(n_four_bar, end=2.6)
     feet = [np.array([i, 0.0]) for i in range(3)]
     stills(left, [*(path(foot, q[:, i]) for i, foot in enumerate(feet)), path(*q.transpose(1, 0, 2))], len(ts))
     left.set(title="Two windows, over and under", xlabel="x / m", ylabel="y / m")
@@ -143,8 +145,8 @@ def draw_n_four_bar(left, right):
 
 def draw_bricard(left, right):
     """Six links that move although the count of degrees of freedom says that they cannot."""
-    ts, q, _, _ = moved(bricard.MECHANISM, end=9.0)
-    ends = jax.vmap(lambda q: bricard.closed(q, bricard.PARAMS))(q)
+    ts, q, _, _ = moved(bricard, end=9.0)
+    ends = jax.vmap(lambda q: closed(q, bricard.params))(q)
     points, axes = (np.asarray(x) for x in ends)
     # The view is along (1, 1, 1), turned a little.
     view = np.linalg.qr(np.array([[1.0, 0.9, 1.2], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]]).T)[0][:, 1:]
@@ -157,7 +159,7 @@ def draw_bricard(left, right):
         np.sum(np.cross(before, rods) * axes, axis=2), np.sum(before * rods, axis=2)
     )  # the angle by which r_(i-1) turns into r_i about u_i
     grid = np.linspace(-np.pi, np.pi, 200)
-    right.contour(*2 * [np.degrees(grid)], bricard.closure(*np.meshgrid(grid, grid)), [0.0], colors=[plots.COLOURS[1]])
+    right.contour(*2 * [np.degrees(grid)], closure(*np.meshgrid(grid, grid)), [0.0], colors=[plots.COLOURS[1]])
     right.plot(*np.degrees(angles[::3, :2]).T, "o", color=plots.COLOURS[0], markersize=3)
     right.set(xlabel="θ / °", ylabel="φ / °", title="cos θ + cos φ + cos θ cos φ = 0")
 

@@ -27,12 +27,11 @@ import diffrax
 import jax
 
 from lagjax import report, stability
-from lagjax.display import plots
+from lagjax.display import plots, table
 from lagjax.numerics import Dopri8
 from lagjax.report import FULL, MAIN, QUICK
 from lagjax.scenes import SCENES
 from lagjax.sweep import usable_cores
-from lagjax.work_precision import table
 
 STABILITY = "stability"
 SETTINGS = {
@@ -264,8 +263,7 @@ def _summary(parts, folder):
         (name, *part.summary[:-1], part.summary[-1] if part.summary[-1] == "-" else str(folder / part.summary[-1]))
         for name, part in parts.items()
     ]
-    width = max(len(row[-1]) for row in [header, *rows])
-    return table((*header[:-1], header[-1].ljust(width)), [(*row[:-1], row[-1].ljust(width)) for row in rows])
+    return table(header, rows, prose=True)
 
 
 def _progress(text):

@@ -13,9 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.display import table
 from lagjax.integrate import Crossing, Trajectory
 from lagjax.system import System, coordinates
-from lagjax.work_precision import WorkPrecision, in_ms, table, usual_methods, usual_others
+from lagjax.work_precision import WorkPrecision, in_ms, usual_methods, usual_others
 from lagjax.work_precision import work_precision as compared
 
 # The tolerance at which a run must reach its `required` error, for the method named with it.
@@ -194,9 +195,7 @@ def case_table(cases: Sequence[Case]) -> str:
         for case in cases
     ]
     header = ("stiff and extreme cases", "error", "allowed", "", "what happened")
-    # The last column is prose, aligned to the left.
-    width = max(len(row[-1]) for row in [header, *cells])
-    return table(header[:-1] + (header[-1].ljust(width),), [row[:-1] + (row[-1].ljust(width),) for row in cells])
+    return table(header, cells, prose=True)
 
 
 def _row(run, curve, point):

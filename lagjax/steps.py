@@ -91,7 +91,7 @@ def step(
       whatever the force reads from `params`, held in the step.
     - `dt`: the length of the step, `[t]`; negative to step back. It may be traced.
     - `method`: `lj.RK4()` (the default, four evaluations), `lj.Tsit5()` or `lj.Dopri8()`. With constraints each step is
-      followed by the return of q and v to them (`mechanics/consistent_state.py`), at which they hold to round-off.
+      followed by the return of q and v to them (`mechanics/constrained_state.py`), at which they hold to round-off.
 
     **Returns:** the time, the position and the velocity, in the dtype of the state; NaN where the mass
     matrix is singular (or, without constraints, neither definite nor dominated by its diagonal), or a step is too long

@@ -9,9 +9,8 @@ from scipy.special import ellipj, ellipk
 
 import lagjax as lj
 from lagjax.integrate import Trajectory
+from lagjax.integrate.results import Errors, Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.trajectory.error_report import Errors
-from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
 
 ASKED = SolveOptions(None, None, None, np.asarray(np.inf), None, "project")
 HOW = SolveInfo("Dopri8", 8, 13, "tolerance")

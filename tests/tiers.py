@@ -7,12 +7,12 @@ NAMES = """
     analysis.branches.continue_equilibria analysis.energy.energy_ledger analysis.equilibria.equilibria
     analysis.explain.explain analysis.exponents.floquet analysis.exponents.lyapunov_exponents
     analysis.formulations.action analysis.periodic_orbit.periodic_orbit analysis.poincare.poincare
-    analysis.poincare.turning_points exchange.standalone_programs.export fit.fit.fit fit.fit.fit_loss
-    fit.fit.fit_residuals fit.fit.load_fit fit.uncertainty.identifiability integrate.adjoint.replay.Replay
-    integrate.contacts.contacts.touches integrate.events.event.Crossing numerics.radau.Radau5
+    analysis.poincare.turning_points exchange.export fit.fit.fit fit.fit.fit_loss
+    fit.fit.fit_residuals fit.fit.load_fit fit.uncertainty.identifiability integrate.replay.Replay
+    guards.touches integrate.events.event.Crossing numerics.radau.Radau5
     numerics.runge_kutta.Nystrom8 numerics.symplectic.Gauss numerics.symplectic.Splitting sweep.sweep.sweep
     system.constraints.CompliantContact system.constraints.Contact system.constraints.SampledControl
-    system.hybrid.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
+    system.system.Hybrid two_points.connect.connect two_points.geodesic.exponential_map two_points.geodesic.geodesic
     two_points.optimal_control.steer two_points.regulators.TrackingLQR two_points.steering.Steering
     work_precision.work_precision.horizons work_precision.work_precision.work_precision
 """

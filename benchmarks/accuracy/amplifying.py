@@ -12,6 +12,7 @@ from benchmarks.accuracy.by_hand import DOUBLE_PENDULUM
 from benchmarks.accuracy.long_double import LONG, exactly
 from benchmarks.accuracy.motion import by_long_double
 from lagjax.mechanisms import double_pendulum
+from lagjax.mechanisms.planar import Masses
 
 GRAVITY = 9.8125
 
@@ -131,7 +132,7 @@ def two_rods(name, q0, v0, ts, **how):
 
 def masses_on_rods(ts):
     """The mechanism of two masses in Cartesian coordinates, rods horizontal at first; the reference uses angles."""
-    g = LONG(double_pendulum.PARAMS["g"])
+    g = LONG(double_pendulum.params["g"])
 
     def field(t, y):
         a, b, u, w = y
@@ -144,9 +145,9 @@ def masses_on_rods(ts):
         moved = lambda a, rate: np.stack([np.cos(a) * rate, np.sin(a) * rate], axis=1)
         a, b, u, w = y.T
         q, v = (arm(a), arm(a) + arm(b)), (moved(a, u), moved(a, u) + moved(b, w))
-        return tuple(double_pendulum.Masses(*(x.astype(float) for x in part)) for part in (q, v))
+        return tuple(Masses(*(x.astype(float) for x in part)) for part in (q, v))
 
-    m = double_pendulum.MECHANISM
+    m = double_pendulum
     # The angle whose sine is exactly one.
     quarter = 2 * np.arctan(LONG(1))
     return by_long_double(

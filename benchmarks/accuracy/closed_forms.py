@@ -12,7 +12,8 @@ import lagjax as lj
 from benchmarks.accuracy import work_precision
 from benchmarks.accuracy.long_double import LONG, exactly, reference
 from benchmarks.accuracy.motion import Motion
-from lagjax.mechanisms import driven_crank, slider_crank
+from lagjax.mechanisms import slider_crank
+from lagjax.mechanisms.planar import driven_crank_exact
 from lagjax.scenes import bead_on_hoop, mass_distributions, rolling_hoop
 
 
@@ -149,7 +150,7 @@ def leaving():
 
 def crank():
     """The slider-crank; the reference solves the equation of its crank's angle in long double."""
-    p = exactly(slider_crank.PARAMS)
+    p = exactly(slider_crank.params)
     ratio = p["l1"] / p["l2"]
 
     def inertia(angle):
@@ -171,10 +172,10 @@ def crank():
 
     def to_qv(y):
         angle, rate = y.T
-        q, unit, _ = driven_crank.exact(angle.astype(float), slider_crank.PARAMS | {"rate": 1.0})
+        q, unit, _ = driven_crank_exact(angle.astype(float), slider_crank.params | {"rate": 1.0})
         return q, jax.tree.map(lambda x: x * rate.astype(float), unit)
 
-    m = slider_crank.MECHANISM
+    m = slider_crank
     found = reference(field, [0, LONG(150)], to_qv)
     return Motion("slider-crank", m.system, m.q0, m.v0, m.params, np.linspace(0.0, m.end, 11), found.exact,
                   "long double", found.known, tolerances=(1e-5, 1e-8))  # fmt: skip

@@ -25,6 +25,7 @@ from scipy.integrate import solve_ivp
 import lagjax as lj
 from benchmarks.measure import main, row
 from lagjax.mechanisms import double_pendulum
+from lagjax.mechanisms.planar import Masses
 from lagjax.numerics.radau import SimplifiedNewton
 
 jax.config.update("jax_enable_x64", True)
@@ -69,7 +70,7 @@ def points(angles, rates):
     length = np.array([P["l1"], P["l2"]])[:, None]
     rods = length * np.stack([np.sin(angles), -np.cos(angles)], axis=-1)
     moves = length * np.stack([np.cos(angles), np.sin(angles)], axis=-1) * rates[..., None]
-    return tuple(double_pendulum.Masses(x[..., 0, :], x[..., 0, :] + x[..., 1, :]) for x in (rods, moves))
+    return tuple(Masses(x[..., 0, :], x[..., 0, :] + x[..., 1, :]) for x in (rods, moves))
 
 
 def textbook(t, y):

@@ -25,7 +25,7 @@ from jax.flatten_util import ravel_pytree
 import lagjax as lj
 from benchmarks.measure import machine, row, versions, written
 from lagjax.fit.residuals import dampened
-from lagjax.integrate.trajectory.results import in_words
+from lagjax.integrate.results import in_words
 from lagjax.scenes import bead_on_hoop, cross_rails, mass_distributions
 
 jax.config.update("jax_enable_x64", True)

@@ -42,7 +42,7 @@ import numpy as np  # noqa: E402
 import lagjax as lj  # noqa: E402
 from benchmarks.gpu.host_operations import host_operations, with_a_look  # noqa: E402
 from benchmarks.measure import CLOCK, in_new_process, main, row, skipped, small  # noqa: E402
-from lagjax.integrate.trajectory.error_report import EXPECTED  # noqa: E402
+from lagjax.integrate.results import EXPECTED  # noqa: E402
 from lagjax.scenes import bead_on_hoop  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)

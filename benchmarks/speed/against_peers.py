@@ -199,7 +199,7 @@ def pendulum_rows(wanted):
 
 def crank_rows(wanted):
     """The slider-crank compared with IDAS."""
-    what, mechanism = "slider-crank: lagjax / IDAS", slider_crank.MECHANISM
+    what, mechanism = "slider-crank: lagjax / IDAS", slider_crank
     if not wanted(what):
         return
     p = mechanism.params

@@ -160,7 +160,7 @@ left = diffrax.Event(normal, __import__("optimistix").Newton(1e-9, 1e-9))
 options = {"events": rolling_hoop.DEPARTURE}
 """
 SLIDER_CRANK = """
-from lagjax.mechanisms.slider_crank import MECHANISM
+from lagjax.mechanisms import slider_crank as MECHANISM
 system, params, start, ts = MECHANISM.system, MECHANISM.params, (MECHANISM.q0, MECHANISM.v0), np.linspace(0.0, 0.1, 5)
 """
 # Nine coordinates, two wheels on the ground and four no-slip equations; pushed, so that it sways as it runs.
@@ -179,7 +179,7 @@ from lagjax.scenes import mass_distributions as scene
 helix, (q, v, _), params = scene.SYSTEMS["helix"], scene.ORBITS["helix"], scene.PARAMS["helix"]
 """
 GOVERNOR = """
-from lagjax.mechanisms.governor import MECHANISM
+from lagjax.mechanisms import governor as MECHANISM
 """
 SOLVED = """
 options = globals().get("options", {})

@@ -29,7 +29,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
-from lagjax.display import by_line
+from lagjax.display import by_line, columns
 from lagjax.jaxtools import is_traced, jitted
 from lagjax.mechanics import describe, forcing_and_inertia, response
 from lagjax.numerics import dense, independent_rows, lapack, reciprocal_condition, roots_beside_zeros
@@ -448,10 +448,7 @@ def _lines(found: Equilibria):
     rows = [_row(found, i) for i in range(len(found)) if found.found[i]]
     if rows:
         heads = list(rows[0])
-        widths = [max(len(head), *(len(row[head]) for row in rows)) for head in heads]
-        yield "  " + "  ".join(head.rjust(width) for head, width in zip(heads, widths)).rstrip()
-        for row in rows:
-            yield "  " + "  ".join(row[head].rjust(width) for head, width in zip(heads, widths)).rstrip()
+        yield from (f"  {line}" for line in columns([heads, *([row[head] for head in heads] for row in rows)], ">"))
     if any(found.zero_modes[i] for i in range(len(found)) if found.found[i]):
         yield "  A zero mode: one of a family of equilibria, the nearest to its start; or branches meet there."
     status = np.asarray(found.status)

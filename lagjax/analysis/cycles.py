@@ -38,6 +38,7 @@ from lagjax.analysis.flow import any_flow
 from lagjax.analysis.monodromy import OrbitProblem, any_problem_of, tolerance_of, user_system
 from lagjax.analysis.periodic_orbit import PeriodicOrbit
 from lagjax.analysis.shooting import OrbitRequest, guessed
+from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
 from lagjax.system import State, checked, coordinates
@@ -188,16 +189,15 @@ class OrbitBranch(eqx.Module):
         # Of the range that was asked for, which ends may lie beside by round-off.
         whole = abs(reached[1] - self.last) < 1e-9 * abs(self.last - self.first)
         span = f"from {number(reached[0])} to {number(reached[1])}" + ("" if whole else f" (asked to {self.last:.6g})")
-        lines = [f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {points}"]
-        lines += [
-            f"  {c.kind:<16}{self.along} = {number(c.parameter) + c.doubt:<14} {_torus_angle(c)}" for c in self.critical
+        rows = [
+            (c.kind, f"{self.along} = {number(c.parameter) + c.doubt:<14} {_torus_angle(c)}") for c in self.critical
         ]
         low, high = np.min(self.period), np.max(self.period)
-        lines.append(f"  {'periods':<16}{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else ""))
-        lines.append(f"  {'stability':<16}{stability_in_words(self._verdicts())}")
+        rows.append(("periods", f"{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else "")))
+        rows.append(("stability", stability_in_words(self._verdicts())))
         where = f", {self.along} = {number(self.parameter[-1])}" if self.status == AT_EDGE else ""
-        lines.append(f"  {'ends at':<16}{self.status}{where}")
-        return "\n".join(lines)
+        rows.append(("ends at", f"{self.status}{where}"))
+        return labelled(f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {points}", rows)
 
 
 def _torus_angle(c: CriticalOrbit):

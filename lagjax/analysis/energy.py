@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from lagjax.display import columns
 from lagjax.display import plots as plot
 from lagjax.integrate import (
     ENDED_WELL,
@@ -494,18 +495,13 @@ class EnergyLedger(eqx.Module):
         rows += [(name, [jumps[-1]]) for name, jumps in self._jumps().items()]
         heads = ["change", *(f"by {name}" for name in names)] if len(names) > 1 else ["change"]
         cells = [[self._number(x) for x in numbers] for _, numbers in rows]
-        widths = [max(len(row[i]) for row in [heads, *cells] if i < len(row)) for i in range(len(heads))]
+        lines = columns([["", *heads], *([name, *row] for (name, _), row in zip(rows, cells))], "<>")
         width = max(len(name) for name, _ in rows)
-
-        def line(name: str, cells: list[str]) -> str:
-            return "  ".join([f"  {name:<{width}}", *(f"{x:>{w}}" for x, w in zip(cells, widths))])
-
         closure = f"{self.relative_closure:.0e} of the largest energy at the outputs, {self.scale:.6g}"
         verdict = "" if self.closes else f"; DOES NOT CLOSE: above {self.allowed:.0e}"
         return "\n".join([
             f"EnergyLedger, t = {self.t[0]:.6g} to {self.t[-1]:.6g}, {len(self.t)} instants",
-            line("", heads),
-            *(line(name, row) for (name, _), row in zip(rows, cells)),
+            *(f"  {line}" for line in lines),
             f"  {'closure':<{width}}  {closure}{verdict}",
             *(f"  {note}" for note in self._odd()),
         ])  # fmt: skip

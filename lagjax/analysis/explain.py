@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.display import by_line
+from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.integrate import found as jumps_found
 from lagjax.integrate import modes_at, nystrom_for, traced_phases
@@ -79,21 +79,20 @@ class HybridExplanation:
         return plot.graph(list(self.phases), arrows)
 
     def __repr__(self):
-        width = max(map(len, self.phases))
-        lines = ["Hybrid"]
+        rows = []
         for name, found in self.phases.items():
             held = ", ".join(map(repr, found.structure.constraints)) if found.structure is not None else ""
             count = found.degrees_of_freedom
             words = [f"{count} degree{'' if count == 1 else 's'} of freedom", *([f"held by {held}"] if held else [])]
             words += ["no switch leads here"] if name in self.unreachable else []
             words += ["no switch leaves it"] if name in self.final else []
-            lines.append(f"  {name:<{width}}  {'; '.join(words)}")
+            rows.append((name, "; ".join(words)))
             for _, targets, guard, value in (switch for switch in self.switches if switch[0] == name):
                 now = "" if value is None else f", now {value:.6g}"
-                lines.append(f"  {'':<{width}}    -> {' or '.join(targets)}, when {guard} reaches zero{now}")
+                rows.append(("", f"  -> {' or '.join(targets)}, when {guard} reaches zero{now}"))
             if found.problem:
-                lines.append(f"  {'':<{width}}    problem: {found.problem.splitlines()[0]}")
-        return by_line("\n".join(lines))
+                rows.append(("", f"  problem: {found.problem.splitlines()[0]}"))
+        return labelled("Hybrid", rows)
 
 
 def explained(hybrid: Hybrid, phases: dict, state: State) -> HybridExplanation:
@@ -155,8 +154,7 @@ class Explanation:
     modes: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self):
-        width = max(len(label) for label, _ in self.rows)
-        return "\n".join(["System", *(by_line(f"  {label:<{width}}  {text}") for label, text in self.rows)])
+        return labelled("System", self.rows)
 
 
 @overload

@@ -42,7 +42,7 @@ from jaxtyping import Array, ArrayLike, Bool, Complex, Float, PyTree
 from lagjax.analysis.flow import SwitchingFlow, any_flow
 from lagjax.analysis.monodromy import any_problem_of, period_of, refuse_unfollowed
 from lagjax.analysis.periodic_orbit import PeriodicOrbit
-from lagjax.display import plots
+from lagjax.display import labelled, plots
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_traced, numpy_of
 from lagjax.system import Hybrid, State, System, by_name, coordinates
@@ -208,7 +208,7 @@ class Floquet(eqx.Module):
             rows.append(("zero", f"{unknown} of the multipliers {are} 0 within the errors of M, as after sticking"))
         elif unknown:
             rows.append(("WARNING", f"{unknown} of the multipliers {are} not known: as small as the errors of M"))
-        return "\n".join(["Floquet multipliers", *(f"  {label:<11}  {value}" for label, value in rows)])
+        return labelled("Floquet multipliers", rows)
 
 
 def floquet(
@@ -393,7 +393,7 @@ class LyapunovExponents(eqx.Module):
         parts = "neighbours part exponentially; chaos, if the motion stays bounded"
         verdict = parts if bool(self.sensitive) else "no exponential parting seen in this time"
         rows.append(("verdict", verdict if bool(self.ended) else "not known: the motion could not be followed"))
-        return "\n".join(["Lyapunov exponents", *(f"  {label:<9}  {value}" for label, value in rows)])
+        return labelled("Lyapunov exponents", rows)
 
 
 @by_name("lj.lyapunov_exponents(system, q, v, params, ts=ts)", "ts")

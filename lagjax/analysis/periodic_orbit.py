@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from lagjax.analysis import shooting
 from lagjax.analysis.monodromy import any_problem_of, refuse_unfollowed, tolerance_of, user_system
 from lagjax.analysis.shooting import OrbitRequest
+from lagjax.display import labelled
 from lagjax.integrate import RESULTS, Report, Switches, Trajectory, integrate, reported
 from lagjax.jaxtools import HashablePart, hashable_partition, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import describe, listed
@@ -111,7 +112,7 @@ class PeriodicOrbit(eqx.Module):
             rows += [("", row) for row in self.switches.in_rows()]
         if not bool(self.converged):
             rows.append(("WARNING", "not converged: this is the best that was found"))
-        return "\n".join(["Periodic orbit", *(f"  {label:<9}  {value}" for label, value in rows)])
+        return labelled("Periodic orbit", rows)
 
 
 def _moved(tree):

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.integrate import Crossing, Crossings, Trajectory, angle_mask, crossings_of, curves, integrate
 from lagjax.jaxtools import is_traced
@@ -148,7 +149,7 @@ class PoincareSection(eqx.Module):
         if is_traced(self):
             return f"Poincaré section, being traced, room for {self.t.shape[-1]} crossings"
         rows = _batch_rows(self) if np.ndim(self.count) else _rows(self)
-        return "\n".join(["Poincaré section", *(f"  {label:<10}  {value}" for label, value in rows)])
+        return labelled("Poincaré section", rows)
 
 
 @by_name("lj.poincare(system, q0, v0, params, section=section, ts=ts)", "section", "ts")

@@ -34,6 +34,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.display import labelled
 from lagjax.jaxtools import compiled, is_traced, numpy_of, remembered
 from lagjax.mechanics import (
     Generator,
@@ -403,12 +404,10 @@ class SymmetryTest(eqx.Module):
             rows.append((f"constraint '{name}'", words + (", though it looks the same" if unchanged else "")))
         rows.append(("charge", f"{float(self.charge):.9g}" + (f", at {self.at}" if self.at else "")))
         rows.append(("its rate there", "0" if self else f"{float(self.rate):.9g}"))
-        width = max(len(name) for name, _ in rows)
         verdict = "conserved by a symmetry" if self else f"no symmetry: broken by {' and '.join(self.broken_by())}"
-        return "\n".join([
-            f"{self.name}: {verdict}; residual {float(self.residual):.0e} over {int(self.states)} states",
-            *(f"  {name:<{width}}  {words}" for name, words in rows),
-        ])  # fmt: skip
+        return labelled(
+            f"{self.name}: {verdict}; residual {float(self.residual):.0e} over {int(self.states)} states", rows
+        )
 
 
 def is_symmetry(system, generator, q: PyTree, v: PyTree, params: PyTree = None, *, t=0.0) -> SymmetryTest:

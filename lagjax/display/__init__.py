@@ -21,4 +21,4 @@ from lagjax.display.scenery import (
     surface,
     triangles,
 )
-from lagjax.display.terminal import by_line, is_plain, meter, printable, waiting
+from lagjax.display.terminal import by_line, columns, is_plain, labelled, meter, printable, table, waiting

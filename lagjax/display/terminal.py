@@ -4,6 +4,7 @@ Short work shows nothing, and nothing is shown outside of terminals and notebook
 """
 
 import threading
+from collections.abc import Iterable, Sequence
 from contextlib import contextmanager, nullcontext
 
 
@@ -23,6 +24,27 @@ def by_line(text: object) -> str:
 def is_plain(text: str) -> bool:
     """Whether a text has only characters that `printable` leaves as they are, line ends and tabs."""
     return text.replace("\n", "").replace("\t", "").isprintable()
+
+
+def labelled(title: str, rows: Iterable[tuple[str, object]]) -> str:
+    """What a result prints: a title, and below it values in one column, each after its label."""
+    rows = list(rows)
+    width = max((len(label) for label, _ in rows), default=0)
+    return "\n".join(map(printable, [title, *(f"  {label:<{width}}  {value}".rstrip() for label, value in rows)]))
+
+
+def columns(rows: Sequence[Sequence[str]], sides: str) -> list[str]:
+    """Lines whose cells stand below each other; `sides` is "<" or ">" for each column, the last one for all further."""
+    sides = sides + sides[-1] * (max(map(len, rows), default=0) - len(sides))
+    widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(sides))]
+    return ["  ".join(f"{cell:{s}{w}}" for cell, s, w in zip(row, sides, widths)).rstrip() for row in rows]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], prose: bool = False) -> str:
+    """A header, a line, and rows: the first column to the left, the others to the right but for a last one of prose."""
+    sides = "<" + ">" * (len(header) - 2) + ("<" if prose else ">") if len(header) > 1 else "<"
+    head, *shown = columns([header, *rows], sides)
+    return "\n".join([head, "-" * max(map(len, [head, *shown])), *shown])
 
 
 # Seconds of waiting before a message is shown, and between two updates of it.

@@ -1,8 +1,9 @@
 """The closed table of what files may hold besides numbers, text, dicts, lists and tuples (`npz.py`).
 
 A class or a function is looked up here by its package and its own name; a file's name that is not in the table is
-refused, and nothing is imported for it. Each class has the fields that a file may give it. A class that is not listed,
-such as one of the user's, is passed as `classes=[TheClass]`.
+refused, and nothing is imported for it. A file may give a class of ours the fields that it is defined with, and one of
+another package those listed here. A class that is not listed, such as one of the user's, is passed as
+`classes=[TheClass]`.
 """
 
 import dataclasses
@@ -22,20 +23,37 @@ import optimistix as optx
 
 from lagjax.numerics import tolerance_of_the_controller
 
-# A module, and the classes that are found there: their fields.
-CLASSES = """
-lagjax.numerics.runge_kutta
-  Dopri8 Tsit5 RK4: in_a_loop
-lagjax.numerics.runge_kutta
-  Nystrom8 Nystrom12: in_a_loop
-lagjax.numerics.symplectic
-  Gauss: stages newton pace
-lagjax.numerics.symplectic
-  Splitting: order pace
-lagjax.numerics.radau
-  Radau5: root_finder root_find_max_steps step_powers
-lagjax.numerics.radau
-  SimplifiedNewton: rtol atol norm kappa slow
+# Our own classes by module: a file may give each the fields that it has where it is defined.
+OURS = """
+analysis.branches: Branches Branch Critical
+analysis.energy: EnergyLedger
+analysis.exponents: Floquet LyapunovExponents
+analysis.linearise: Linearisation LinearisationKind LinearParts Raw
+analysis.normal_modes: NormalModes Mode
+analysis.poincare: PoincareSection
+analysis.symmetry_test: SymmetryTest
+bodies.body: Pose
+fit.next_measurement: NextMeasurements Candidate
+fit.records: Windows Record
+fit.residuals: FitProblem
+fit.result: Fit
+fit.search: Misfit Evaluation
+fit.uncertainty: Identifiability
+fit.unknowns: Leaf FreeNumbers Chart Starts
+integrate.events.event: Crossings
+integrate.results: Errors Snapshot
+integrate.trajectory: Switches
+learned: Network SameMotion
+numerics.newton: Unknowns Covariance
+numerics.radau: Radau5 SimplifiedNewton
+numerics.runge_kutta: Dopri8 Tsit5 RK4 Nystrom8 Nystrom12
+numerics.symplectic: Gauss Splitting
+sweep.engine: Status
+system.coordinates: State
+"""
+
+# A module of another package, and the classes that are found there: their fields.
+OTHERS = """
 diffrax
   Euler SemiImplicitEuler LeapfrogMidpoint ReversibleHeun ConstantStepSize DirectAdjoint ForwardMode:
   Heun Midpoint Ralston Bosh3 Tsit5 Dopri5 Dopri8: scan_kind
@@ -54,11 +72,6 @@ lineax
   AutoLinearSolver: well_posed
   Diagonal: well_posed rcond
   SVD: rcond
-lagjax.bodies.body
-  Pose: position quaternion
-lagjax.learned
-  Network: mlp sizes angular
-  SameMotion: differences ratio
 equinox.nn
   MLP: layers activation final_activation use_bias use_final_bias in_size out_size width_size depth scan
   Linear: weight bias in_features out_features use_bias
@@ -80,79 +93,16 @@ equinox.nn
     padding use_ceil
   MultiheadAttention: query_proj key_proj value_proj output_proj dropout num_heads query_size key_size value_size
     output_size qk_size vo_size use_query_bias use_key_bias use_value_bias use_output_bias
-lagjax.system.coordinates
-  State: t q v params
-lagjax.integrate.trajectory.trajectory
-  Snapshot: t q v multipliers
-lagjax.integrate.events.event
-  Crossings: t q v multipliers count uncertain
-lagjax.integrate.trajectory.hybrid_trajectory
-  Switches: t way to q v q_after v_after impulse count uncertain names ways
-lagjax.integrate.trajectory.error_report
-  Errors: q v multipliers events result steps
-lagjax.analysis.poincare
-  PoincareSection: trajectory event
-lagjax.analysis.energy
-  EnergyLedger: t jacobi_integral kinetic potential works constraints impact_times impacts switches impact_total
-    closure scale allowed quadrature
-lagjax.sweep.engine
-  Status: result steps scaled_error residual
-lagjax.analysis.exponents
-  Floquet: multipliers trivial reasons monodromy log_volume error period ended apart words
-lagjax.analysis.exponents
-  LyapunovExponents: exponents uncertainty t growth volume settled ended all_of_them
-lagjax.analysis.symmetry_test
-  SymmetryTest: name residual charge_rate lagrangian force has_forces displacement invariance charge rate states at
-lagjax.analysis.branches
-  Branches: branches critical along first last names params status
-  Branch: parameter q v multipliers stable eigenvalues status critical
-  Critical: kind parameter q v multipliers derivative frequency accuracy branches
-lagjax.analysis.linearise
-  Linearisation: mass gyroscopic damping circulatory stiffness positions velocities multipliers residual sound state
-    parts kind names
-lagjax.analysis.linearise
-  LinearisationKind: unseen holonomic independent conservative at_rest timeless
-  LinearParts: mass velocity position drift transfer positions velocities turning multipliers a off forces sound
-    independent raw
-  Raw: mass velocity position rows slopes
-lagjax.analysis.normal_modes
-  NormalModes: roots shapes energy zero growing double code unexplained linearisation zero_words
-  Mode: root shape energy double linearisation label
-lagjax.numerics.windowed_least_squares
-  Unknowns: shared local
-  Covariance: shared local local_shared
-lagjax.fit.uncertainty
-  Identifiability: names values singular_values combinations noise next
-lagjax.fit.next_measurement
-  NextMeasurements: of now candidates absolute
-  Candidate: name t times sd alone sigma rows known direction least
-lagjax.fit.unknowns
-  Leaf: number places
-  FreeNumbers: params start low high mean sd names leaves weak
-lagjax.fit.records
-  Windows: ts real sample last seam record
-  Record: t measured q0 v0 hold_q hold_v params sigma
-lagjax.fit.unknowns
-  Chart: guess along across
-  Starts: q v
-lagjax.fit.residuals
-  FitProblem: system first found overrides windows starts measured sigma spread spread_in_sigmas unit unflatten observe
-    options loss absolute
-lagjax.fit.search
-  Misfit: times large curved doubtful
-lagjax.fit.search
-  Evaluation: rows well covariance determined singular_values combinations chi2 freedom
-lagjax.bodies.body
-  Pose: position quaternion
-lagjax.fit.result
-  Fit: problem unknowns cost steps rested misfit costs evaluation units
 """
 
 
-def _listed() -> dict[str, tuple[str, tuple[str, ...]]]:
-    """By package and name, the module of a class and its fields."""
+def _listed() -> dict[str, tuple[str, tuple[str, ...] | None]]:
+    """By package and name, the module of a class and its fields; None for those that it has itself."""
     found, module = {}, ""
-    for line in re.sub(r"\n {4,}", " ", CLASSES).splitlines():
+    for line in OURS.split("\n")[1:-1]:
+        module, _, names = line.partition(": ")
+        found |= {f"lagjax.{name}": (f"lagjax.{module}", None) for name in names.split()}
+    for line in re.sub(r"\n {4,}", " ", OTHERS).splitlines():
         names, _, fields = line.partition(":")
         if not line.startswith(" "):
             module = line
@@ -241,7 +191,10 @@ def listed(module: str, name: str) -> tuple[type, tuple[str, ...]] | None:
     """A class of the table and the fields that it may have; None if it is not listed."""
     name = RENAMED.get(name, name) if module.split(".")[0] == "lagjax" else name
     place, fields = LISTED.get(f"{module.split('.')[0]}.{name}", (None, ()))
-    return None if place is None else (getattr(import_module(place), name), fields)
+    if place is None:
+        return None
+    cls = getattr(import_module(place), name)
+    return cls, (fields_of(cls) or ()) if fields is None else fields
 
 
 def name_of_function(value: Any) -> dict[str, str] | None:

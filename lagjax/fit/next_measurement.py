@@ -30,7 +30,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax.display import by_line
+from lagjax.display import by_line, columns
 from lagjax.fit.records import Record, Windows, channel_name, closest, padded
 from lagjax.fit.residuals import WHOLE, FitProblem, check_predicted
 from lagjax.fit.search import UNSEEN, Evaluation, LinearisedResiduals, evaluation_from, linearised
@@ -247,13 +247,14 @@ def _lines(found: NextMeasurements):
     lines = [f"{found.of} {now}; after one of the following:"]
     shown = found.candidates[:CANDIDATES_SHOWN]
     labels = [c.name if len(c.times) == len(c.t) else f"{c.name} at t = {c.times[0]:.4g}" for c in shown]
-    width = max(map(len, labels), default=0)
+    rows = []
     for label, c in zip(labels, shown):
         after = f"± {c.sd:.2g}" if np.isfinite(c.sd) else "not determined"
         errors = (
             ", ".join(f"{name} to {s:.2g}" for name, s in c.sigma.items() if np.isfinite(s)) if found.absolute else ""
         )
-        lines.append(f"  {label:<{width}}  {after:<9}" + (f"  (measured: {errors})" if errors else ""))
+        rows.append((label, after, f"(measured: {errors})" if errors else ""))
+    lines += [f"  {line}" for line in columns(rows, "<")]
     if len(found.candidates) > CANDIDATES_SHOWN:
         lines.append(f"  ... and {len(found.candidates) - CANDIDATES_SHOWN} more")
     lines += _line_of_times(found.best, unit) if shown else []

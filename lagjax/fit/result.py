@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from lagjax.display import by_line
+from lagjax.display import by_line, columns
 from lagjax.display import plots as plot
 from lagjax.files import NotGiven, NotWritable, Writer, npz
 from lagjax.fit.arguments import FitWarning
@@ -59,8 +59,7 @@ def lines_of(fit: "Fit") -> list[str]:
                 x, sd = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(y)]) for y in (x, sd))
                 named = zip(coordinates.names(q), x, sd)
                 rows += [(f"{label}{name}(0){suffix}", _plus_minus(a, b), "") for name, a, b in named if b != 0]
-    width, wide = max(len(row[0]) for row in rows) if rows else 0, max((len(row[1]) for row in rows), default=0)
-    lines += [f"  {name:<{width}}  {value:<{wide}}  {unit}".rstrip() for name, value, unit in rows]
+    lines += [f"  {line}" for line in columns(rows, "<")]
     if many:
         lines.append(f"  ... and {len(fit.names) - 40} more")
     if weak := fit.problem.found.weak:

@@ -41,7 +41,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.display import by_line
+from lagjax.display import by_line, labelled, printable
 from lagjax.fit.arguments import problem_of
 from lagjax.fit.next_measurement import (
     NEGLIGIBLE_SHARE,
@@ -317,12 +317,12 @@ class Laplace:
 
     def __repr__(self):
         evidence = f", log evidence {self.log_evidence:.6g}" if np.isfinite(self.log_evidence) else ""
-        lines = [f"Laplace: {len(self.names)} unknowns{evidence}"]
-        width = max(map(len, self.names), default=0)
-        gauss_newton = np.sqrt(np.diag(self.gauss_newton))
-        for name, mean, sd, other in list(zip(self.names, self.mean, self.sd, gauss_newton))[:40]:
-            lines.append(f"  {name:<{width}}  {mean:.6g} ± {sd:.3g}, by Gauss and Newton ± {other:.3g}")
-        return by_line("\n".join([*lines, *(f"  {words}" for words in self.caveats)]))
+        numbers = zip(self.names, self.mean, self.sd, np.sqrt(np.diag(self.gauss_newton)))
+        rows = [
+            (name, f"{mean:.6g} ± {sd:.3g}, by Gauss and Newton ± {other:.3g}") for name, mean, sd, other in numbers
+        ]
+        found = labelled(f"Laplace: {len(self.names)} unknowns{evidence}", rows[:40])
+        return "\n".join([found, *(printable(f"  {words}") for words in self.caveats)])
 
 
 def laplace(problem: FitProblem, u: Unknowns, variance: float) -> Laplace:

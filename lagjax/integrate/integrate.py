@@ -13,17 +13,16 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.integrate import arguments
-from lagjax.integrate.adjoint.replay import Replay
-from lagjax.integrate.diagnose_guard import warn_of_events, warn_of_missed_end
 from lagjax.integrate.events.event import Crossing
-from lagjax.integrate.failure import raise_at_run_time, raise_failure
+from lagjax.integrate.failure import raise_at_run_time, raise_failure, warn_of_events, warn_of_missed_end
 from lagjax.integrate.prepare import MANY_STEPS, prepare
 from lagjax.integrate.problem import Problem
-from lagjax.integrate.solve.backward_time import run
-from lagjax.integrate.solve.harvest import report
-from lagjax.integrate.solve.over_jumps import warn_of_lost
-from lagjax.integrate.trajectory.results import ENDED_WELL, is_among
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.replay import Replay
+from lagjax.integrate.results import ENDED_WELL, is_among
+from lagjax.integrate.solve.legs import warn_of_lost
+from lagjax.integrate.solve.phases import run
+from lagjax.integrate.solve.reports import report
+from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import SILENT, WATCHED, is_traced
 from lagjax.numerics import EqualSteps
 from lagjax.system import Hybrid, System, by_name
@@ -77,7 +76,7 @@ def integrate(
       method, except as `outputs` says. (Decreasing times have to be known while JAX is tracing: a NumPy array.)
     - `rtol`, `atol`: tolerances of the local error of each coordinate and velocity, `atol + rtol |y|`. `rtol` is 1e-9
       by default in float64, 1e-5 in float32. Without `atol` each number is judged by its own size, whatever the units
-      (`lagjax/integrate/stepping/tolerances.py`): at a zero crossing by its size at the end of the step, at rest by
+      (`lagjax/integrate/stepping.py`): at a zero crossing by its size at the end of the step, at rest by
       its change in a step, and a decaying one over three decades. Give `atol` if small numbers do not matter, such as
       the stretching of a stiff spring. A pair is one for coordinates, `[q]`, and one for velocities, `[q]/[t]`. The
       size of an angle (a coordinate that enters only through sines and cosines) counts at most as one turn.

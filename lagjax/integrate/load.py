@@ -10,16 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax.files import Reader, Table, check_field, fields_of, npz
+from lagjax.integrate.data import PLAIN
 from lagjax.integrate.events.event import Crossings
-from lagjax.integrate.solve.backward_time import backward_trajectory_of
-from lagjax.integrate.solve.phases import traced_phases
+from lagjax.integrate.results import RESULTS, Errors, Snapshot, SolveInfo, SolveOptions, item, pack
+from lagjax.integrate.solve.phases import backward_trajectory_of, traced_phases
 from lagjax.integrate.solve.programs import trajectory_of
-from lagjax.integrate.trajectory.error_report import Errors
-from lagjax.integrate.trajectory.hybrid_trajectory import OF_PHASES, HybridTrajectory, Switches
-from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
-from lagjax.integrate.trajectory.results import RESULTS, item
-from lagjax.integrate.trajectory.save import PLAIN
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.trajectory import OF_PHASES, HybridTrajectory, Switches, Trajectory
 from lagjax.jaxtools import is_array, without_init
 from lagjax.system import SYSTEMS, Hybrid, State, System, UnknownSystem, differences, signature
 

@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax.integrate import arguments
-from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate.arguments import warn_of_odd_dissipation
 from lagjax.integrate.equal_steps.pace import with_traced_pace
 from lagjax.integrate.events.event import crossings_of, guards_of, left_to_diffrax
-from lagjax.integrate.input_warnings import warn_of_odd_dissipation
 from lagjax.integrate.problem import Problem
+from lagjax.integrate.replay import Replay
 from lagjax.integrate.settings import Settings, is_recorded, patient
-from lagjax.integrate.solve.error_estimate import steps_to_repeat
 from lagjax.integrate.solve.phases import phases_in, refuse_beside_switches, traced_phases
-from lagjax.integrate.stepping.step_to_outputs import WHOLE_STEPS
+from lagjax.integrate.solve.reports import steps_to_repeat
+from lagjax.integrate.stepping import WHOLE_STEPS
 from lagjax.mechanics import has_networks
 from lagjax.numerics import EqualSteps
 from lagjax.system import Hybrid, System, check_system, coordinates, with_rates

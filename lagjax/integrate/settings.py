@@ -46,7 +46,7 @@ class Settings:
     max_steps: int | None = eqx.field(static=True)
     drift: str = eqx.field(static=True)
     progress: bool | None = eqx.field(static=True)
-    # The accelerations of forces that may cancel, where they are known: `Forced` of `stepping/tolerances.py`.
+    # The accelerations of forces that may cancel, where they are known: `Forced` of `stepping.py`.
     forced: Any = None
     # The size of the record for reverse mode, in bytes; None for the usual one.
     memory: float | None = eqx.field(static=True, default=None)

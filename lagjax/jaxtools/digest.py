@@ -37,7 +37,7 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 
 from lagjax.jaxtools.cache import HashablePart, once
-from lagjax.jaxtools.identity import Meaning, content_of
+from lagjax.jaxtools.jaxpr import Meaning, content_of
 from lagjax.jaxtools.tracing import is_plain
 
 try:

@@ -1,8 +1,11 @@
 """The equations of motion at one state."""
 
-from lagjax.mechanics.accelerations import accelerations, accelerations_at, constraint_force, constraint_residual
-from lagjax.mechanics.consistent_state import (
+from lagjax.mechanics.constrained_state import (
+    accelerations,
+    accelerations_at,
     consistent_state,
+    constraint_force,
+    constraint_residual,
     departures,
     free_coordinates,
     returned,

@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lagjax.jaxtools import compiled, is_traced, shape_of
-from lagjax.mechanics.accelerations import accelerations_at
+from lagjax.mechanics.constrained_state import accelerations_at
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.lagrangian import applied_force
 from lagjax.system import (

@@ -97,7 +97,26 @@ def vanishing(size: Array, nearby: Array):
     return size <= VANISHES_BELOW[np.dtype(size.dtype)] * jnp.nan_to_num(nearby, posinf=0.0)
 
 
-def acceleration_round_off(inertia, forces, x: Array, u: Array):
+class Misses(NamedTuple):
+    """What the solution misses of A a = gamma in each equation, with the sizes of what could cause it.
+
+    `terms`: of A a - gamma, added up; `sizes`: `Σ_j |A_ij|`; `mass`, `forces`: of each row of M a - F - Aᵀ λ.
+    """
+
+    by: Float[Array, " m"]
+    terms: Float[Array, " m"]
+    sizes: Float[Array, " m"]
+    mass: Float[Array, " n"]
+    forces: Float[Array, " n"]
+
+    def contradictory(self, independent: Bool[Array, " m"], below: float, x: Array, u: Array) -> Bool[Array, " m"]:
+        """Which dependent equations ask for another acceleration than those that they depend on; by how much of their
+        terms, and by more than round-off."""
+        round_off = self.sizes * _acceleration_round_off(self.mass, self.forces, x, u)
+        return ~independent & (jnp.abs(self.by) > below * self.terms + round_off)
+
+
+def _acceleration_round_off(inertia, forces, x: Array, u: Array):
     """The round-off of an acceleration in equilibrium or uniform motion, where all its terms nearly cancel."""
     by_force = jnp.max(jnp.where(inertia > 0, forces / jnp.where(inertia > 0, inertia, 1.0), 0.0))
     extent = jnp.max(jnp.abs(x))
@@ -442,16 +461,19 @@ def _where_it_counts(jacobian: Array, nearby: Array):
     return jnp.where(vanishing(size(jacobian), size(nearby))[:, None], 0.0, jacobian)
 
 
-def _contradictory(linear, rows: Array, independent: Array, a, multipliers: Array, x: Array, u: Array):
-    """Which dependent equations ask for another acceleration than those that they depend on."""
+def _contradictory(
+    linear: LinearEquation, rows: constraints.ConstraintRows, independent: Array, a: Array, multipliers: Array,
+    x: Array, u: Array,
+) -> Bool[Array, " m"]:  # fmt: skip
+    forces = jnp.abs(linear.forcing) + jnp.abs(multipliers) @ jnp.abs(rows.jacobian)
+    misses = _misses(rows, a, largest_of_rows(linear.mass), forces)
+    return misses.contradictory(independent, DEPENDENT_BELOW[np.dtype(x.dtype)], x, u)
+
+
+def _misses(rows: constraints.ConstraintRows, a: Array, mass: Array, forces: Array) -> Misses:
     jacobian, gamma = rows
-    disagreement = jnp.abs(jacobian @ a - gamma)
     terms = jnp.abs(jacobian) @ jnp.abs(a) + jnp.abs(gamma)
-    forces = jnp.abs(linear.forcing) + jnp.abs(jacobian).T @ jnp.abs(multipliers)
-    inertia = jnp.max(jnp.abs(linear.mass), axis=1)
-    slopes = jnp.sum(jnp.abs(jacobian), axis=1)
-    round_off = slopes * acceleration_round_off(inertia, forces, x, u)
-    return ~independent & (disagreement > DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off)
+    return Misses(jacobian @ a - gamma, terms, jnp.sum(jnp.abs(jacobian), axis=1), mass, forces)
 
 
 # The most by which M a may miss F, as a share of the largest of their terms.
@@ -537,13 +559,10 @@ class ForwardDynamics(NamedTuple):
             solver = _solver(*state, None)
             scale = 1 / jnp.sqrt(jnp.abs(jnp.diagonal(solver.schur)))
             conditioned = dense.reciprocal_condition(scale[:, None] * solver.schur * scale[None, :])
-            jacobian, gamma = solver.rows
-            singular |= (conditioned <= SINGULAR_BELOW[np.dtype(x.dtype)]) | ~solver.solved(gamma).unique
-            terms = jnp.abs(jacobian) @ jnp.abs(a) + jnp.abs(gamma)
-            forces = jnp.abs(mass * a) + jnp.abs(multipliers) @ jnp.abs(jacobian)
-            round_off = self.row_sizes(*state) * acceleration_round_off(mass, forces, x, u)
-            allowed = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + round_off
-            contradictory = jnp.any(~solver.independent & (jnp.abs(jacobian @ a - gamma) > allowed))
+            singular |= (conditioned <= SINGULAR_BELOW[np.dtype(x.dtype)]) | ~solver.solved(solver.rows.gamma).unique
+            forces = jnp.abs(mass * a) + jnp.abs(multipliers) @ jnp.abs(solver.rows.jacobian)
+            misses = _misses(solver.rows, a, mass, forces)
+            contradictory = jnp.any(misses.contradictory(solver.independent, DEPENDENT_BELOW[np.dtype(x.dtype)], x, u))
         known = jnp.concatenate([a, multipliers, jnp.ravel(model.lagrangian(t, x, u))])
         finite = jnp.all(jnp.isfinite(known)) & ~jnp.any(missed(*state, along)[1])
         return Verdict(a, multipliers, finite, singular, contradictory, mass)

@@ -18,11 +18,9 @@ rest smaller by `mu` over an eigenvalue of G.
 
 Source: as for `saddle_point.py`; Benzi, Golub & Liesen, Acta Numerica 14 (2005) 1, §5 (Schur complement).
 
-Decide whether a system is large and made of parts that touch few others, and how to solve it then.
-
-The jaxpr shows which velocities M couples, and which velocities each constraint equation restricts. With M in small
-blocks, the matrix S = A M⁻¹ Aᵀ of the multipliers couples equations that act on a common block; ordered, it is a band.
-Nothing here depends on values, so a plan holds at every state.
+**When.** The jaxpr shows which velocities M couples, and which velocities each constraint equation restricts. With M in
+small blocks, the matrix S = A M⁻¹ Aᵀ of the multipliers couples equations that act on a common block; ordered, it is a
+band. Nothing here depends on values, so a plan holds at every state.
 """
 
 from collections.abc import Callable
@@ -40,7 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lagjax.jaxtools import length, once, pattern
 from lagjax.mechanics.lagrangian import forcing_and_inertia
-from lagjax.mechanics.saddle_point import Verdict, acceleration_round_off, slightly_off, vanishing
+from lagjax.mechanics.saddle_point import Misses, Verdict, slightly_off, vanishing
 from lagjax.numerics import banded, dense
 from lagjax.system import Model, constraints
 
@@ -247,9 +245,8 @@ class Banded(NamedTuple):
             singular = jnp.any(vanishes) | _undetermined(plan, operators, kept)
             push, pull = banded.multiplications(sizes, plan.of_rows)
             terms, forces = push(jnp.abs(a)) + jnp.abs(rate), jnp.abs(operators.forcing) + pull(jnp.abs(multipliers))
-            round_off = acceleration_round_off(mass, forces, x, u)
-            tolerance = DEPENDENT_BELOW[np.dtype(x.dtype)] * terms + jnp.sum(sizes, axis=0) * round_off
-            contradictory = jnp.any(~kept & (jnp.abs(operators.push(a) + rate) > tolerance))
+            misses = Misses(operators.push(a) + rate, terms, jnp.sum(sizes, axis=0), mass, forces)
+            contradictory = jnp.any(misses.contradictory(kept, DEPENDENT_BELOW[np.dtype(x.dtype)], x, u))
         finite = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(x) for x in known])))
         solved = jnp.all(jnp.isfinite(jnp.concatenate([a, multipliers])))
         return Verdict(a, multipliers, finite, finite & (singular | ~solved), contradictory, mass)

@@ -1,25 +1,23 @@
 """Well-known multibody and DAE test problems, each with an independently known motion.
 
-Each module contains the physics and the equations in the symbols of its source; `MECHANISM` defines what to integrate
-and where the motion must end. `MECHANISMS` lists them by name.
+A `Mechanism` says what to integrate and where the motion must end; `MECHANISMS` lists them by name. The physics and the
+equations of each, in the symbols of its source, are in `planar.py` and `spatial.py`.
 """
 
-from lagjax.mechanisms import (
+from lagjax.mechanisms.mechanism import Mechanism
+from lagjax.mechanisms.planar import (
     andrews,
-    bricard,
     car_axis,
     double_pendulum,
     driven_crank,
-    fekete,
-    governor,
     n_four_bar,
     slider_crank,
 )
-from lagjax.mechanisms.mechanism import Mechanism
+from lagjax.mechanisms.spatial import bricard, fekete, governor
 
 MECHANISMS = {
-    module.MECHANISM.name: module.MECHANISM
-    for module in (
+    mechanism.name: mechanism
+    for mechanism in (
         andrews,
         car_axis,
         slider_crank,

@@ -36,6 +36,7 @@ from lagjax.display import Drawing, Shape, Still
 from lagjax.integrate import still, subject_of
 from lagjax.models.links_and_joints import (
     BodyJoint,
+    LinkShape,
     Loop,
     MergedLinks,
     Placement,
@@ -44,13 +45,15 @@ from lagjax.models.links_and_joints import (
     all_positions,
     connected,
     drawn,
+    is_file,
+    looks_of,
     made_up,
     moved,
+    not_drawn,
     quaternion_of,
     rate_squared,
     unmoved,
 )
-from lagjax.models.shapes import LinkShape, is_file, looks_of, not_drawn
 from lagjax.shapes import axis, line
 from lagjax.system import Holonomic, System
 

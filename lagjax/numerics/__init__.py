@@ -13,13 +13,22 @@ from lagjax.numerics.dense import (
 from lagjax.numerics.lapack import Roots, general_roots, roots_beside_zeros, symmetric_roots, zero_count
 from lagjax.numerics.newton import (
     MOST,
+    ByWindows,
+    Covariance,
+    Slopes,
+    Unknowns,
+    WindowedEquations,
+    covariance,
     damped_newton,
     differentiable,
+    eliminate,
+    filled,
     largest,
     last_step,
     least_squares_root,
     newton,
     newton_in_python,
+    slopes_of,
     while_in_python,
     with_value,
     zero_below,
@@ -39,14 +48,3 @@ from lagjax.numerics.runge_kutta import (
     in_our_form,
 )
 from lagjax.numerics.symplectic import EqualSteps, Gauss, Splitting, Tableau, lengths, sequence, tableau
-from lagjax.numerics.windowed_least_squares import (
-    ByWindows,
-    Covariance,
-    Slopes,
-    Unknowns,
-    WindowedEquations,
-    covariance,
-    eliminate,
-    filled,
-    slopes_of,
-)

@@ -22,7 +22,8 @@ from jaxtyping import PyTree
 from scipy import optimize
 
 from lagjax.display import plots
-from lagjax.integrate import HybridTrajectory, integrate, releases, slips, sticks, touches
+from lagjax.guards import releases, slips, sticks, touches
+from lagjax.integrate import HybridTrajectory, integrate
 from lagjax.report import FULL, QUICK, Case, Scene, relative_error
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.rolling_hoop import contact, in_flight, lagrangian, rolling

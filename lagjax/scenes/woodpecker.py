@@ -36,7 +36,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.integrate import HybridTrajectory, integrate, releases, slips, sticks, touches
+from lagjax.guards import releases, slips, sticks, touches
+from lagjax.integrate import HybridTrajectory, integrate
 from lagjax.system import Holonomic, Hybrid, Nonholonomic, Switch, System
 
 # From the source, in kg, m, s, N m/rad; the period on the cycle is 0.145976 s, and the sleeve falls by 19.445 mm.

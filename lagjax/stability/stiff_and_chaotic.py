@@ -127,7 +127,7 @@ def stiff():
     rows = [_spring(k, None, derived=k < 1e7) for k in (1e4, 1e6, 1e8, 1e10)]
     rows += [_spring(k, Dopri8(), derived=True) for k in (1e4, 1e6, 1e8)]
     rows += [_spring(k, Radau5(), expected=None) for k in (1e4, 1e6, 1e8, 1e10)]
-    return [*rows, *(_mechanism(m.MECHANISM) for m in (car_axis, governor)), *_fixed_steps()]
+    return [*rows, *(_mechanism(m) for m in (car_axis, governor)), *_fixed_steps()]
 
 
 def _spring(k, method, derived=False, **what):

@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lagjax.display import table
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled
 from lagjax.report import FULL, relative_error
 from lagjax.system import System, coordinates
-from lagjax.work_precision import table
 
 PER_PERIOD = 100.0
 # A result with fewer than two correct digits is never accurate, whatever the tolerance.
@@ -239,13 +239,10 @@ def stability_table(outcomes: Sequence[Outcome]) -> str:
         "what the library said",
     )
     cells = [_cells(outcome) for outcome in outcomes]
-    # The last column is text, so it is left-aligned.
-    width = max(len(row[-1]) for row in [header, *cells])
-    body = table((*header[:-1], header[-1].ljust(width)), [(*row[:-1], row[-1].ljust(width)) for row in cells])
     counts = {verdict: sum(outcome.verdict == verdict for outcome in outcomes) for verdict in VERDICTS}
     return "\n".join(
         [
-            *(line.rstrip() for line in body.split("\n")),
+            table(header, cells, prose=True),
             "",
             "error and gradient: relative, against the exact motion and its exact derivative; in lanes: the error of "
             "the same motion in a compiled batch with derivatives; estimated: the motion's own estimate of its error; "

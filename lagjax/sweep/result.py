@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from lagjax.display import COLOURS, Page, encoded, film, film_scripts, fragment, in_bytes, printable
+from lagjax.display import COLOURS, Page, encoded, film, film_scripts, fragment, in_bytes, labelled
 from lagjax.display import plots as plot
 from lagjax.files import Table
 from lagjax.integrate import RESULTS, Trajectory, film_of_lanes
@@ -480,8 +480,7 @@ class Sweep:
         if self.ran:
             compiled = f"compiled in {self.compiling:.3g} s" if self.compiling else "nothing had to be compiled"
             rows.append(("", f"{compiled}; computed in {self.seconds:.3g} s, {self.ran / self.seconds:,.0f} points/s"))
-        width = max(len(label) for label, _ in rows)
-        return "\n".join(["Sweep", *(printable(f"  {label:<{width}}  {value}") for label, value in rows)])
+        return labelled("Sweep", rows)
 
     def _shapes(self):
         shown = []

@@ -25,7 +25,6 @@ from lagjax.system.constraints import (
     Stop,
 )
 from lagjax.system.coordinates import PrecisionWarning, State, is_traced
-from lagjax.system.hybrid import Hybrid, Switch, replace_fields
 from lagjax.system.model import (
     FirstOrder,
     Form,
@@ -41,6 +40,6 @@ from lagjax.system.model import (
     signature,
     unchecked,
 )
-from lagjax.system.system import System, check_functions, rate_of
+from lagjax.system.system import Hybrid, Switch, System, check_functions, rate_of, replace_fields
 from lagjax.system.traced import OF_POSITION, OF_STATE, WITH_MULTIPLIERS, Traced, takes_of
 from lagjax.system.user_errors import Call, check_arguments, in_words, warn

@@ -22,9 +22,8 @@ from lagjax.jaxtools import depends, is_linear, kinds, length, numpy_of, once, r
 from lagjax.system import coordinates
 from lagjax.system.constraints import Held, Holonomic, Nonholonomic
 from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
 from lagjax.system.model import Model, known_system, model_of
-from lagjax.system.system import System, unchecked
+from lagjax.system.system import Hybrid, System, unchecked
 from lagjax.system.traced import OF_STATE, WITH_FORCE, Traced, TracedProgram, takes_of, traced
 from lagjax.system.user_errors import Call, check_arguments, in_words, warn
 

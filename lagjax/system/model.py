@@ -26,8 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from lagjax.jaxtools import compiled, shape_of, without_init
 from lagjax.system import coordinates
 from lagjax.system.coordinates import State
-from lagjax.system.hybrid import Hybrid
-from lagjax.system.system import System, rate_of
+from lagjax.system.system import Hybrid, System, rate_of
 from lagjax.system.traced import WITH_MULTIPLIERS, Traced, takes_of
 
 
@@ -107,7 +106,7 @@ class Form(NamedTuple):
 class InModes(NamedTuple):
     """The parameters of a system some of whose constraints hold only in some of its `modes`.
 
-    - `modes` (k,): of each element's law, as in `integrate/elements/laws.py`.
+    - `modes` (k,): of each element's law, as in `integrate/laws.py`.
     - `off` (m,): which of the stacked constraint equations do not hold now; their multipliers are zero.
     - `slack` (k,): how far the guard of each mode may be below zero by round-off, and by its sign more of some modes.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from lagjax.display import plots
+from lagjax.display import labelled, plots
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import has_jumps
 from lagjax.system import System, Traced, coordinates, takes_of
@@ -219,8 +219,7 @@ class Steering(eqx.Module):
             ("elements", f"{self.elements}, {self.iterations} iterations on all meshes"),
         ]
         rows += [("tried", self.tried)] if "; " in self.tried else []
-        width = max(len(name) for name, _ in rows)
-        return "\n".join(["Steering", *(f"  {name.ljust(width)}  {text}" for name, text in rows)])
+        return labelled("Steering", rows)
 
     def _change_in_words(self) -> str:
         if not np.isfinite(self.cost_change):

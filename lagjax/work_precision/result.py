@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax.display import DrawnAxes
+from lagjax.display import DrawnAxes, labelled, table
 from lagjax.display import plots as plot
 from lagjax.integrate import Trajectory
 from lagjax.work_precision.methods import as_code
@@ -14,17 +14,6 @@ from lagjax.work_precision.references import Reference
 
 # The numbers of a point; unknown ones are NaN.
 NUMBERS = ("error", "seconds", "least", "steps", "evaluations")
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A plain-text table: first column to the left, the others to the right."""
-    lines = [header, *rows]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    shown = [
-        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths)))
-        for line in lines
-    ]
-    return "\n".join([shown[0], "-" * len(shown[0]), *shown[1:]])
 
 
 # Round-off dominates where a tighter tolerance improves on the best error so far by less than this factor.
@@ -272,21 +261,20 @@ class WorkPrecision:
         return DrawnAxes(title, label, curves, 0.0 if self.reference is None else self.reference.error)
 
     def __repr__(self):
-        lines = [f"Work and precision of {len(self.curves)} method{'s' if len(self.curves) > 1 else ''}"]
-        lines.append(f"  error      {self.measured}")
+        rows = [("error", self.measured)]
         if self.reference is not None:
-            lines.append(f"  reference  {self.reference.in_words()}")
+            rows.append(("reference", self.reference.in_words()))
             if not self.reference.agrees:
-                lines.append(f"  WARNING    {_reference_warning(self.reference)}")
-        lines.append(f"  time       median of a compiled solve, without the {in_ms(self.call_seconds)} ms of a call")
+                rows.append(("WARNING", _reference_warning(self.reference)))
+        rows.append(("time", f"median of a compiled solve, without the {in_ms(self.call_seconds)} ms of a call"))
+        head = labelled(f"Work and precision of {len(self.curves)} method{'s' if len(self.curves) > 1 else ''}", rows)
         header = ("method", "tolerance", "error", "steps", "evaluations", "ms", "order", "compile/s", "")
         cells = [
             (*_curve_cells(curve, i)[:1], *_point_cells(point), *_curve_cells(curve, i)[1:], _remark(point))
             for curve in self.curves.values()
             for i, point in enumerate(curve.points)
         ]
-        width = max(len(row[-1]) for row in cells)
-        return "\n".join([*lines, "", table(header, [(*row[:-1], row[-1].ljust(width)) for row in cells])])
+        return "\n".join([head, "", table(header, cells, prose=True)])
 
 
 def in_ms(seconds: float) -> str:

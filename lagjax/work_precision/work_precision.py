@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from lagjax.display import plots as plot
+from lagjax.display import table
 from lagjax.integrate import Crossing, Trajectory, arguments, ended_well, integrate, is_suited, message
 from lagjax.jaxtools import is_eager, is_traced
 from lagjax.numerics import EqualSteps, Gauss, Radau5, Splitting, evaluations_a_step
@@ -52,7 +53,7 @@ from lagjax.work_precision.references import (
     computed_reference,
     given_reference,
 )
-from lagjax.work_precision.result import Curve, Point, WorkPrecision, in_ms, table
+from lagjax.work_precision.result import Curve, Point, WorkPrecision, in_ms
 
 # The options of `integrate` that mean the same for every method.
 OPTIONS = ("max_step", "jump_ts", "drift", "max_steps")

@@ -12,7 +12,7 @@ import pytest
 import lagjax as lj
 from lagjax.analysis import energy
 from lagjax.integrate import HybridTrajectory
-from lagjax.integrate.trajectory.parts import Snapshot
+from lagjax.integrate.results import Snapshot
 from lagjax.numerics import quadrature
 from lagjax.scenes import SCENES
 from lagjax.system.model import model_of

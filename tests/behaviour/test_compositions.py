@@ -14,8 +14,8 @@ import pytest
 from jax import lax
 
 import lagjax as lj
-from lagjax.integrate.adjoint import second_order, step_record
-from lagjax.integrate.adjoint.replay import Replay
+from lagjax.integrate import step_record
+from lagjax.integrate.replay import Replay
 
 TS, NODES = np.array([0.0, 0.4, 0.9]), 11
 P = 0.3 * np.sin(np.arange(1.0, 3 * NODES + 1))

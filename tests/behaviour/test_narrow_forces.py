@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.stepping.step_to_outputs import between_jumps, together
+from lagjax.integrate.stepping import between_jumps, together
 from tests.counting import compiles
 from tests.tiers import exhaustive_but
 

@@ -11,7 +11,6 @@ from jax import lax
 
 import lagjax as lj
 from lagjax.integrate import in_turn
-from lagjax.integrate.solve import harvest
 from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
 from lagjax.sweep import engine

@@ -6,7 +6,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.display import CUBE, DISK, SPHERE, InSpace
-from lagjax.integrate.trajectory.subject import subject_of
+from lagjax.integrate.pictures import subject_of
 
 A, B = (
     lj.bodies.Body("a", 2.0, (0.1, 0.2, 0.25)),

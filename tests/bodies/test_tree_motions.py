@@ -9,8 +9,8 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
-from lagjax.integrate.elements.laws_of_elements import check_linear
-from lagjax.integrate.jumps.find import found as jumps_found
+from lagjax.integrate.elements import check_linear
+from lagjax.integrate.jumps import found as jumps_found
 from lagjax.system import prepare
 
 Y, G = (0.0, 1.0, 0.0), 9.81

@@ -9,7 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate.events.event import Crossings
-from tests.integrate.trajectory.test_save import Pair, Place, check, of_springs, springs
+from tests.integrate.test_data import Pair, Place, check, of_springs, springs
 from tests.systems import PARAMS, motion, rod_pendulum
 
 

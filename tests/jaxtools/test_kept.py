@@ -17,7 +17,7 @@ from jax.extend.core import Primitive
 import lagjax as lj
 from lagjax.jaxtools import LATER, KeptProgram, Said, digest, folder, kept
 from lagjax.jaxtools.digest import NotKept, digest_of
-from lagjax.jaxtools.identity import Meaning, meaning_of
+from lagjax.jaxtools.jaxpr import Meaning, meaning_of
 from lagjax.jaxtools.outline import NoOutline, outlined, rebuilt
 from lagjax.system.user_errors import warn
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lagjax.system import Given
-from tests.integrate.jumps.test_find import JUMPING, jumps_of
+from tests.integrate.test_jumps import JUMPING, jumps_of
 from tests.jaxtools.in_numpy import run
 
 

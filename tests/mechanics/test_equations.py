@@ -9,7 +9,7 @@ import lagjax as lj
 from lagjax.analysis.explain import _how_solved
 from lagjax.jaxtools.jaxpr import equations as equations_in
 from lagjax.mechanics import equations, sparse_saddle_point
-from lagjax.mechanics.consistent_state import to_manifold
+from lagjax.mechanics.constrained_state import to_manifold
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.saddle_point import Dense
 from lagjax.mechanics.sparse_saddle_point import Banded

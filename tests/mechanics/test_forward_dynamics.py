@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.integrate.elements.in_modes import in_modes
+from lagjax.integrate.elements import in_modes
 from lagjax.mechanics import equations_of
 from lagjax.mechanics.saddle_point import ForwardDynamics
 from lagjax.system import State, model_of

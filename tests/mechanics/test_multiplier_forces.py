@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.system.test_hybrid import G
+from tests.system.test_system import G
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lagjax.mechanics.consistent_state import to_manifold
+from lagjax.mechanics.constrained_state import to_manifold
 from lagjax.mechanics.equations import equations_of
 from lagjax.system.model import model_of
 from tests.behaviour.test_nonholonomic import (

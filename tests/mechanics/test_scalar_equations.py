@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics.consistent_state import to_manifold
+from lagjax.mechanics.constrained_state import to_manifold
 from lagjax.mechanics.equations import equations_of, is_small, write_out
 from lagjax.scenes import bead_on_hoop
 from lagjax.system import coordinates

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.models.mjcf import mujoco_itself
-from tests.models.test_shapes import ARM, MOVING
-from tests.models.test_urdf import BODY, PENDULUM, arm, two_links
+from lagjax.models.readers import mujoco_itself
+from tests.models.test_links_and_joints import ARM, MOVING
+from tests.models.test_readers import BODY, PENDULUM, arm, two_links
 
 mujoco = mujoco_itself()
 

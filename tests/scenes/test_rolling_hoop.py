@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lagjax.integrate.integrate import integrate
-from lagjax.mechanics.accelerations import accelerations
+from lagjax.mechanics.constrained_state import accelerations
 from lagjax.scenes import rolling_hoop as hoop
 from tests.by_numpy import by_numpy, equations
 from tests.references import keys, reference

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax as lj
-from lagjax.integrate.solve.harvest import report
+from lagjax.integrate.solve.reports import report
 from tests.mutated import describe
 
 AXES = {"k": np.arange(1, 6), "x": np.linspace(0.1, 1.0, 8)}

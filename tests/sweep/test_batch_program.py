@@ -9,7 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.display import terminal as meter
-from lagjax.jaxtools import identity
+from lagjax.jaxtools import jaxpr
 from tests.counting import compiles
 
 K = 2.0
@@ -152,7 +152,7 @@ def test_a_second_sweep_compares_little(monkeypatch):
     """Of a motion's program, which JAX traced before, a second sweep compares no equation; twin: the first."""
     # Programs inside it that earlier tests used are known already.
     jax.clear_caches()
-    calls, whole = [], identity.meaning_of
+    calls, whole = [], jaxpr.meaning_of
     monkeypatch.setattr(identity, "meaning_of", lambda jaxpr: calls.append(jaxpr) or whole(jaxpr))
     fall = lj.System(lambda t, q, v, p: 0.5 * v**2 - p * q)
     run = lambda point: lj.integrate(fall, 0.0, 0.0, point["x"], ts=jnp.array([0.0, 1.0])).q[-1]

@@ -7,7 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import Report, reported
-from lagjax.integrate.solve.harvest import Settled
+from lagjax.integrate.solve.reports import Settled
 from lagjax.sweep import engine
 from tests.sweep.small_stores import scaled
 from tests.sweep.test_sweep import AXES, MAX_STEPS, quiet, swing

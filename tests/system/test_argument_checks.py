@@ -31,7 +31,7 @@ DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
     "integrate": (lambda system: lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS), True),
     "step": (lambda system: lj.step(system, 0.0, 1.0, 0.0, PARAMS, 0.1), False),
     "rollout": (lambda system: lj.rollout(system, 1.0, 0.0, PARAMS, 10, 0.1), False),
-    "connect": (lambda system: lj.connect(system, 1.0, 0.0, 0.0, 1.0, PARAMS), False),
+    "connect": (lambda system: lj.connect(system, 1.0, 0.0, 0.0, 1.0, PARAMS), True),
     "steer": (lambda s: lj.steer(s, {"u": 0.0}, (0.0, 0.0), (1.0, 0.0), None, PARAMS, t_b=(0.1, 1.0)), False),
     "lqr": (lambda system: lj.lqr(system, {"u": 0.0}, (0.0, 0.0), lambda t, q, v, u, p: q**2, PARAMS), False),
     "poincare": (lambda s: lj.poincare(s, 1.0, 0.0, PARAMS, section=lambda t, q, v, params: q, ts=TS), True),

@@ -1,4 +1,4 @@
-"""Constraints at three levels, in closed form; their accelerations are in `tests/mechanics/test_accelerations.py`."""
+"""Constraints at three levels, in closed form; accelerations: `tests/mechanics/test_constrained_state.py`."""
 
 from functools import partial
 

@@ -21,7 +21,7 @@ def test_slider_crank():
     The motion has one degree of freedom, never stops and so is a minimum: on rows in units of constraints (1e-5 of
     those of the mass) the index must be counted to say so. Twin: in a shorter time the start is faster.
     """
-    crank, time = slider_crank.MECHANISM, 0.012
+    crank, time = slider_crank, 0.012
     known = lj.integrate(crank.system, crank.q0, crank.v0, crank.params, ts=np.linspace(0.0, time, 9), rtol=1e-13)
     reach = lambda time: lj.connect(crank.system, crank.q0, known.end.q, 0.0, time, crank.params, outputs=9)
     found = reach(time)

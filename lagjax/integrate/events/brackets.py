@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import EventKind, Guards
-from lagjax.integrate.stepping.projected_solver import ProjectedSolver
+from lagjax.integrate.stepping import ProjectedSolver
 
 # Where an interval is divided; not in the middle, since half a period after an extremum there is another one.
 SHARES = (0.0, 0.45, 1.0)

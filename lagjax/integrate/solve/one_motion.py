@@ -18,32 +18,36 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from lagjax.integrate.adjoint.replay import Replay, replayed
-from lagjax.integrate.adjoint.step_record import Recorded, StepProblem, with_room
 from lagjax.integrate.equal_steps.loop import stepped
 from lagjax.integrate.equal_steps.pace import Pace
 from lagjax.integrate.events.brackets import Sight
 from lagjax.integrate.events.detect import EventController
 from lagjax.integrate.events.event import Guards
 from lagjax.integrate.events.event_times import Located, all_known, at_known_times, by_name, end_of, first_end, locate
+from lagjax.integrate.replay import Replay, replayed
+from lagjax.integrate.results import RESULTS, Snapshot, ended_well
 from lagjax.integrate.settings import Settings, is_recorded
-from lagjax.integrate.solve.error_estimate import ROUND_OFFS
-from lagjax.integrate.stepping.projected_solver import FastField, Field, ProjectedSolver, forward_differentiable
-from lagjax.integrate.stepping.step_to_outputs import StepToOutputs, apart_from_jumps, together
-from lagjax.integrate.stepping.tolerances import (
+from lagjax.integrate.solve.reports import ROUND_OFFS
+from lagjax.integrate.step_record import Recorded, StepProblem, with_room
+from lagjax.integrate.stepping import (
     AsNothing,
+    FastField,
+    Field,
     PerCoordinateTolerance,
+    ProjectedSolver,
     Scales,
+    StepToOutputs,
     Tolerances,
+    apart_from_jumps,
+    forward_differentiable,
     rounding,
     scales_of,
     shared,
     span_of,
+    together,
     tolerances_at,
 )
-from lagjax.integrate.trajectory.parts import Snapshot
-from lagjax.integrate.trajectory.results import RESULTS, ended_well
-from lagjax.integrate.trajectory.trajectory import worst_drift
+from lagjax.integrate.trajectory import worst_drift
 from lagjax.jaxtools import calls_host, like, one_function, stop_gradient
 from lagjax.mechanics import (
     Equations,

@@ -21,25 +21,20 @@ import jax.tree_util as jtu
 import numpy as np
 
 from lagjax.display import waiting
-from lagjax.integrate.adjoint.both_modes import solve_in_both_modes
+from lagjax.integrate.both_modes import solve_in_both_modes
+from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
 from lagjax.integrate.events.event import Crossings
-from lagjax.integrate.jumps.find import Jumps, with_jumps_in_time
-from lagjax.integrate.jumps.find import found as jumps_found
-from lagjax.integrate.jumps.sliding import slidable
+from lagjax.integrate.jumps import Jumps, slidable, with_jumps_in_time
+from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
+from lagjax.integrate.results import RESULTS, Errors, Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
-from lagjax.integrate.solve.assembly import InElements
-from lagjax.integrate.solve.error_estimate import with_errors, with_errors_inside
-from lagjax.integrate.solve.harvest import report_settled
+from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
-from lagjax.integrate.solve.over_jumps import solved_over_jumps, warn_of_missed, with_lost, without_elements
+from lagjax.integrate.solve.reports import report_settled, with_errors, with_errors_inside
 from lagjax.integrate.solve.segments import solved_in_phases
-from lagjax.integrate.trajectory.error_report import Errors
-from lagjax.integrate.trajectory.hybrid_trajectory import HybridTrajectory, Switches
-from lagjax.integrate.trajectory.parts import Snapshot, SolveInfo, SolveOptions, pack
-from lagjax.integrate.trajectory.results import RESULTS
-from lagjax.integrate.trajectory.trajectory import Trajectory
+from lagjax.integrate.trajectory import HybridTrajectory, Switches, Trajectory
 from lagjax.jaxtools import (
     HashablePart,
     KeptProgram,

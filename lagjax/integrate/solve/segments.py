@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.integrate.events.event import Guards
-from lagjax.integrate.jumps.find import Jumps
+from lagjax.integrate.jumps import Jumps
+from lagjax.integrate.results import NO_PHASE, RESULTS, Snapshot
 from lagjax.integrate.settings import Settings
 from lagjax.integrate.solve.legs import (
     Ending,
@@ -29,15 +30,13 @@ from lagjax.integrate.solve.legs import (
     before_any,
     ending_of,
     nothing,
+    over_jumps,
     sizes_of,
     times_of,
     unknown,
 )
 from lagjax.integrate.solve.one_motion import resolution
-from lagjax.integrate.solve.over_jumps import over_jumps
-from lagjax.integrate.trajectory.hybrid_trajectory import OF_PHASES, SWITCHES, Switches
-from lagjax.integrate.trajectory.parts import NO_PHASE, Snapshot
-from lagjax.integrate.trajectory.results import RESULTS
+from lagjax.integrate.trajectory import OF_PHASES, SWITCHES, Switches
 from lagjax.jaxtools import apart, like, where
 from lagjax.mechanics import all_finite
 from lagjax.system import Hybrid, System, model_of
@@ -49,7 +48,7 @@ class Phase(NamedTuple):
     `switches` (k,): their numbers in the hybrid; `targets` (k, 2): the next phase, and that of rest; `resets`:
     `reset(t, q, v, multipliers, params)` -> (q, v), and whether the motion comes to rest there; `events`: the names of
     the recorded events, whose guards come last. `meeting`: of the elements of the phase, which changes their modes
-    (`elements/meeting.py`); these have their `places` among the modes of all phases, and one guard, after those of
+    (`meeting.py`); these have their `places` among the modes of all phases, and one guard, after those of
     switches.
     """
 

@@ -12,7 +12,7 @@ import lagjax as lj
 from lagjax.fit.arguments import problem_of
 from lagjax.fit.residuals import dampened
 from lagjax.fit.search import CHANCE, _exceeded_by_chance, _undampened, misfit
-from lagjax.numerics.windowed_least_squares import WindowedEquations
+from lagjax.numerics.newton import WindowedEquations
 from tests.fit.cases import formula, in_closed_form
 
 # The room hands out a function of this name.

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
-from lagjax.integrate.elements.in_modes import OneGuard, in_modes
-from lagjax.integrate.trajectory.hybrid_trajectory import Switches
+from lagjax.integrate.elements import OneGuard, in_modes
+from lagjax.integrate.trajectory import Switches
 from lagjax.system import State
 from tests.by_numpy import by_numpy
 from tests.integrate.elements.test_motions import moved

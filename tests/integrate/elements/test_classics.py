@@ -11,7 +11,7 @@ import lagjax as lj
 from lagjax.scenes import rolling_hoop
 from lagjax.scenes.slipping_hoop import FIRST, PARAMS, exact, height
 from tests.integrate.elements.test_motions import MU, K, moved, rubbed
-from tests.system.test_hybrid import G
+from tests.system.test_system import G
 
 
 def at_rest(q: dict) -> dict:

@@ -7,7 +7,7 @@ from scipy import optimize
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
-from tests.system.test_hybrid import G, in_phases
+from tests.system.test_system import G, in_phases
 
 K, MU = 100.0, 0.3
 # The block's last turn, half swings of ω = 10 that lose 2 μ g/k each, and its derivative by μ.

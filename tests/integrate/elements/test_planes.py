@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
-from lagjax.integrate.elements.complementarity import ContactProblem, solved
+from lagjax.integrate.complementarity import ContactProblem, solved
 from tests.integrate.elements.test_motions import moved
 
 G, M, R = 9.81, 1.3, 0.4

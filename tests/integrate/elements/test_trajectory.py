@@ -10,7 +10,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.integrate import HybridTrajectory
-from lagjax.integrate.elements.meeting import Met
+from lagjax.integrate.meeting import Met
 
 # The package hands out a function of this name.
 explain = import_module("lagjax.analysis.explain")

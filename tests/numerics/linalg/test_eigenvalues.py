@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from tests.analysis.modes.test_normal_modes import rails
+from tests.analysis.test_normal_modes import rails
 
 
 @pytest.mark.slow

@@ -1,1 +1,0 @@
-"""Impacts, friction and what lets go."""

@@ -1,1 +1,0 @@
-"""Forces that jump."""

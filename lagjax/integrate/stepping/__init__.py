@@ -1,1 +1,0 @@
-"""Solvers and controllers around diffrax's."""

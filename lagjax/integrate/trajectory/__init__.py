@@ -1,1 +1,0 @@
-"""A motion, and what is done with it."""
