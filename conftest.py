@@ -27,6 +27,8 @@ from typing import Any
 
 # The workers share the cores: additional threads of OpenBLAS can stall a small factorisation for seconds.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What a test computes is compiled from the source that is tested: `jaxtools/test_kept.py` turns the folder on.
+os.environ["LAGJAX_CACHE"] = "off"
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

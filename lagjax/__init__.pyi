@@ -241,5 +241,9 @@ from .exchange import export as export
 from .exchange import from_sympy as from_sympy
 from .exchange import result_codes as result_codes
 
+# isort: split
+# Compiled programs, kept from one process to the next.
+from .files import cache as cache
+
 # Names that have left this map, by where they are.
 MOVED: dict[str, str]

@@ -1,5 +1,6 @@
 """What lagjax does with JAX's programs, whatever they compute: jaxprs as data, compiling, caches."""
 
+from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import (
     FACTS,
     HashablePart,
@@ -62,6 +63,7 @@ from lagjax.jaxtools.jaxpr import (
     without_repeats,
     written,
 )
+from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,
@@ -73,6 +75,7 @@ from lagjax.jaxtools.open_jumps import (
     has_jumps,
     judging,
 )
+from lagjax.jaxtools.outline import NoOutline, outlined, rebuilt
 from lagjax.jaxtools.primitives import (
     ad,
     front,
@@ -87,6 +90,7 @@ from lagjax.jaxtools.primitives import (
 )
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.tracing import (
+    HAPPENED,
     REGULAR_FIRST,
     SILENT,
     WATCHED,

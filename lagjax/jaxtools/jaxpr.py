@@ -396,12 +396,13 @@ WHOLE = 1024
 
 
 class Meaning:
-    """A key: nested tuples, hashed once."""
+    """A key: nested tuples, hashed once. `digest`: that of another process too, once `digest.py` has found it."""
 
-    __slots__ = "parts", "_hash"
+    __slots__ = "parts", "_hash", "digest"
 
     def __init__(self, parts: Hashable):
         self.parts, self._hash = parts, hash(parts)
+        self.digest: bytes | None = None
 
     def __hash__(self):
         return self._hash

@@ -8,6 +8,7 @@ mishandles one it ends the process. `LAGJAX_PLAIN=0` compiles as ever with any.
 
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
@@ -59,6 +60,10 @@ WATCHED = jax.make_user_context(default_value=False)
 SILENT = jax.make_user_context(default_value=False)
 # Whether the caller solves again with the robust method when equations assumed regular turn out singular.
 REGULAR_FIRST = jax.make_user_context(default_value=False)
+
+# What has happened, and how often, that has to happen in each process: a program that does it while it is traced is
+# not kept for another one.
+HAPPENED: Counter[str] = Counter()
 
 
 def takes_for_regular() -> bool:

@@ -34,6 +34,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.jaxtools import (
     ARITHMETIC,
     FACTS,
+    HAPPENED,
     ClosedJaxpr,
     Itself,
     Jaxpr,
@@ -133,13 +134,13 @@ class TracedProgram:
         self._fixed = [x if _is_small(x) else None for x in constants]
         self.arrays = (*(x for x in constants if not _is_small(x)), *jtu.tree_leaves(own))
         small = tuple((str(x.dtype), x.shape, np.asarray(x).tobytes()) for x in self._fixed if x is not None)
-        self._meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
+        self.meaning = Meaning((self.signature.kind, takes, self._structure, meaning_of(self.jaxpr), small, rules))
 
     def __hash__(self):
-        return hash(self._meaning)
+        return hash(self.meaning)
 
     def __eq__(self, other):
-        return self is other or isinstance(other, TracedProgram) and self._meaning == other._meaning
+        return self is other or isinstance(other, TracedProgram) and self.meaning == other.meaning
 
     def __call__(self, arrays: Sequence, args: tuple):
         """The function's result, given the arrays that it reads."""
@@ -158,6 +159,7 @@ class TracedProgram:
 
     def function_with(self, arrays: Sequence) -> Callable:
         """The user's function; if it is a module, with its own ones among these arrays."""
+        HAPPENED["a function was called that is not a program"] += 1
         structure = jtu.tree_structure(eqx.filter(self.function, is_array))
         own = arrays[len(arrays) - structure.num_leaves :]
         return eqx.combine(jtu.tree_unflatten(structure, own), self._rest)
@@ -179,6 +181,7 @@ class Traced(eqx.Module):
     @property
     def function(self) -> Callable:
         """The user's function."""
+        HAPPENED["a function was called that is not a program"] += 1
         return self.program.function_with(self.arrays) if self.arrays else self.program.function
 
     @property

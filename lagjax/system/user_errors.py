@@ -27,6 +27,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from lagjax.jaxtools import HAPPENED
+
 # The code between the user's line and here: warnings skip it.
 PACKAGES = tuple(str(Path(str(module.__file__)).parent) + os.sep for module in (jax, eqx, diffrax))
 BETWEEN = (*PACKAGES, __file__.rsplit("system", 1)[0])
@@ -34,6 +36,7 @@ BETWEEN = (*PACKAGES, __file__.rsplit("system", 1)[0])
 
 def warn(words: str, category: type[Warning]) -> None:
     """Warn at the innermost line outside this library and the libraries that it calls."""
+    HAPPENED["a warning was given"] += 1
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(BETWEEN):
         frame = frame.f_back

@@ -7,10 +7,10 @@ with the robust way as a branch (`lax.cond`) gives the first answer of a pendulu
 diffrax, two programs after 2.3 times (processor time, two cores).
 """
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 import diffrax
@@ -24,18 +24,21 @@ from lagjax.display import waiting
 from lagjax.integrate.both_modes import solve_in_both_modes
 from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
+from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.jumps import Jumps, slidable, with_jumps_in_time
 from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
-from lagjax.integrate.results import SolveInfo, SolveOptions, pack
+from lagjax.integrate.results import RESULTS, Errors, Snapshot, SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.reports import report_settled, with_errors, with_errors_inside
 from lagjax.integrate.solve.segments import solved_in_phases
-from lagjax.integrate.trajectory import HybridTrajectory, Trajectory
+from lagjax.integrate.trajectory import HybridTrajectory, Switches, Trajectory
 from lagjax.jaxtools import (
     HashablePart,
+    KeptProgram,
+    Said,
     as_usual,
     compiler_options,
     filled_up,
@@ -43,13 +46,15 @@ from lagjax.jaxtools import (
     is_eager,
     jitted,
     one_by_one,
+    outlined,
     program_of,
+    rebuilt,
     stop_gradient,
     takes_for_regular,
 )
 from lagjax.mechanics import has_networks, is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
-from lagjax.system import Model, State, model_of
+from lagjax.system import Model, State, model_of, replace_fields
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
@@ -106,14 +111,16 @@ def _may_hold_too_much(problem: Problem) -> bool:
 
 
 class _Programs:
-    """The compiled programs of one kind of motion: with the equations assumed regular (None once they turned out not to
-    be), and with the robust solve. JAX keeps them as long as this object lives."""
+    """The programs of one kind of motion: with the equations assumed regular (None once they turned out not to be), and
+    with the robust solve."""
 
     def __init__(self, static: HashablePart, count: int, regular: bool):
-        jit = partial(jax.jit, compiler_options=compiler_options())
-        self.regular: Callable | None = jit(partial(_of_arrays, static, False, count)) if regular else None
-        self.robust: Callable = jit(partial(_of_arrays, static, True, count))
-        self._count, self._compiled = count, set()
+        def of(robust: bool) -> KeptProgram:
+            said = Said(partial(_meant, static, robust), _outline, partial(_said_tree, static))
+            return KeptProgram(partial(_of_arrays, static, robust, count), said)
+
+        self.regular: KeptProgram | None = of(False) if regular else None
+        self.robust = of(True)
 
     @as_usual
     def run(self, arrays: list, count: int, shown: bool | None, settled: bool = False) -> Trajectory:
@@ -123,15 +130,14 @@ class _Programs:
         """
         while True:
             program = self.regular or self.robust
-            with nullcontext() if program in self._compiled else waiting(shown, "compiling"):
+            with nullcontext() if program.is_ready else waiting(shown, "compiling"):
                 found, rows, well = program(arrays)
-            self._compiled.add(program)
             if program is self.robust:
                 jax.block_until_ready((found, rows))
             if program is self.robust or settled or well:
                 break
             self.regular = None
-        if count == self._count:
+        if len(found.t) == count:
             return found
         # In NumPy: JAX would compile a program for each number of outputs.
         return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
@@ -148,6 +154,54 @@ def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
     return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
 
 
+# The classes of what a motion gives, besides those of the user's states.
+CLASSES = Trajectory, HybridTrajectory, Snapshot, Crossings, Switches, Errors, type(RESULTS.successful)
+
+
+def _meant(static: HashablePart, robust: bool) -> list[tuple[Any, bool]]:
+    """What a program computes, for its digest; with whether states and parameters may be in the user's classes.
+
+    The number of outputs is not in it: `run` cuts what is too long. Nor are the functions of a system with elements as
+    the user wrote them, which nothing calls: beside them are their programs, in modes.
+    """
+    leaves = iter(static.leaves)
+    found: list[tuple[Any, bool]] = [((__name__, robust, compiler_options()), False)]
+    for name, structure in zip(Problem._fields, static.structure.children()):
+        part = HashablePart(tuple(islice(leaves, structure.num_leaves)), structure)
+        if name == "system":
+            system = jtu.tree_unflatten(part.structure, part.leaves)
+            if isinstance(system, InElements):
+                user = jtu.tree_map(lambda x: "a function" if callable(x) else x, system.user)
+                leaves_of_system, structure = jtu.tree_flatten(replace_fields(system, user=user))
+                part = HashablePart(tuple(leaves_of_system), structure)
+        found.append((part, name in ("q", "v", "params")))
+    return found
+
+
+def _outline(results: tuple) -> dict[str, Any]:
+    """The structure of what `_of_arrays` returns, as data."""
+    found, *_ = results
+    given = {"q": found.end.q, "arrays": found.arrays, "static": found.static, "RESULTS": RESULTS}
+    return {"how": list(found.static.how), "results": outlined(results, CLASSES, given)}
+
+
+def _said_tree(static: HashablePart, outline: dict[str, Any], arrays: list):
+    """Results of this structure; what they say of themselves is that of this problem."""
+    problem = Problem(*static.combine(arrays))
+    of_problem, described = _described(problem, SolveInfo(*outline["how"]))
+    given = {"q": problem.q, "arrays": of_problem, "static": described, "RESULTS": RESULTS}
+    return rebuilt(outline["results"], CLASSES, given)
+
+
+def _described(problem: Problem, how: SolveInfo):
+    """What a trajectory says of its problem: arrays, and the rest."""
+    s = problem.settings
+    # What the tolerance chose is no longer known where the motion is continued.
+    chosen = Tsit5() if s.method is None and how.method == Tsit5.__name__ else s.method
+    asked = SolveOptions(chosen, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
+    return pack((problem.system, problem.params, asked), how, trajectory_of)
+
+
 @jitted
 def _trajectory_of(problem: Problem):
     return _trajectory(problem)
@@ -158,12 +212,9 @@ def _trajectory(problem: Problem):
     system, *motion, settings = problem
     start, model = problem.start, model_of(system, *problem.start)
     s, method = settings, method_of(settings, model)
-    # What the tolerance chose is no longer known where the motion is continued.
     by_tolerance = s.method is None and isinstance(method, Tsit5)
-    chosen = method if by_tolerance else s.method
     if settings.outputs is None:
         settings = replace(settings, outputs="interpolated" if by_tolerance else "exact")
-    asked = SolveOptions(chosen, s.controller, s.dt0, s.max_step, s.jump_ts, s.drift, s.jumps)
     how = _how(method, s.method, settings, system.in_phases)
     settings = eqx.tree_at(lambda s: s.method, settings, method, is_leaf=lambda x: x is None)
     # Derivatives flow to the floating-point arrays of these; the settings are constants.
@@ -203,7 +254,7 @@ def _trajectory(problem: Problem):
         )
     else:
         fields, _ = solve_arrays(x, fixed, settings.adjoint, True)
-    arrays, described = pack((system, problem.params, asked), how, trajectory_of)
+    arrays, described = _described(problem, how)
     settled = fields.pop("settled")
     of = HybridTrajectory if system.in_phases else Trajectory
     return of(t=problem.ts, **fields, arrays=arrays, static=described), settled

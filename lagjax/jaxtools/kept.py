@@ -1,0 +1,300 @@
+"""Compiled programs that outlast their process: found again by what they mean, run without tracing or compiling.
+
+A program belongs to what it computes (`digest.py`), wherever and whenever it was compiled. It takes and gives flat
+lists of arrays; what its results are put into is made outside of it, from an outline in the entry. An entry is one file
+of `folder.py`: a header in JSON, then XLA's executable. Nothing is pickled.
+
+JAX's public `serialize_executable` pickles, and so do its trees. So this module takes its executable and puts it into
+JAX's own call, which is private: `jax.stages.Compiled` with the fields of `_unloaded_executable` of
+`jax._src.interpreters.pxla`, and the client's `serialize_executable` and `deserialize_executable`. XLA's executables
+call LAPACK at addresses that JAX looks up when it lowers a call: without `initialize_lapack` a process would end. It is
+done with the versions of `TRIED` alone; where anything of it is missing or refuses, the program is compiled, as it
+would be anyway. A program in whose first run a process ended is not run again (`folder.tried`).
+
+Not kept: programs that call Python while they run (checks, callbacks, progress meters), those that give a warning while
+they are traced, those for several devices or in one of JAX's contexts, and those that depend on something which
+`digest.py` cannot write.
+"""
+
+import atexit
+import json
+import os
+import queue
+import re
+import threading
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import jaxlib.version
+import numpy as np
+from jax.core import ShapedArray
+from jaxtyping import PyTree
+
+from lagjax.jaxtools import folder
+from lagjax.jaxtools.cache import compiler_options
+from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
+from lagjax.jaxtools.outline import NoOutline
+from lagjax.jaxtools.tracing import HAPPENED
+
+PRIVATE: Any = None
+try:
+    from jax._src.interpreters.pxla import UnloadedMeshExecutable
+    from jax._src.lax.linalg import initialize_lapack
+    from jaxlib._jax import DeviceList
+
+    PRIVATE = UnloadedMeshExecutable, DeviceList, initialize_lapack
+except ImportError:
+    pass
+
+# The versions of jax and jaxlib with which the tests of this module were run.
+TRIED = {"0.10.2"}
+# What a version of JAX without these parts raises, and XLA for an executable that it does not take.
+REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
+# What an executable may call: JAX's own LAPACK. Anything else may be there in one process and not in the next.
+CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
+# How long the end of a process waits for programs that are being written, in seconds.
+AT_THE_END = 5.0
+
+
+class Tally(NamedTuple):
+    """What the folder did for this process: programs found there, written, and those not kept, by why."""
+
+    found: Counter
+    not_kept: Counter
+
+
+TALLY = Tally(Counter(), Counter())
+
+
+class Said(NamedTuple):
+    """How a program's results are put together without tracing it.
+
+    `parts`: what it means, for `digest_of`; `outline(tree)`: the structure of its results as data; `tree(outline,
+    arrays)`: results of that structure, whatever their leaves.
+    """
+
+    parts: Callable[[], Sequence[tuple[Any, bool]]]
+    outline: Callable[[PyTree], Any]
+    tree: Callable[[Any, list], PyTree]
+
+
+class KeptProgram:
+    """`jax.jit` of a function of a list of arrays, whose programs are kept in the user's folder as well.
+
+    `is_ready`: whether it has run.
+    """
+
+    def __init__(self, function: Callable[[list], PyTree], said: Said):
+        self._said, self._structure, self.is_ready = said, None, False
+
+        def flat(arrays: list) -> list:
+            leaves, self._structure = jtu.tree_flatten(function(arrays))
+            return leaves
+
+        self._jit = jax.jit(flat, compiler_options=compiler_options())
+        self._known: dict[tuple, tuple[Callable, Any]] = {}
+
+    def __call__(self, arrays: list) -> PyTree:
+        signature = _signature(arrays)
+        call, structure = self._known.get(signature) or self._first(signature, arrays)
+        try:
+            found = call(arrays)
+        except (TypeError, ValueError):
+            # On another device: a program of `jax.jit` serves all.
+            if call is self._jit:
+                raise
+            found = self._jit(arrays)
+        if structure is None:
+            # That of `jax.jit` is known once it has traced.
+            structure = self._structure
+            self._known[signature] = call, structure
+        self.is_ready = True
+        return jtu.tree_unflatten(structure, found)
+
+    def _first(self, signature: tuple, arrays: list) -> tuple[Callable, Any]:
+        """What runs with arrays of this kind, and the structure of its results: kept ones, or compiled here."""
+        where = folder.place()
+        try:
+            if where.path is None:
+                raise NotKept(where.why_not)
+            digest = digest_of([(_surely(arrays), False), *((part, own) for part, own in self._said.parts())])
+        except NotKept as reason:
+            TALLY.not_kept[str(reason)] += 1
+            return self._jit, None
+        with folder.tried(where.path, digest) as entry:
+            found = None if entry is None else self._loaded(*entry, arrays)
+        if found is None:
+            before = HAPPENED.copy()
+            lowered = self._jit.lower(arrays)
+            found = lowered.compile(), self._structure
+            if HAPPENED != before:
+                TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
+            else:
+                self._write(where.path, digest, *found, arrays)
+        self._known[signature] = found
+        return found
+
+    def _loaded(self, header: dict[str, Any], program: memoryview, arrays: list) -> tuple[Callable, Any] | None:
+        try:
+            structure = jtu.tree_structure(self._said.tree(header["outline"], arrays))
+            call = _call_of(header, bytes(program), arrays)
+            if structure.num_leaves != len(header["outputs"]):
+                return None
+            # What is wrong with it shows here, not in the middle of something else.
+            jax.block_until_ready(call(arrays))
+        except REFUSED as error:
+            TALLY.not_kept[f"it could not be loaded: {type(error).__name__}: {str(error)[:200]}"] += 1
+            return None
+        TALLY.found["found"] += 1
+        return call, structure
+
+    def _write(self, path: Path, digest: str, call: Any, structure: Any, arrays: list) -> None:
+        """Write the program, in another thread."""
+
+        def write() -> None:
+            try:
+                tree = jtu.tree_unflatten(structure, range(structure.num_leaves))
+                outline = json.loads(json.dumps(self._said.outline(tree)))
+                again = jtu.tree_structure(self._said.tree(outline, arrays))
+                if again != structure:
+                    raise NotKept("its results are of a structure that has no outline")
+                header, program = _parts_of(call)
+                if folder.write(path, digest, {"outline": outline, **header}, program):
+                    TALLY.found["written"] += 1
+            except (NotKept, NoOutline) as reason:
+                TALLY.not_kept[str(reason)] += 1
+            except REFUSED as error:
+                TALLY.not_kept[f"{type(error).__name__}: {str(error)[:200]}"] += 1
+
+        LATER.do(write)
+
+
+def _signature(arrays: list) -> tuple:
+    """What JAX compiles another program for, but for devices."""
+    context = None if trace_context is None else trace_context()
+    return context, *((x.shape, x.dtype, getattr(x, "weak_type", False)) for x in arrays)
+
+
+def _surely(arrays: list) -> tuple:
+    """The kinds of arrays on the one device where programs are kept; or `NotKept`."""
+    for name, version in (("jax", jax.__version__), ("jaxlib", jaxlib.version.__version__)):
+        if version not in TRIED or PRIVATE is None:
+            raise NotKept(f"this was not tried with {name} {version}")
+    if jax.default_backend() != "cpu":
+        raise NotKept(f"this was not tried on a {jax.default_backend()}")
+    first = jax.devices()[:1]
+    for x in arrays:
+        if isinstance(x, jax.Array) and list(x.devices()) != first:
+            raise NotKept("it runs on another device than the first, or on several")
+    # Results are as committed to the device as what they are computed from.
+    committed = any(getattr(x, "committed", False) for x in arrays)
+    return committed, *((x.shape, np.dtype(x.dtype), getattr(x, "weak_type", False)) for x in arrays)
+
+
+def _parts_of(call: Any) -> tuple[dict[str, Any], bytes]:
+    """What is kept of a compiled program of JAX's: a header, and XLA's executable; or `NotKept`."""
+    parts: Any = call._executable._unloaded_executable
+    if parts.host_callbacks or parts.keepalive or parts.unordered_effects or parts.ordered_effects:
+        raise NotKept("it calls Python while it runs, as for a check or a callback")
+    if parts.mut or call._params.const_args or len(parts.device_list) != 1:
+        raise NotKept("it is more than a function of its arguments")
+    calls = {name for module in parts.xla_executable.hlo_modules() for name in CALLS.findall(module.to_string())}
+    if others := sorted(name for name in calls if not LAPACK.fullmatch(name)):
+        raise NotKept(f"it calls {others[0]}")
+    program = parts.backend.serialize_executable(parts.xla_executable)
+    header = {
+        "name": parts.name,
+        "committed": bool(parts.committed),
+        "lapack": bool(calls),
+        "reads": sorted(parts.kept_var_idx),
+        "outputs": [_kind(x) for x in parts.output_avals],
+    }
+    return header, program
+
+
+def _kind(x: ShapedArray) -> list:
+    if jnp.issubdtype(x.dtype, jax.dtypes.extended) or x != ShapedArray(x.shape, x.dtype, weak_type=x.weak_type):
+        raise NotKept(f"it gives a {x}")
+    return [list(x.shape), x.dtype.name, bool(x.weak_type)]
+
+
+def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[list], list]:
+    """JAX's own call of a kept program."""
+    device = jax.devices()[0]
+    client: Any = device.client
+    unloaded, list_of, find_lapack = PRIVATE
+    devices = list_of((device,))
+    sharding = jax.sharding.SingleDeviceSharding(device)
+    given = [ShapedArray(arrays[i].shape, jnp.dtype(arrays[i].dtype)) for i in header["reads"]]
+    results = [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
+    if header["lapack"]:
+        find_lapack()
+    parts = unloaded(
+        xla_executable=client.deserialize_executable(program, executable_devices=devices),
+        device_list=devices,
+        backend=client,
+        input_avals=given,
+        input_shardings=[sharding for _ in given],
+        output_avals=results,
+        output_shardings=[sharding for _ in results],
+        committed=header["committed"],
+        name=header["name"],
+        unordered_effects=[],
+        ordered_effects=[],
+        keepalive=[],
+        host_callbacks=[],
+        kept_var_idx=set(header["reads"]),
+        mut=None,
+        xla_in_layouts=[None for _ in given],
+        dispatch_in_layouts=[None for _ in given],
+        xla_out_layouts=[None for _ in results],
+        all_args_info=None,
+        pgle_profiler=None,
+    )
+    taken = (([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays],), {})
+    return jax.stages.Compiled(parts.load(), [], taken, jtu.tree_structure([0 for _ in results]))
+
+
+class Later:
+    """Does things in another thread, in order; the end of the process waits for them, though not long."""
+
+    def __init__(self):
+        self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._left, self._changed, self._thread = 0, threading.Condition(), None
+
+    def do(self, job: Callable[[], None]) -> None:
+        """Do this soon."""
+        with self._changed:
+            self._left += 1
+            if self._thread is None or not self._thread.is_alive():
+                # After a fork there is no thread any more.
+                self._thread = threading.Thread(target=self._work, name="lagjax writes programs", daemon=True)
+                self._thread.start()
+        self._todo.put(job)
+
+    def _work(self) -> None:
+        while True:
+            job = self._todo.get()
+            try:
+                job()
+            finally:
+                with self._changed:
+                    self._left -= 1
+                    self._changed.notify_all()
+
+    def wait(self, seconds: float = AT_THE_END) -> bool:
+        """Wait until all is done; whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._left == 0, seconds)
+
+
+LATER = Later()
+atexit.register(LATER.wait)
+if hasattr(os, "register_at_fork"):
+    # A forked process has neither the thread nor what it was about to do.
+    os.register_at_fork(after_in_child=LATER.__init__)
