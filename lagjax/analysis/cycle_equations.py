@@ -34,6 +34,7 @@ Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -42,7 +43,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.arclength import BranchPoint, Number, Tracer
+from lagjax.analysis.arclength import (
+    Along,
+    BranchPoint,
+    CriticalPoint,
+    Monitor,
+    Problem,
+    count_changes,
+    sign_changes,
+    zero,
+)
 from lagjax.analysis.flow import Changes, Flow, SwitchingFlow
 from lagjax.analysis.monodromy import Reasons, directions, orthonormal
 from lagjax.analysis.shooting import TURN, OrbitRequest, integral_at
@@ -53,16 +63,8 @@ from lagjax.jaxtools import compiled
 SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
 # The number of points between which the extreme coordinates are interpolated, and of short steps to each point.
 POINTS, SUBSTEPS = 96, 8
-ENERGY, PERIOD, ENTRY, NUMBER = "energy", "period", "entry", "number"
-
-
-class Along(eqx.Module):
-    """The parameter of a branch: a number in `params`, the energy, the period, or an entry of the first state."""
-
-    name: str = eqx.field(static=True)
-    kind: str = eqx.field(static=True)
-    number: Number | None = None
-    entry: int = eqx.field(static=True, default=0)
+# The parameter is a number in `params`, the energy, the period, or an entry of the first state.
+ENERGY, PERIOD, ENTRY = "energy", "period", "entry"
 
 
 class Drive(eqx.Module):
@@ -345,6 +347,11 @@ def drive_by_parameter(frame: OrbitFrame, z):
 # A driven system repeats if it changes by less than this from one period to the next, relative to its change in a
 # period.
 SAME = 1e-5
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
+# How often a branch is bisected where a pair leaves the unit circle, but nothing smooth shows it.
+HALVINGS = 40
 # A multiplier within this many square roots of the error of N is on the unit circle: a double one is off by that much.
 ON_CIRCLE = 3.0
 
@@ -368,12 +375,53 @@ class OrbitOutputs(NamedTuple):
     moves: float
 
 
-class OrbitTracer(Tracer):
-    """Cycles of an `OrbitFrame`. `guide`: the last point of the branch."""
+def _turn(problem: "CycleProblem", a: BranchPoint, b: BranchPoint) -> CriticalPoint | None:
+    """Where the parameter turns."""
+    # At a pitchfork it turns along the side branch, where the multiplier only touches 1.
+    kind = "fold" if a.sign * b.sign < 0 or not problem.crosses else "branch point"
+    return zero(kind, lambda p: p.tangent[-1], problem, a, b)
+
+
+def _torus(problem: "CycleProblem", a: BranchPoint, b: BranchPoint) -> CriticalPoint | None:
+    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
+    many = a if a.growing > b.growing else b
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
+    slowest = min(outside, key=abs, default=1.0)
+    if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
+        return None
+    found = zero("torus", lambda p: p.outputs.pairs, problem, a, b)
+    if found is not None:
+        return found
+    left, right = problem.halved(a, b, lambda p: p.growing, HALVINGS)
+    if left is a and right is b:
+        return None
+    point = right if left is a else left
+    return CriticalPoint("torus", point.z, abs(float(right.z[-1] - left.z[-1])), point=point)
+
+
+def _zero_of(kind: str, name: str, alone: bool) -> Monitor:
+    """A smooth function of the multipliers, which is zero at critical points of a kind."""
+    value = lambda point: getattr(point.outputs, name)
+    return Monitor(value, sign_changes, partial(zero, kind, value), alone, smooth=True)
+
+
+# The direction of the parameter, χ₊, χ₋, and the multipliers outside the unit circle.
+MONITORS = (
+    Monitor(lambda point: point.tangent[-1], sign_changes, _turn),
+    _zero_of("branch point", "plus", alone=True),
+    _zero_of("period doubling", "minus", alone=False),
+    Monitor(lambda point: point.growing, count_changes, _torus),
+)
+
+
+class CycleProblem(Problem):
+    """Cycles of an `OrbitFrame`. `guide`: the last point of the branch; `crosses`: whether χ₊ shows what crosses."""
+
+    monitors = MONITORS
 
     def __init__(self, frame: OrbitFrame, low: float, high: float, guide: Guide, crosses: bool):
         super().__init__(low, high)
-        self.frame, self.guide, self.crosses = frame, guide, crosses
+        self.frame, self.along, self.guide, self.crosses = frame, frame.along, guide, crosses
         nodes = frame.parts * frame.scale.size
         self.positions = nodes
         self.weights = np.append(np.full(nodes, 1 / frame.parts), [1.0, 1.0])
@@ -408,7 +456,7 @@ class OrbitTracer(Tracer):
             self.cached = key, jax.tree.map(np.asarray, orbit_at(self.frame, z, self.guide))
         return self.cached[1]
 
-    def at(self, z):
+    def residual(self, z):
         evaluation = self.evaluated(z)
         if np.isfinite(evaluation.amplified):
             self.amplified = float(evaluation.amplified)
@@ -424,10 +472,9 @@ class OrbitTracer(Tracer):
         if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
         if self.ways is not None and not np.array_equal(self.ways, evaluation.ways):
-            near = f"{self.frame.along.name} = {z[-1] * self.unit:.6g}"
             return (
-                f"other switches, near {near}: the start comes to a switch (another state of the cycle as the start of "
-                "lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
+                f"other switches, near {self.value_of(z)}: the start comes to a switch (another state of the cycle as "
+                "the start of lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
             )
         if not self.repeats(z)[0]:
             return "the period of the drive changes, which only accelerations of the first phase show"
@@ -438,14 +485,41 @@ class OrbitTracer(Tracer):
         size = np.abs(left)
         within = ON_CIRCLE * np.sqrt(self.noise)
         growing = int(np.sum(size > 1 + within)) if np.all(np.isfinite(size)) else None
-        below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
         outputs = OrbitOutputs(
             z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
+        return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing)
+
+    def ends(self, points, after, origin) -> str | None:
+        before, name = points[-1], self.along.name
+        if self.frame.asked.moves:
+            largest = max(point.outputs.moves for point in points)
+            shrinks = after.outputs.moves < AT_REST * largest
+            if shrinks or self.guide.rate @ self.evaluated(after.z).guide.rate < 0:
+                if before.outputs.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(points):.6g}"
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
+                return f"a period that grows without end, near {self.value_of(before.z)}"
+        if after.outputs.period > ENDLESS * float(self.frame.period):
+            return f"a period that grows without end, near {self.value_of(after.z)}"
+        return None
+
+    def _at_rest(self, points) -> float:
+        """The parameter, extrapolated to a motion of size zero.
+
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
+        """
+        b, power = points[-1].outputs, 1 if self.along.kind == ENTRY else 2
+        parameter = b.parameter
+        if len(points) > 1:
+            a = points[-2].outputs
+            m, n = a.moves**power, b.moves**power
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * self.unit else parameter
 
     def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""
