@@ -54,13 +54,25 @@ from lagjax.analysis.arclength import (
     zero,
 )
 from lagjax.analysis.flow import Changes, Flow, SwitchingFlow
-from lagjax.analysis.monodromy import Reasons, directions, orthonormal
-from lagjax.analysis.shooting import TURN, OrbitRequest, integral_at
+from lagjax.analysis.monodromy import Reasons, directions, orthonormal, without
+from lagjax.analysis.shooting import (
+    SAMPLED_AT,
+    TURN,
+    Goal,
+    OrbitRequest,
+    change_in_a_period,
+    closing_rows,
+    comes_back,
+    held_off,
+    in_parts,
+    integral_at,
+    left_open,
+    slope_of_integral,
+    times_of,
+)
 from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled
 
-# Times, in periods, at which the accelerations of a driven system are compared.
-SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
 # The number of points between which the extreme coordinates are interpolated, and of short steps to each point.
 POINTS, SUBSTEPS = 96, 8
 # The parameter is a number in `params`, the energy, the period, or an entry of the first state.
@@ -85,7 +97,7 @@ class OrbitFrame(eqx.Module):
     """The data that stay the same along a branch: the flow at its start, units, and held quantities.
 
     - `scale` (2n,): the size of each coordinate and velocity; `period`: its unit; `unit`: that of the parameter.
-    - `turns` (n,): whole turns of each coordinate; `integral`, `z` (2n,): the energy and the state at the start.
+    - `turns` (n,): whole turns of each coordinate; `goal`: the energy and the state at the start, which may be held.
     - `slope`: the size of the energy's gradient; `sizes` (c,): the sizes of the constraints' gradients.
     - `drive`: None unless a drive sets the period and makes it change with the parameter.
     - `free` (d, N), `reference` (N,): V and y_0, the fixed combinations of unknowns and the point they refer to.
@@ -97,8 +109,7 @@ class OrbitFrame(eqx.Module):
     period: Float[Array, ""]
     unit: Float[Array, ""]
     turns: Float[Array, " n"]
-    integral: Float[Array, ""]
-    z: Float[Array, " 2n"]
+    goal: Goal
     slope: Float[Array, ""]
     sizes: Float[Array, " c"]
     drive: Drive | None
@@ -144,22 +155,21 @@ def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
     """Follow the flow through all parts, with tangents."""
     flow, nodes, period = frame.split(z)
     count, size, scale = frame.parts, frame.scale.size, frame.scale
-    times, span = _times(frame, period), period / count
+    times, span = times_of(frame.t, period, count), period / count
     columns = jnp.concatenate([jnp.eye(size, dtype=z.dtype), jnp.zeros((size, 2), z.dtype)], axis=1)
 
     def part(j, t, node):
         return flow.passage(t, node, span, columns, scale, changes=_changes(frame, flow, z, j, span))
 
-    if count == 1:
-        passed = jax.tree.map(lambda x: x[None], part(0, times[0], nodes[0]))
-    else:
-        passed = jax.vmap(part)(jnp.arange(count), times, nodes)
-    closing, slopes = _closing(frame, nodes, passed)
+    passed = in_parts(part, jnp.arange(count), times, nodes)
+    closing = left_open(frame.asked, nodes, passed.z, frame.turns, scale)
+    bases = jnp.broadcast_to(jnp.eye(size, dtype=z.dtype), (count, size, size))
+    slopes = closing_rows(passed.frame, bases).at[-size:].multiply(comes_back(frame.asked, z.dtype)[:, None])
 
     def others(z: Array):
         return _others(frame, z, guide)
 
-    value = jnp.concatenate([closing, others(z)])
+    value = jnp.concatenate([closing.reshape(-1), others(z)])
     jacobian = jnp.concatenate([slopes, jax.jacfwd(others)(z)])
 
     good = jnp.all(passed.ended) & jnp.all(jnp.isfinite(jacobian))
@@ -184,10 +194,6 @@ def _ways(switches: Switches | None):
     return ways if switches.modes is None else jnp.concatenate([ways[:, None], switches.modes[-1]], axis=1)
 
 
-def _times(frame, period):
-    return frame.t + period * jnp.arange(frame.parts, dtype=period.dtype) / frame.parts
-
-
 def _changes(frame, flow, z, j, span) -> Changes:
     """How parameters and times change with the frame columns: with μ, with log T, and not at all with the state."""
     last = jnp.eye(z.size, dtype=z.dtype)[-1]
@@ -209,30 +215,13 @@ def _changes(frame, flow, z, j, span) -> Changes:
     return Changes(jax.tree.map(rows, by_number), by_log_period(j * span), by_log_period(span))
 
 
-def _closing(frame, nodes, passed):
-    """The distance from each part's end to the next part's start, and its Jacobian."""
-    count, (size, n) = frame.parts, (frame.scale.size, frame.turns.size)
-    comes_back = np.concatenate([1.0 - np.array(frame.asked.relative, float), np.ones(n)])
-    first = nodes[0] + jnp.concatenate([TURN * frame.turns, jnp.zeros_like(frame.turns)])
-    values = (passed.z - jnp.concatenate([nodes[1:], first[None]])) / frame.scale[None]
-    rows = jnp.zeros((count, size, count * size + 2), values.dtype)
-    for j in range(count):
-        after = (j + 1) % count
-        rows = rows.at[j, :, j * size : (j + 1) * size].add(passed.frame[j, :, :size])
-        rows = rows.at[j, :, after * size : (after + 1) * size].add(-np.eye(size))
-        rows = rows.at[j, :, -2:].set(passed.frame[j, :, size:])
-    keep = np.ones((count, size))
-    keep[-1] = comes_back
-    return (values * keep).reshape(-1), (rows * keep[:, :, None]).reshape(count * size, -1)
-
-
 def _others(frame: OrbitFrame, z, guide):
     """All equations except those that close the motion."""
     flow, nodes, period = frame.split(z)
     along, asked, value = frame.along, frame.asked, z[-1] * frame.unit
     parts = []
     if flow.dimension < frame.scale.size:
-        off = jax.vmap(flow.start.residual)(_times(frame, period), nodes)
+        off = jax.vmap(flow.start.residual)(times_of(frame.t, period, frame.parts), nodes)
         parts.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
     if asked.moves:
@@ -243,12 +232,13 @@ def _others(frame: OrbitFrame, z, guide):
         parts.append(drive_off(frame, flow.start, period)[None])
     elif not asked.free:
         parts.append(z[-2:-1])
-    if asked.energy or along.kind == ENERGY:
-        goal = value if along.kind == ENERGY else frame.integral
-        parts.append((integral_at(flow.start, frame.t, nodes[0]) - goal)[None] / frame.slope)
-    parts += [(first[i] - frame.z[i] / frame.scale[i])[None] for i in asked.held]
-    if along.kind == ENTRY:
-        parts.append((first[along.entry] - value / frame.scale[along.entry])[None])
+    goal = frame.goal
+    if along.kind == ENERGY:
+        goal = goal._replace(integral=value)
+    elif along.kind == ENTRY:
+        goal = goal._replace(z=goal.z.at[along.entry].set(value))
+    held = held_off(flow.start, frame.t, nodes[0], asked, goal, frame.slope, frame.scale)
+    parts += [off[None] for off in held]
     return jnp.concatenate([*parts, frame.free @ (z[:-1] - frame.reference)])
 
 
@@ -267,9 +257,7 @@ def _changed(frame, flow, period):
     def at(t: Array):
         return flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
 
-    # Sampled at the same phases for every period.
-    times = frame.t + period * jnp.asarray(SAMPLED_AT, period.dtype)
-    return jax.vmap(at)(times + period) - jax.vmap(at)(times)
+    return change_in_a_period(at, frame.t, period)
 
 
 def drive_of(flow: Flow, t, z, period, scale) -> Drive:
@@ -312,7 +300,9 @@ def path_at(frame: OrbitFrame, z):
     if isinstance(flow, SwitchingFlow):
         return flow.path(frame.t, nodes[0], period, POINTS)
     each, span = -(-POINTS // frame.parts), period / frame.parts
-    states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(_times(frame, period), nodes)
+    states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(
+        times_of(frame.t, period, frame.parts), nodes
+    )
     states = jnp.concatenate([states[:, :-1].reshape(-1, frame.scale.size), states[-1, -1:]])
     return period * jnp.arange(len(states), dtype=z.dtype) / (len(states) - 1), states
 
@@ -320,16 +310,11 @@ def path_at(frame: OrbitFrame, z):
 @compiled
 def sizes_at(flow: Flow, t, z, period, scale):
     """The energy, the sizes of its gradient and of the constraints' gradients, in units of `scale`; and the drive."""
-    slope = jax.grad(lambda z: integral_at(flow, t, z))(z) * scale
-    size = jnp.linalg.norm(slope)
     rows = jnp.zeros(0, z.dtype)
     if flow.dimension < z.size:
         rows = jnp.linalg.norm(flow.normals(t, z, scale), axis=1)
-
-    def positive(x: Array):
-        return jnp.where(x > 0, x, 1.0)
-
-    return integral_at(flow, t, z), positive(size), positive(rows), drive_of(flow, t, z, period, scale)
+    size = slope_of_integral(flow, t, z, scale)[1]
+    return integral_at(flow, t, z), size, jnp.where(rows > 0, rows, 1.0), drive_of(flow, t, z, period, scale)
 
 
 @compiled
@@ -524,20 +509,16 @@ class CycleProblem(Problem):
     def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""
         count = int(np.sum(evaluation.there))
-        reduced = self._without(evaluation, evaluation.whole)
-        left = np.linalg.eigvals(reduced)
+        left = np.linalg.eigvals(without(evaluation.trivial, evaluation.whole))
         left = left[np.argsort(np.abs(left - 1), kind="stable")][count:]
         left = left[
             np.lexsort((-left.imag, -np.round(np.abs(left) / max(np.max(np.abs(left), initial=0.0), 1e-300), 9)))
         ]
         return np.concatenate([np.ones(count, complex), left.astype(complex)]), left.astype(complex)
 
-    def _without(self, evaluation, matrix):
-        rest = np.eye(len(matrix)) - evaluation.trivial.T @ evaluation.trivial
-        return rest @ matrix @ rest + evaluation.trivial.T @ evaluation.trivial
-
     def _product(self, evaluation, shift):
-        return float(np.linalg.det(self._without(evaluation, evaluation.whole + shift * np.eye(len(evaluation.whole)))))
+        shifted = evaluation.whole + shift * np.eye(len(evaluation.whole))
+        return float(np.linalg.det(without(evaluation.trivial, shifted)))
 
     def _pairs(self, left):
         """A function that changes its sign where a pair leaves the unit circle.

@@ -36,7 +36,7 @@ from lagjax.analysis.flow import any_flow
 from lagjax.analysis.following import AT_EDGE, Follower
 from lagjax.analysis.monodromy import OrbitProblem, any_problem_of, tolerance_of, user_system
 from lagjax.analysis.periodic_orbit import PeriodicOrbit
-from lagjax.analysis.shooting import OrbitRequest, guessed
+from lagjax.analysis.shooting import Goal, OrbitRequest, guessed
 from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
@@ -306,7 +306,7 @@ def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, O
         )
     free = asked._replace(free=True, energy=False, held=())
     if along == ENERGY:
-        return Along(along, ENERGY), free
+        return Along(along, ENERGY), free._replace(energy=True)
     if along == PERIOD:
         if not reasons.energy:
             raise ValueError(
@@ -314,7 +314,8 @@ def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, O
                 f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
             )
         return Along(along, PERIOD), free._replace(free=False)
-    return Along(along, ENTRY, None, entries.index(along)), free
+    entry = entries.index(along)
+    return Along(along, ENTRY, None, entry), free._replace(held=(entry,))
 
 
 @compiled
@@ -337,10 +338,10 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     first = float(first)
     unit = np.asarray(abs(range_from(first, to, place.name, "that of the orbit") - first), s.t.dtype)
     y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
-    no_rows = jnp.zeros((0, y.size), s.t.dtype)
+    no_rows, goal = jnp.zeros((0, y.size), s.t.dtype), Goal(integral, jnp.asarray(nodes[0]))
     frame = OrbitFrame(
-        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
-        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
+        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), goal, slope, sizes,
+        None, no_rows, y, place, asked, problem.reasons, len(nodes),
     )  # fmt: skip
     z = np.append(y, first / unit)
     if not problem.reasons.autonomous and place.kind == NUMBER:
