@@ -143,8 +143,6 @@ def _nearest(difference, turn_shifts, scale, asked):
 
 # Times, in periods, at which the rates of a driven system are compared.
 SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
-# The Jacobi integral counts as held within this many round-offs of its terms.
-ROUND_OFFS = 16.0
 
 
 class Goal(NamedTuple):
@@ -194,13 +192,7 @@ def closing_rows(frames: Float[Array, "K s k+e"], bases: Float[Array, "K s k"]) 
 
 def held_off(flow: Flow | SwitchingFlow, t, z, asked: OrbitRequest, goal: Goal, size, scale) -> list[Array]:
     """How far what is held is from its goal: the energy in units of `size`, entries of z in those of `scale`."""
-    off = []
-    if asked.energy:
-        excess = integral_at(flow, t, z) - goal.integral
-        # A value below the round-off of its terms is set to zero, but keeps its derivative.
-        terms = jnp.abs(goal.integral) + jnp.abs(flow.model.lagrangian(t, *jnp.split(goal.z, 2)))
-        is_round_off = lax.stop_gradient(jnp.abs(excess) <= ROUND_OFFS * jnp.finfo(excess.dtype).eps * terms)
-        off.append(jnp.where(is_round_off, excess - lax.stop_gradient(excess), excess) / size)
+    off = [(integral_at(flow, t, z) - goal.integral) / size] if asked.energy else []
     return off + [(z[i] - goal.z[i]) / scale[i] for i in asked.held]
 
 
@@ -231,6 +223,8 @@ LEAST_DAMPING, FIRST_DAMPING, DAMPING_FACTOR, TOO_MUCH_DAMPING = 0.01, 0.03, 8.0
 STOP_BELOW, CONVERGED_BELOW = 1.0, 1e3
 # Singular values below this many tolerances, or below the second number if that is larger, count as zero.
 ZERO_TOLERANCES, ZERO_BELOW = 1e4, 1e-8
+# A held integral counts as met when it is off by at most this many round-offs of its terms.
+ROUND_OFFS = 16.0
 # A step that shrinks the motion below this fraction of the first one is rejected.
 SHRUNK_BELOW = 0.1
 # No step changes the logarithm of the period, or the state in units of its size, by more than this.
@@ -433,6 +427,12 @@ def _residual(flow, t, candidate, ends, asked, goal, guess):
         parts.append(jnp.zeros(1, scale.dtype))
     size = lax.stop_gradient(slope_of_integral(flow, t, lax.stop_gradient(z), scale)[1]) if asked.energy else None
     held = held_off(flow, t, z, asked, goal, size, scale)
+    if asked.energy:
+        # A value below the round-off of its terms is set to zero, but keeps its derivative.
+        terms = jnp.abs(goal.integral) + jnp.abs(flow.model.lagrangian(t, *jnp.split(goal.z, 2)))
+        round_off = ROUND_OFFS * jnp.finfo(terms.dtype).eps * terms / size
+        fixed = lax.stop_gradient(held[0])
+        held[0] = jnp.where(jnp.abs(fixed) <= round_off, held[0] - fixed, held[0])
     return jnp.concatenate([*parts, *(HELD_WEIGHT * off[None] for off in held)])
 
 
