@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.arclength import Along, BranchPoint, range_from
-from lagjax.analysis.balance import OK, VELOCITY, WORDS, Steady
+from lagjax.analysis.balance import OK, VELOCITY, WORDS, Steady, side_by_side
 from lagjax.analysis.critical_points import Frame, SteadyProblem, along_named, full_jacobian, value_in, with_value
 from lagjax.analysis.degenerate import unknowns
 from lagjax.analysis.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
@@ -182,7 +182,7 @@ class Branches(eqx.Module):
         return [name for name, x in zip(self.names, spread) if x > 1e-9 * largest][:6] or list(self.names[:1])
 
     def _curves(self):
-        return [_columns(b.q, len(b)) for b in self.branches]
+        return [side_by_side(b.q) for b in self.branches]
 
     def draw(self, axis, name: str | None = None):
         """Draw one coordinate, by default the first, on matplotlib axes, as `plot` does."""
@@ -213,10 +213,6 @@ def _all_handles(axes):
         handles += new_handles
         labels += new_labels
     return handles, labels
-
-
-def _columns(tree, rows):
-    return np.concatenate([np.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
 UNKNOWN, UNSTABLE, STABLE = -1, 0, 1

@@ -67,7 +67,7 @@ from lagjax.analysis.arclength import (
 from lagjax.analysis.balance import Steady
 from lagjax.analysis.equilibria import GROWS_ABOVE
 from lagjax.jaxtools import compiled
-from lagjax.numerics import independent_rows, newton_in_python
+from lagjax.numerics import newton_in_python
 
 FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
 
@@ -179,18 +179,12 @@ def dynamic(frame: Frame, z):
     """K, C, M of `D(s)`, bordered by the independent constraints."""
     s, y = frame.split(z)
     d = equations.departures(s, y, jax.jacfwd(lambda y: equations.balance(s, y))(y))
-    m = d.rows.shape[0]
-    kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
-
-    def keep(rows: Array):
-        return jnp.where(kept[:, None], rows, 0.0)
-
-    holonomic = s.model.holonomic[:, None]
-    rows, slopes, none = keep(d.rows), keep(d.slopes), jnp.zeros((s.n, m), d.rows.dtype)
+    d, kept = d.independent()
+    holonomic, none = s.model.holonomic[:, None], jnp.zeros_like(d.rows.T)
     corner = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(d.rows.dtype)
-    stiffness = jnp.block([[d.stiffness, -keep(d.pushes).T], [jnp.where(holonomic, rows, slopes), corner]])
-    damping = jnp.block([[d.damping, none], [jnp.where(holonomic, 0.0, rows), 0 * corner]])
-    mass = jnp.block([[d.mass, none], [0 * rows, 0 * corner]])
+    stiffness = jnp.block([[d.stiffness, -d.pushes.T], [jnp.where(holonomic, d.rows, d.slopes), corner]])
+    damping = jnp.block([[d.damping, none], [jnp.where(holonomic, 0.0, d.rows), 0 * corner]])
+    mass = jnp.block([[d.mass, none], [0 * d.rows, 0 * corner]])
     return stiffness, damping, mass
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.arclength import NUMBER, Along, no_such_number, numbers_in, range_from
+from lagjax.analysis.balance import side_by_side
 from lagjax.analysis.branches import (
     draw_by_stability,
     draw_critical,
@@ -162,8 +163,7 @@ class OrbitBranch(eqx.Module):
     def _values(self, name: str):
         if name == "period":
             return np.asarray(self.period)
-        leaves = [np.asarray(x).reshape(len(self), -1) for x in jax.tree.leaves(self.high)]
-        return np.concatenate(leaves, axis=1)[:, self._names().index(name)]
+        return side_by_side(self.high)[:, self._names().index(name)]
 
     @property
     def verdicts(self) -> np.ndarray:

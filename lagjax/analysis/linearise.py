@@ -40,13 +40,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from lagjax.analysis.balance import SINGULAR_BELOW
 from lagjax.jaxtools import compiled, is_eager, is_traced, remembered
 from lagjax.mechanics import explain_failure, forcing_and_inertia, invariance, response, where
 from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, lapack
 from lagjax.system import Model, State, check_system, constraints, coordinates, prepare
-
-# The reduced mass matrix is singular if its reciprocal condition, after scaling, is below this.
-SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class LinearisationKind(NamedTuple):

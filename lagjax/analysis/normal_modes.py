@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis import degenerate
-from lagjax.analysis.balance import Steady, SteadySymmetries
+from lagjax.analysis.balance import Steady, SteadySymmetries, side_by_side
 from lagjax.analysis.eigenmodes import (
     ASYMPTOTIC,
     DIVERGENCE,
@@ -186,7 +186,7 @@ def reason_of(modes) -> str:
 
 def label_of(i: int, modes) -> str:
     """A mode in a few words."""
-    linearisation, shape = modes.linearisation, np.abs(_flat(modes)[i])
+    linearisation, shape = modes.linearisation, np.abs(side_by_side(modes.shapes)[i])
     moved = [linearisation.names[j] for j in np.argsort(-shape.round(6), kind="stable") if shape[j] > NAMED_ABOVE]
     named = ", ".join(moved[:4]) + (", ..." if len(moved) > 4 else "")
     if bool(modes.zero[i]):
@@ -205,12 +205,6 @@ def label_of(i: int, modes) -> str:
     if bool(modes.double[i]):
         words += ", double root"
     return f"{words}: {named}"
-
-
-def _flat(modes):
-    """The shapes as (k, N)."""
-    leaves = [np.asarray(x) for x in jax.tree.leaves(modes.shapes)]
-    return np.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
 
 
 ZERO_BELOW = 1e-9
