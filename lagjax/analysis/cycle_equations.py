@@ -363,7 +363,7 @@ class OrbitOutputs(NamedTuple):
 def _turn(problem: "CycleProblem", a: BranchPoint, b: BranchPoint) -> CriticalPoint | None:
     """Where the parameter turns."""
     # At a pitchfork it turns along the side branch, where the multiplier only touches 1.
-    kind = "fold" if a.sign * b.sign < 0 or not problem.crosses else "branch point"
+    kind = "fold" if a.sign * b.sign < 0 or not problem.isolated else "branch point"
     return zero(kind, lambda p: p.tangent[-1], problem, a, b)
 
 
@@ -400,13 +400,17 @@ MONITORS = (
 
 
 class CycleProblem(Problem):
-    """Cycles of an `OrbitFrame`. `guide`: the last point of the branch; `crosses`: whether χ₊ shows what crosses."""
+    """Cycles of an `OrbitFrame`.
+
+    `guide`: the last point of the branch. `isolated`: whether only trivial directions lead from a cycle to others at
+    the same parameter; if not, χ₊ is zero everywhere and shows nothing.
+    """
 
     monitors = MONITORS
 
-    def __init__(self, frame: OrbitFrame, low: float, high: float, guide: Guide, crosses: bool):
+    def __init__(self, frame: OrbitFrame, low: float, high: float, guide: Guide, isolated: bool):
         super().__init__(low, high)
-        self.frame, self.along, self.guide, self.crosses = frame, frame.along, guide, crosses
+        self.frame, self.along, self.guide, self.isolated = frame, frame.along, guide, isolated
         nodes = frame.parts * frame.scale.size
         self.positions = nodes
         self.weights = np.append(np.full(nodes, 1 / frame.parts), [1.0, 1.0])
@@ -473,7 +477,7 @@ class CycleProblem(Problem):
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
         outputs = OrbitOutputs(
-            z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
+            z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.isolated else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
         return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing)

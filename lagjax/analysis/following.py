@@ -160,7 +160,7 @@ class Follower:
             if isinstance(point, CriticalPoint):
                 number, known = self._numbered(point, after)
                 path.through.add(number)
-                if self.found[number].directions and self._crosses(number, known, after.z - before.z):
+                if self.found[number].directions and self._passes_crossing(number, known, after.z - before.z):
                     status = f"a known crossing, at {self.problem.value_of(self.found[number].z)}"
                 point = self._at_critical(number, after)
             # Two steps are searched for what only dips, and some of it lies in front of the last point.
@@ -189,7 +189,7 @@ class Follower:
         # A root or multiplier is neutral there, so the nearest other point decides the stability.
         return replace(critical.point or after, z=critical.z, growing=None, critical=number)
 
-    def _crosses(self, number: int, known: bool, step: np.ndarray) -> bool:
+    def _passes_crossing(self, number: int, known: bool, step: np.ndarray) -> bool:
         """Note that a branch passes a crossing, so that each direction is followed once; whether this one has been."""
         problem, critical = self.problem, self.found[number]
         along = problem.weights * step / np.linalg.norm(step)
