@@ -27,7 +27,7 @@ from lagjax.analysis.eigenmodes import (
     Motions,
     motions_of,
 )
-from lagjax.analysis.linearise import Linearisation, linearise, linearised
+from lagjax.analysis.linearise import Linearisation, linearise, linearised, pencil
 from lagjax.display import Animation, plots
 from lagjax.integrate import drawn
 from lagjax.jaxtools import compiled, is_eager, is_traced
@@ -220,16 +220,15 @@ def with_neutral(linearisation, shapes, zero):
     words = [""] * len(zero)
     if not np.any(zero):
         return shapes, words
-    p, kind = linearisation.parts, linearisation.kind
-    drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
-    A = np.block([[drift, transfer], [-position, -velocity]])
+    p, kind = jax.tree.map(np.asarray, linearisation.parts), linearisation.kind
+    A = pencil(p, np)[1]
     # Rows have different units, so each is scaled by its largest entry.
     size = np.max(np.abs(A), axis=1, keepdims=True)
     basis = null_space(A / np.where(size > 0, size, 1.0), ZERO_BELOW).T
-    count = drift.shape[0]
+    count = p.drift.shape[0]
     # A direction with a displacement is described by it, one without a displacement by its velocities.
-    still = basis[:, :count] @ np.asarray(p.positions).T
-    moving = basis[:, count:] @ np.asarray(p.velocities).T + basis[:, :count] @ np.asarray(p.turning).T
+    still = basis[:, :count] @ p.positions.T
+    moving = basis[:, count:] @ p.velocities.T + basis[:, :count] @ p.turning.T
     reduced = _reduced(np.concatenate([still, moving], axis=1))
     shapes, n = np.array(shapes), shapes.shape[1]
     for i, row in zip(np.flatnonzero(zero), reduced):
