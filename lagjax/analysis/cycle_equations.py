@@ -360,14 +360,14 @@ class OrbitOutputs(NamedTuple):
     moves: float
 
 
-def _turn(problem: "CycleProblem", a: BranchPoint, b: BranchPoint) -> CriticalPoint | None:
+def _turn(problem, a, b) -> CriticalPoint | None:
     """Where the parameter turns."""
     # At a pitchfork it turns along the side branch, where the multiplier only touches 1.
     kind = "fold" if a.sign * b.sign < 0 or not problem.isolated else "branch point"
     return zero(kind, lambda p: p.tangent[-1], problem, a, b)
 
 
-def _torus(problem: "CycleProblem", a: BranchPoint, b: BranchPoint) -> CriticalPoint | None:
+def _torus(problem, a, b) -> CriticalPoint | None:
     """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
     many = a if a.growing > b.growing else b
     outside = [x for x in many.outputs.multipliers if abs(x) > 1]

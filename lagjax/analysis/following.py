@@ -4,6 +4,7 @@ After each step the monitors of the problem are compared. What changed is refine
 the branch. Where branches cross, the others wait to be followed, each once and in both directions.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -134,7 +135,7 @@ class Follower:
             step /= 3
         return None, step, why
 
-    def _between(self, points: list[BranchPoint], after: BranchPoint) -> list[CriticalPoint | BranchPoint] | None:
+    def _between(self, points: list[BranchPoint], after: BranchPoint) -> Sequence[CriticalPoint | BranchPoint] | None:
         """What lies between the last point and the next one; None if the step jumped to another branch."""
         problem, before = self.problem, points[-1]
         found = between(problem, before, after)
@@ -152,11 +153,11 @@ class Follower:
         length = self.problem.length
         return any(length(found.z - before.z) <= 2 * length(after.z - before.z) for found in self.found)
 
-    def _passed(self, path: BranchPath, between: list[CriticalPoint | BranchPoint], after: BranchPoint) -> str:
+    def _passed(self, path: BranchPath, inside: Sequence[CriticalPoint | BranchPoint], after: BranchPoint) -> str:
         """Put what lies in front of the next point into the path; return why the branch ends there, or nothing."""
         before, place, status = path.points[-1], len(path.points), ""
         along = self.problem.weights * (after.z - before.z)
-        for point in between:
+        for point in inside:
             if isinstance(point, CriticalPoint):
                 number, known = self._numbered(point, after)
                 path.through.add(number)
@@ -206,7 +207,7 @@ class Follower:
 
     def _cosine(self, a: np.ndarray, b: np.ndarray) -> float:
         length = self.problem.length
-        return (self.problem.weights * a) @ b / (length(a) * length(b))
+        return float((self.problem.weights * a) @ b) / (length(a) * length(b))
 
     def _end(self, path: BranchPath, step: float) -> str:
         """Why a branch ends at its last point, if it does: at infinity, or where it began."""

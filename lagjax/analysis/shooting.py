@@ -425,7 +425,7 @@ def _residual(flow, t, candidate, ends, asked, goal, guess):
     parts = [left_open(asked, candidate.nodes, ends, guess.turns, scale).reshape(-1)]
     if asked.moves:
         parts.append(jnp.zeros(1, scale.dtype))
-    size = lax.stop_gradient(slope_of_integral(flow, t, lax.stop_gradient(z), scale)[1]) if asked.energy else None
+    size = lax.stop_gradient(slope_of_integral(flow, t, lax.stop_gradient(z), scale)[1]) if asked.energy else 1.0
     held = held_off(flow, t, z, asked, goal, size, scale)
     if asked.energy:
         # A value below the round-off of its terms is set to zero, but keeps its derivative.
