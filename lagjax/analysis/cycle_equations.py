@@ -236,7 +236,7 @@ def _others(frame: OrbitFrame, z, guide):
     if along.kind == ENERGY:
         goal = goal._replace(integral=value)
     elif along.kind == ENTRY:
-        goal = goal._replace(z=goal.z.at[along.entry].set(value))
+        goal = goal._replace(z=jnp.asarray(goal.z).at[along.entry].set(value))
     held = held_off(flow.start, frame.t, nodes[0], asked, goal, frame.slope, frame.scale)
     parts += [off[None] for off in held]
     return jnp.concatenate([*parts, frame.free @ (z[:-1] - frame.reference)])

@@ -338,7 +338,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     first = float(first)
     unit = np.asarray(abs(range_from(first, to, place.name, "that of the orbit") - first), s.t.dtype)
     y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
-    no_rows, goal = jnp.zeros((0, y.size), s.t.dtype), Goal(integral, jnp.asarray(nodes[0]))
+    no_rows, goal = jnp.zeros((0, y.size), s.t.dtype), Goal(integral, nodes[0])
     frame = OrbitFrame(
         flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), goal, slope, sizes,
         None, no_rows, y, place, asked, problem.reasons, len(nodes),
