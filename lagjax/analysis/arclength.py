@@ -1,4 +1,4 @@
-"""Pseudo-arclength continuation of a branch of solutions, which passes folds; its parameter, by name.
+"""Pseudo-arclength continuation of branches of solutions: through folds, past critical points, onto crossing branches.
 
 The solutions are steady motions (`critical_points.py`) or cycles (`cycle_equations.py`): solutions z = (y, μ) of
 equations E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predicted one step along the tangent τ,
@@ -9,6 +9,10 @@ equations E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predic
 There may be more equations than unknowns, some of them redundant; they are then solved by least squares. Lengths are
 measured in the positions and the parameter.
 
+A `Problem` has the equations, the frame in which their points are read, and monitors: functions of the points, each of
+which changes where something happens in between, and knows how that point is refined. A `Follower` takes the steps,
+looks at the monitors after each, and decides where a branch ends and which others are followed.
+
 Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
 Continuation Methods*, ch. 6 (steps).
 """
@@ -16,7 +20,7 @@ Continuation Methods*, ch. 6 (steps).
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -77,20 +81,29 @@ def no_such_number(along: str, params: PyTree, more: str) -> ValueError:
     )
 
 
+NUMBER = "number"
+
+
+class Along(eqx.Module):
+    """The parameter of a branch: a number in `params`, or, by its `kind` and `entry`, something else that is held."""
+
+    name: str = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    number: Number | None = None
+    entry: int = eqx.field(static=True, default=0)
+
+
+def range_from(first: float, to: float, along: str, where: str) -> float:
+    """The last value of the parameter; raises unless it differs from the first, which is given in `where`."""
+    if not np.isfinite(last := float(to)) or first == last:
+        raise ValueError(
+            f"to={to} leaves the parameter {along!r} no range: it starts at {first:.6g}.\n"
+            f"Fix: to={2 * first or 1.0:.6g}, and the first value in {where}."
+        )
+    return last
+
+
 ITERATIONS = 10
-# Step lengths: the first, the longest (relative to the distance from the origin) and the smallest.
-FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
-# The largest turn of the tangent in a step, in radians, and the desired one.
-MOST_TURN, TURN = 0.4, 0.12
-# The largest and the desired contraction rate of Newton's method, which is large if the prediction was poor.
-MOST_CONTRACTION, CONTRACTION = 0.3, 0.1
-# Positions larger than this, in their units, count as infinite.
-INFINITY = 1e4
-CLOSED_WITHIN = 1e-3
-# A spurious crossing means that a step jumped to another branch, and it is repeated (AGAIN) with a shorter one, unless
-# it is shorter than SHORT already.
-AGAIN, SHORT = "again", 1e-6
-AT_EDGE = "the end of the range"
 # The number of values from which a zero is interpolated.
 INTERPOLATED = 6
 LOST = "equations that are redundant at the start of the branch are no longer redundant"
@@ -102,6 +115,7 @@ class BranchPoint:
 
     `sign`: of a function that changes sign where another branch crosses. `growing`: the number of small departures that
     grow, None if unknown. `negative`: the number of negative factors in the product of which `sign` is the sign.
+    `critical`: the number of the critical point that it is.
     """
 
     z: np.ndarray
@@ -110,39 +124,97 @@ class BranchPoint:
     sign: float
     outputs: Any
     growing: int | None
-    negative: int
+    negative: int = 0
     critical: int | None = None
 
 
 @dataclass
-class BranchPath:
-    """The points of a branch in order, and why it ends."""
+class CriticalPoint:
+    """A critical point: its kind, z, and how far off its parameter may be, in the unit of z.
 
-    points: list[BranchPoint] = field(default_factory=list)
-    status: str = ""
-    others: list[str] = field(default_factory=list)
-
-
-class Tracer(abc.ABC):
-    """The data common to all branches of a run: the equations, the measure of length, the range of the parameter.
-
-    Abstract: `at` and `described` define what is solved. `weights` (N + 1,): of the entries of z in a length. A branch
-    ends at infinity if one of the first `positions` entries of z is large. `unit`: of the parameter.
+    `located`: False where it only lies somewhere between two points. `directions`: the tangents of both branches of a
+    crossing; `used`: those that are followed. `derivative`: of the parameter. `point`: the point of the branch, None if
+    it is not known yet, or has no outputs.
     """
 
+    kind: str
+    z: np.ndarray
+    accuracy: float
+    directions: list[np.ndarray] = field(default_factory=list)
+    frequency: float = 0.0
+    derivative: Any = None
+    located: bool = True
+    point: BranchPoint | None = None
+    used: list[np.ndarray] = field(default_factory=list)
+
+
+class Monitor(NamedTuple):
+    """A function of the points of a branch that shows what happens between two of them.
+
+    - `value(point)`, and `changes(before, after)`: whether a change of this value means something.
+    - `refine(problem, before, after)`: the critical point in between, to round-off; None if there is none after all.
+    - `alone`: only where none of the monitors before has found anything. `smooth`: so smooth that values at three
+      points show two zeros between them.
+    """
+
+    value: Callable[[BranchPoint], Any]
+    changes: Callable[[Any, Any], bool]
+    refine: Callable[[Any, BranchPoint, BranchPoint], CriticalPoint | None]
+    alone: bool = True
+    smooth: bool = False
+
+
+def sign_changes(before: float, after: float) -> bool:
+    """Whether a number changes its sign."""
+    return before * after < 0
+
+
+def count_changes(before: int | None, after: int | None) -> bool:
+    """Whether a number of things changes, where both are known."""
+    return before is not None and after is not None and before != after
+
+
+class Problem(abc.ABC):
+    """Equations E(z) = 0 that have branches of solutions, how a point is read, and what is watched along a branch.
+
+    Abstract: `residual` has the equations, `described` reads a point in the `frame`, `monitors` find critical points.
+
+    - `along`: the parameter, in units of `unit`, between `low` and `high`.
+    - `weights` (N + 1,): of the entries of z in a length. A branch ends at infinity if one of the first `positions`
+      entries of z is large.
+    - `crossings`: whether `monitors` solve for the branches that cross, which are then followed too.
+    """
+
+    frame: Any
+    along: Along
     weights: np.ndarray
     positions: int
     dtype: np.dtype
     unit: float
-
-    def cast(self, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Vectors in the dtype of the equations."""
-        return tuple(np.asarray(x, self.dtype) for x in vectors)
+    monitors: tuple[Monitor, ...]
+    crossings = False
 
     def __init__(self, low: float, high: float):
         self.low, self.high = low, high
         # The ratio of Newton's second step to its first in the last correction.
         self.contraction = 0.0
+
+    @abc.abstractmethod
+    def residual(self, z) -> tuple[np.ndarray, np.ndarray, float]:
+        """E, J and the largest residual of all equations."""
+
+    @abc.abstractmethod
+    def described(self, z, jacobian, tangent) -> BranchPoint | str:
+        """A point with its outputs; or a message that says what is wrong with it."""
+
+    def moved_to(self, point: BranchPoint):
+        """Called when the branch has reached a point, to which the equations may refer from then on."""
+
+    def ends(self, points: list[BranchPoint], after: BranchPoint, origin: CriticalPoint | None) -> str | None:
+        """Why a branch ends before this point, if it does; `origin`: the critical point at which it began."""
+
+    def escape(self, point: BranchPoint) -> CriticalPoint | None:
+        """The critical point at which a branch goes to infinity, from a point far out, if it can be solved for."""
 
     @property
     def eps(self) -> float:
@@ -153,16 +225,20 @@ class Tracer(abc.ABC):
         """The round-off of a Newton step, relative to z."""
         return self.eps
 
-    @abc.abstractmethod
-    def at(self, z) -> tuple[np.ndarray, np.ndarray, float]:
-        """E, J and the largest residual of all equations."""
+    def cast(self, *vectors) -> tuple[np.ndarray, ...]:
+        """Vectors in the dtype of the equations."""
+        return tuple(np.asarray(x, self.dtype) for x in vectors)
 
-    @abc.abstractmethod
-    def described(self, z, jacobian, tangent) -> BranchPoint | str:
-        """A point with its outputs; or a message that says what is wrong with it."""
+    def size(self, z):
+        return max(1.0, float(np.max(np.abs(z))))
 
-    def moved_to(self, point: BranchPoint):
-        """Called when the branch has reached a point, to which the equations may refer from then on."""
+    def length(self, step) -> float:
+        """The length of a step of z."""
+        return float(np.sqrt(self.weights @ step**2))
+
+    def value_of(self, z, digits=6) -> str:
+        """The parameter in words."""
+        return f"{self.along.name} = {z[-1] * self.unit:.{digits}g}"
 
     def tangent(self, jacobian, along):
         """The unit tangent in the direction of `along`."""
@@ -175,7 +251,7 @@ class Tracer(abc.ABC):
         known = row @ z if known is None else known
 
         def step(z):
-            value, jacobian, _ = self.at(z)
+            value, jacobian, _ = self.residual(z)
             if not (np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))):
                 return None
             matrix = np.concatenate([jacobian, row[None]])
@@ -195,86 +271,49 @@ class Tracer(abc.ABC):
         self.contraction = second / first if first > 1e-6 else 0.0
         return found.y
 
-    def size(self, z):
-        return max(1.0, float(np.max(np.abs(z))))
-
     def point(self, z, along) -> BranchPoint | str:
         """The point of a branch at z; or a message that says what is wrong with it."""
-        _, jacobian, off = self.at(z)
+        _, jacobian, off = self.residual(z)
         # The residual of all equations, also redundant ones; equations are scaled to order one.
         if off > self.noise**0.5 * self.size(z):
             return LOST
         return self.described(z, jacobian, self.tangent(jacobian, along))
 
-    def trace(self, start: BranchPoint, most: int, on_step: Callable, first: float = FIRST) -> BranchPath:
-        """Follow a branch until it leaves the range of the parameter, ends or closes.
+    def point_near(self, z, along, row, known=None) -> BranchPoint | None:
+        """The point of a branch to which `corrected` leads; None if there is none."""
+        z = self.corrected(z, row, known)
+        candidate = self.point(z, along) if z is not None else None
+        return candidate if isinstance(candidate, BranchPoint) else None
 
-        `on_step(before, after, path)` finds critical points between two points. It may return why the path ends, or
-        `AGAIN` to request a shorter step.
-        """
-        path, point, step = BranchPath([start]), start, first
-        while len(path.points) < most:
-            tried = step
-            after, step, why = self.next_point(point, tried)
-            if after is None:
-                path.status = why
-                return path
-            outside = not self.low <= after.z[-1] <= self.high
-            if outside:
-                after = self.at_edge(point, after) or after
-            ended = on_step(point, after, path)
-            if ended == AGAIN:
-                step = min(tried, float(np.sqrt(self.weights @ (after.z - point.z) ** 2))) / 4
-                if step > SHORT * self.size(point.z):
-                    continue
-                ended = None
-            if ended:
-                path.status = ended
-                return path
-            path.points.append(after)
-            if outside:
-                path.status = AT_EDGE
-                return path
-            if np.max(np.abs(after.z[: self.positions])) > INFINITY:
-                path.status = "infinity"
-                return path
-            if self.closes(path, step):
-                path.status = "closed"
-                return path
-            point = after
-            self.moved_to(point)
-        path.status = f"the limit of {most} points"
-        return path
-
-    def next_point(self, point: BranchPoint, step: float):
-        """The next point, the step to try after it, and, if there is no point, the reason."""
-        longest = LONGEST * max(1.0, float(np.max(np.abs(point.z[: self.positions]))))
-        why = "Newton's method does not converge, however short the step"
-        while step > LEAST * self.size(point.z):
-            step = min(step, longest)
-            row = self.weights * point.tangent
-            z = self.corrected(point.z + step * point.tangent, row)
-            contraction = self.contraction
-            candidate = self.point(z, point.tangent) if z is not None else None
-            if isinstance(candidate, BranchPoint):
-                turn = np.arccos(np.clip((self.weights * candidate.tangent) @ point.tangent, -1, 1))
-                moved = np.sqrt(self.weights @ (candidate.z - point.z) ** 2)
-                if turn < MOST_TURN and moved < 1.2 * step and contraction < MOST_CONTRACTION:
-                    grow = min(TURN / max(turn, 1e-3), CONTRACTION / max(contraction, 1e-3))
-                    return candidate, step * float(np.clip(grow, 0.5, 2.0)), ""
-                why = "the branch turns more sharply than steps can follow: a corner of L, or a cusp"
-            elif isinstance(candidate, str):
-                why = candidate
-            step /= 3
-        return None, step, why
+    def begin(self, z, towards) -> BranchPoint | str:
+        """The point of a branch with the parameter of z, from which it is followed `towards` (±1) larger ones."""
+        row = np.eye(z.size)[-1]
+        corrected = self.corrected(z, row)
+        return self.point(z if corrected is None else corrected, towards * row)
 
     def between(self, a: BranchPoint, b: BranchPoint, share: float) -> BranchPoint | None:
         """A point of the branch between two others."""
-        row = self.weights * a.tangent
-        guess = a.z + share * (b.z - a.z)
-        z = self.corrected(guess, row)
-        candidate = self.point(z, a.tangent) if z is not None else None
-        return candidate if isinstance(candidate, BranchPoint) else None
+        return self.point_near(a.z + share * (b.z - a.z), a.tangent, self.weights * a.tangent)
+
+    def at_edge(self, a: BranchPoint, b: BranchPoint) -> BranchPoint | None:
+        """The point of the branch at the end of the parameter's range."""
+        edge = self.low if b.z[-1] < self.low else self.high
+        share = np.clip((edge - a.z[-1]) / (b.z[-1] - a.z[-1]), 0.0, 1.0) if b.z[-1] != a.z[-1] else 0.0
+        return self.point_near(a.z + share * (b.z - a.z), a.tangent, np.eye(a.z.size)[-1], edge)
+
+    def halved(self, a: BranchPoint, b: BranchPoint, value: Callable[[BranchPoint], Any], times: int):
+        """Bisect a branch where a count changes: two points much nearer to the change."""
+        low, high, left, right = 0.0, 1.0, a, b
+        for _ in range(times):
+            share = 0.5 * (low + high)
+            middle = self.between(a, b, share) if low < share < high else None
+            if middle is None or value(middle) is None:
+                break
+            if value(middle) == value(left):
+                low, left = share, middle
+            else:
+                high, right = share, middle
+        return left, right
 
     def zero_between(
         self, a: BranchPoint, b: BranchPoint, of: Callable[[BranchPoint], float]
@@ -310,24 +349,6 @@ class Tracer(abc.ABC):
         off = abs(float((zs[1] - zs[0])[-1]))
         return (point, off) if isinstance(point, BranchPoint) else None
 
-    def at_edge(self, a: BranchPoint, b: BranchPoint) -> BranchPoint | None:
-        """The point of the branch at the end of the parameter's range."""
-        edge = self.low if b.z[-1] < self.low else self.high
-        share = np.clip((edge - a.z[-1]) / (b.z[-1] - a.z[-1]), 0.0, 1.0) if b.z[-1] != a.z[-1] else 0.0
-        row = np.zeros_like(a.z)
-        row[-1] = 1.0
-        z = self.corrected(a.z + share * (b.z - a.z), row, edge)
-        candidate = self.point(z, a.tangent) if z is not None else None
-        return candidate if isinstance(candidate, BranchPoint) else None
-
-    def closes(self, path: BranchPath, step: float) -> bool:
-        """Whether a path has returned to its start."""
-        if len(path.points) < 10:
-            return False
-        first, last = path.points[0], path.points[-1]
-        off = np.sqrt(self.weights @ (last.z - first.z) ** 2)
-        return bool(off < max(step, CLOSED_WITHIN) and (self.weights * first.tangent) @ last.tangent > 0.9)
-
 
 def _at_zero(tried):
     """z where the function is zero, by Neville's interpolation of z as a polynomial of the function's value."""
@@ -338,3 +359,19 @@ def _at_zero(tried):
             for i in range(len(zs) - 1)
         ]
     return zs[0]
+
+
+def zero(kind: str, of: Callable[[BranchPoint], float], problem: Problem, a: BranchPoint, b: BranchPoint):
+    """The `CriticalPoint` between two points where a smooth function changes its sign; None if it does not."""
+    found = problem.zero_between(a, b, of)
+    if found is None:
+        return None
+    point, off = found
+    if np.isfinite(off):
+        return CriticalPoint(kind, point.z, off, point=point)
+    # Somewhere between the two points: by a straight line, and how far the parameter changes on the way.
+    share = of(a) / (of(a) - of(b))
+    point = problem.between(a, b, share) or (a if share < 0.5 else b)
+    steepest = max(abs(a.tangent[-1]), abs(b.tangent[-1]))
+    off = max(abs(float((b.z - a.z)[-1])), problem.length(b.z - a.z) * steepest)
+    return CriticalPoint(kind, point.z, float(off), point=point, located=False)

@@ -197,6 +197,17 @@ class Departures(NamedTuple):
     slopes: Float[Array, "m n"]
     pushes: Float[Array, "m n"]
 
+    def independent(self) -> "tuple[Departures, Bool[Array, ' m']]":
+        """The same with zeros in place of constraints that depend on others; and which are kept."""
+        kept = independent_and_not_zero(self.rows)
+        rows, slopes, pushes = (jnp.where(kept[:, None], x, 0.0) for x in (self.rows, self.slopes, self.pushes))
+        return self._replace(rows=rows, slopes=slopes, pushes=pushes), kept
+
+
+def independent_and_not_zero(rows: Float[Array, "m n"]) -> Bool[Array, " m"]:
+    """Which rows are independent of those before; a row of zeros never is."""
+    return independent_rows(rows) & jnp.any(rows != 0, axis=1) if rows.shape[0] else jnp.zeros(0, bool)
+
 
 def departures(s: Steady, y, jacobian) -> Departures:
     """The linear equations of small departures from a steady motion; `jacobian` is the Jacobian of `balance` at y."""
@@ -231,7 +242,7 @@ def directions(s: Steady, d: Departures, y):
     excluded = jnp.concatenate(excluded)
     if not excluded.shape[0]:
         return jnp.eye(2 * n, dtype=rows.dtype), jnp.asarray(2 * n)
-    kept = independent_rows(excluded) & jnp.any(excluded != 0, axis=1)
+    kept = independent_and_not_zero(excluded)
     used = jnp.where(kept[:, None], excluded, 0.0)
     gram = used @ used.T + jnp.diag(jnp.where(kept, 0.0, 1.0))
     return jnp.eye(2 * n, dtype=rows.dtype) - used.T @ _solved(gram, used), 2 * n - jnp.sum(kept)
@@ -251,17 +262,15 @@ def characteristic_roots(s: Steady, y, jacobian, derivatives: bool):
     """
     d, n = departures(s, y, jacobian), s.n
     project, count = directions(s, d, y)
-    m = d.rows.shape[0]
-    kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
-    rows, pushes = jnp.where(kept[:, None], d.rows, 0.0), jnp.where(kept[:, None], d.pushes, 0.0)
-    matrix = jnp.block([[d.mass, -pushes.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0))]])
-    slopes = jnp.where(kept[:, None], d.slopes, 0.0)
-    known = jnp.block([[-d.stiffness, -d.damping], [jnp.zeros_like(rows), -slopes]])
+    d, kept = d.independent()
+    rows = d.rows
+    matrix = jnp.block([[d.mass, -d.pushes.T], [rows, jnp.diag(jnp.where(kept, 0.0, 1.0))]])
+    known = jnp.block([[-d.stiffness, -d.damping], [jnp.zeros_like(rows), -d.slopes]])
     # A coordinate without inertia, such as an azimuth at the pole, has no equation for its small motions.
     sizes = jnp.maximum(jnp.max(jnp.abs(d.mass), axis=1), jnp.max(jnp.abs(rows), axis=0, initial=0.0))
     regular = reciprocal_condition(matrix) > SINGULAR_BELOW[np.dtype(matrix.dtype)]
     regular = regular & (jnp.min(sizes) > jnp.finfo(sizes.dtype).eps ** 1.3 * jnp.max(sizes))
-    accelerations = _solved(jnp.where(regular, matrix, jnp.eye(n + m, dtype=matrix.dtype)), known)[:n]
+    accelerations = _solved(jnp.where(regular, matrix, jnp.eye(len(matrix), dtype=matrix.dtype)), known)[:n]
     unit = jnp.eye(n, dtype=rows.dtype)
     whole = jnp.concatenate([jnp.concatenate([jnp.zeros_like(unit), unit], axis=1), accelerations])
     unit = jnp.eye(2 * n, dtype=rows.dtype)
@@ -276,7 +285,7 @@ def shortest_multipliers(pushes, known):
     """The shortest λ with `Wᵀ λ = known`, W (m, n) of any rank; differentiable where the rank does not change."""
     if not pushes.shape[0]:
         return jnp.zeros(0, pushes.dtype)
-    kept = independent_rows(pushes) & jnp.any(pushes != 0, axis=1)
+    kept = independent_and_not_zero(pushes)
     base = jnp.where(kept[:, None], pushes, 0.0)
     unit = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(pushes.dtype)
     inverted = jnp.linalg.inv(base @ base.T + unit)
@@ -396,9 +405,9 @@ def merged(rows: Equilibria, angle: np.ndarray, radii: np.ndarray) -> Equilibria
     """
     found_rows = np.flatnonzero(np.asarray(rows.found))
     angle = angle & ~np.isin(np.arange(angle.size), rows.symmetries.places)
-    x, u = _columns(rows.q), _columns(rows.v)
+    x, u = side_by_side(rows.q), side_by_side(rows.v)
     x[:, list(rows.symmetries.places)] = 0.0
-    other = np.concatenate([u, _columns(rows.multipliers)], axis=1) if rows.multipliers else u
+    other = np.concatenate([u, side_by_side(rows.multipliers)], axis=1) if rows.multipliers else u
     roots = np.asarray(rows.eigenvalues)
     kept: list[int] = []
     of_start = np.full(len(x), -1)
@@ -436,9 +445,9 @@ def _same_roots(a, b):
     return a.size == b.size and np.all(np.abs(np.abs(a) - np.abs(b)) <= 1e-3 * max(np.abs(a).max(initial=0.0), 1e-300))
 
 
-def _columns(tree):
-    leaves = [np.array(x, float) for x in jax.tree.leaves(tree)]
-    return np.concatenate([x.reshape(x.shape[0], -1) for x in leaves], axis=1)
+def side_by_side(tree: PyTree) -> np.ndarray:
+    """The leaves of a tree as columns of one matrix, with the leading axis that all of them have."""
+    return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(tree)], axis=1)
 
 
 def _lines(found: Equilibria):
@@ -475,7 +484,7 @@ def _row(found, i):
     q, v = pick(found.q), pick(found.v)
     x = np.asarray(coordinates.flatten(q)[0])
     row = {name: _number(x, np.abs(x).max()) for name, x in zip(coordinates.names(q), x)}
-    moves = np.any(np.concatenate([np.asarray(x).reshape(len(found), -1) for x in jax.tree.leaves(found.v)], 1), axis=0)
+    moves = np.any(side_by_side(found.v), axis=0)
     u = coordinates.flatten(v)[0]
     for name, x, shown in zip(coordinates.names(v), u, moves):
         if shown:

@@ -1,37 +1,32 @@
 """How equilibria change with a parameter: branches, where they fold and cross, and where they become unstable.
 
-A branch is traced (`tracing.py`), the critical points between two of its points are solved for (`critical_points.py`),
-and the branches that cross there are traced in turn, each once.
+`critical_points.py` has the equations and what is watched along a branch, `following.py` follows all branches; here
+they get a beginning, units and a table.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float, PyTree
 
-from lagjax.analysis.arclength import AGAIN, FIRST, BranchPath, BranchPoint
-from lagjax.analysis.balance import OK, VELOCITY, WORDS, Steady
-from lagjax.analysis.critical_points import (
-    CriticalPoint,
-    Frame,
-    ParameterPlace,
-    SteadyTracer,
-    between,
-    escape,
-    full_jacobian,
-    place_of,
-)
+from lagjax.analysis.arclength import Along, BranchPoint, range_from
+from lagjax.analysis.balance import OK, VELOCITY, WORDS, Steady, side_by_side
+from lagjax.analysis.critical_points import Frame, SteadyProblem, along_named, full_jacobian, value_in, with_value
 from lagjax.analysis.degenerate import unknowns
 from lagjax.analysis.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
+from lagjax.analysis.following import BranchPath, Follower
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import are_angles, describe, is_autonomous
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
-MARKS = {"fold": ("s", 1), "pitchfork": ("o", 2), "transcritical": ("D", 3), "flutter": ("^", 4)}
+MARKS = {
+    "fold": ("s", 1), "pitchfork": ("o", 2), "transcritical": ("D", 3), "flutter": ("^", 4),
+    "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4),
+}  # fmt: skip
 OTHER_MARK = ("X", 6)
 
 
@@ -86,7 +81,12 @@ class Branch(eqx.Module):
         return len(self.parameter)
 
     def __repr__(self):
-        return f"Branch of {len(self)} points, {stability_in_words(_verdicts(self))}; ends at {self.status}"
+        return f"Branch of {len(self)} points, {stability_in_words(self.verdicts)}; ends at {self.status}"
+
+    @property
+    def verdicts(self) -> np.ndarray:
+        """The stability of each point: STABLE, UNSTABLE or UNKNOWN."""
+        return verdicts_of(self.stable, np.any(np.isfinite(self.eigenvalues), axis=1))
 
 
 class Branches(eqx.Module):
@@ -117,11 +117,9 @@ class Branches(eqx.Module):
         return [c for c in self.critical if c.kind == kind]
 
     def __repr__(self):
-        count = len(self.critical)
-        points = f"{count} critical point{'s' * (count != 1)}" if count else "no critical point"
         lines = [
             f"Branches of equilibria along {self.along}, from {self.first:.6g} to {self.last:.6g}: "
-            f"{len(self.branches)}, with {points}"
+            f"{len(self.branches)}, with {how_many(self.critical)}"
         ]
         width = max([12, *(len(c.kind) for c in self.critical)])
         for c in self.critical:
@@ -135,15 +133,14 @@ class Branches(eqx.Module):
             ends = self._number(low, 6), self._number(high, 6)
             span = f"{self.along} {ends[0]} to {ends[1]}" if ends[0] != ends[1] else f"{self.along} {ends[0]}"
             lines.append(
-                f"  {f'branch {i + 1}':<{width}}  {span:<19}  {stability_in_words(_verdicts(b))}; ends at {b.status}"
+                f"  {f'branch {i + 1}':<{width}}  {span:<19}  {stability_in_words(b.verdicts)}; ends at {b.status}"
             )
         if self.status != "all followed":
             lines.append(f"  {self.status}")
         return "\n".join(lines)
 
     def _number(self, x, digits=10):
-        # A value that is negligible compared with the range is round-off.
-        return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.{digits}g}"
+        return number_in(x, self.last - self.first, digits)
 
     @plot.names_as_they_are()
     def plot(self, *names: str):
@@ -185,7 +182,7 @@ class Branches(eqx.Module):
         return [name for name, x in zip(self.names, spread) if x > 1e-9 * largest][:6] or list(self.names[:1])
 
     def _curves(self):
-        return [_columns(b.q, len(b)) for b in self.branches]
+        return [side_by_side(b.q) for b in self.branches]
 
     def draw(self, axis, name: str | None = None):
         """Draw one coordinate, by default the first, on matplotlib axes, as `plot` does."""
@@ -193,19 +190,15 @@ class Branches(eqx.Module):
         inner = []
         for i, (branch, x) in enumerate(zip(self.branches, curves)):
             colour = plot.COLOURS[i % (len(plot.COLOURS) - 1)]
-            draw_by_stability(axis, branch.parameter, x[:, j], _verdicts(branch), colour)
+            draw_by_stability(axis, branch.parameter, x[:, j], branch.verdicts, colour)
             inner.append(x[:, j])
-        name_stability(axis, [_verdicts(branch) for branch in self.branches])
+        name_stability(axis, [branch.verdicts for branch in self.branches])
         for c in self.critical:
             y = coordinates.flatten(c.q)[0][j]
             if c.kind == "escape":
                 axis.axvline(float(c.parameter), color="0.4", linestyle=":", linewidth=1.2, label="escape to infinity")
                 continue
-            marker, colour = MARKS.get(c.kind, OTHER_MARK)
-            axis.plot(
-                float(c.parameter), float(y), marker, color=plot.COLOURS[colour], markeredgecolor="white",
-                markersize=7, linestyle="", label=c.kind, zorder=4,
-            )  # fmt: skip
+            draw_critical(axis, c, y)
         if any("infinity" in b.status for b in self.branches):
             near = np.concatenate([x[self._in_view(b)] for b, x in zip(self.branches, inner)])
             middle, half = 0.5 * (near.min() + near.max()), 0.55 * np.ptp(near)
@@ -222,20 +215,15 @@ def _all_handles(axes):
     return handles, labels
 
 
-def _columns(tree, rows):
-    return np.concatenate([np.asarray(x).reshape(rows, -1) for x in jax.tree.leaves(tree)], axis=1)
-
-
 UNKNOWN, UNSTABLE, STABLE = -1, 0, 1
 LOOKS = {
     STABLE: ("stable", "-", 1.8), UNSTABLE: ("unstable", "--", 1.3), UNKNOWN: ("stability not known", ":", 1.3)
 }  # fmt: skip
 
 
-def _verdicts(branch):
+def verdicts_of(stable, known) -> np.ndarray:
     """The stability of each point: STABLE, UNSTABLE or UNKNOWN."""
-    known = np.any(np.isfinite(branch.eigenvalues), axis=1)
-    return np.where(known, np.asarray(branch.stable).astype(int), UNKNOWN)
+    return np.where(known, np.where(stable, STABLE, UNSTABLE), UNKNOWN)
 
 
 def runs(verdicts):
@@ -259,6 +247,27 @@ def name_stability(axis, verdicts):
             axis.plot([], [], dash, color="0.2", label=label)
 
 
+def draw_critical(axis, critical, y):
+    """Mark a critical point at this height; the first of its kind gets a name."""
+    marker, colour = MARKS.get(critical.kind, OTHER_MARK)
+    axis.plot(
+        float(critical.parameter), float(y), marker, color=plot.COLOURS[colour], markeredgecolor="white",
+        markersize=7, linestyle="", zorder=4,
+        label=None if critical.kind in axis.get_legend_handles_labels()[1] else critical.kind,
+    )  # fmt: skip
+
+
+def how_many(critical: list) -> str:
+    """The number of critical points in words."""
+    count = len(critical)
+    return f"{count} critical point{'s' * (count != 1)}" if count else "no critical point"
+
+
+def number_in(x, extent, digits=10) -> str:
+    """A value of a parameter; one that is negligible compared with the extent of its range is round-off."""
+    return f"{0.0 if abs(x) < 1e-13 * abs(extent) else float(x):.{digits}g}"
+
+
 def stability_in_words(verdicts):
     """The stability along a branch in words, from its first point to its last."""
     kinds = [LOOKS[verdict][0] for _, verdict in runs(verdicts)]
@@ -267,17 +276,12 @@ def stability_in_words(verdicts):
     return ", then ".join(kinds)
 
 
-# Critical points closer than this are the same.
-SAME = 1e-5
-MOST_BRANCHES = 24
 # The rank of the equations is computed again this far along the parameter, as a fraction of its range.
 NEARBY = 1.234e-3
 DEPENDENT = 1e-9
 # A start near zero does not show the size of the coordinates: a branch that goes to infinity in small units is traced
 # again in larger ones, until a unit of the positions exceeds the second number.
 UNITS, NOTHING = (1.0, 1e3, 1e6, 1e9, 1e12), 1e-2
-# A branch whose last so many points agree in the parameter to this accuracy is a line of equilibria.
-LINE, LINE_WITHIN = 40, 1e-9
 
 
 @by_name('lj.continue_equilibria(system, params, start, along="omega", to=5.0)', "along", "to")
@@ -345,25 +349,24 @@ def continue_equilibria(
     steady = Steady(model, s.t, np.zeros(symmetries.count, s.t.dtype), x0, symmetries)
     held = _held(steady, coordinates.vector(s.q), coordinates.vector(s.v)) if symmetries.count else steady.held
     steady = Steady(model, s.t, held, x0, symmetries)
-    place = place_of(steady, along)
-    first, last = float(place.get(steady)), float(to)
-    if not np.isfinite(last) or first == last:
-        raise ValueError(
-            f"to={to} leaves the parameter {along!r} no range: it starts at {first:.6g}.\n"
-            f"Fix: to={2 * first or 1.0:.6g}, and the first value in params."
-        )
+    place = along_named(steady, along)
+    first = float(value_in(steady, place))
+    last = range_from(first, to, along, "params")
     runs = []
     for units in UNITS:
         frame, z = _frame(steady, place, first, last, s.v, units)
         # If the start is a critical point, the branch begins a little before it.
-        low, high = sorted((float(z[-1]), last / abs(last - first)))
-        runs.append(_Run(SteadyTracer(frame, low, high), most_points, crossings))
-        runs[-1].main(z, np.sign(last - first))
+        problem = SteadyProblem(frame, *sorted((float(z[-1]), last / abs(last - first))))
+        begin = problem.begin(z, np.sign(last - first))
+        if isinstance(begin, str):
+            raise ValueError(f"the branch cannot begin at the start: {begin}.")
+        runs.append(Follower(problem, most_points, crossings))
+        runs[-1].follow(begin)
         if "infinity" not in runs[-1].paths[0].status:
-            return runs[-1].result(along, first, last, s)
+            return _result(runs[-1], first, last, s)
         if np.max(frame.columns[: steady.n]) > NOTHING:
             break
-    return runs[0].result(along, first, last, s)
+    return _result(runs[0], first, last, s)
 
 
 @compiled
@@ -393,9 +396,7 @@ def _solution(steady: Steady, v: PyTree) -> np.ndarray | str:
     return unknowns(row)
 
 
-def _frame(
-    steady: Steady, place: ParameterPlace, first: float, last: float, v: PyTree, units
-) -> tuple[Frame, np.ndarray]:
+def _frame(steady: Steady, place: Along, first: float, last: float, v: PyTree, units) -> tuple[Frame, np.ndarray]:
     """The units and the combinations of equations that are solved; and the point at which the branch begins."""
     y, x0 = _solution(steady, v), steady.model.tree(steady.x0)
     if isinstance(y, str):
@@ -414,7 +415,7 @@ def _frame(
     rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
     # More equations are dependent at a critical point than elsewhere, so the rank is computed again close by.
     nearby = Steady(steady.model, steady.t, steady.held, np.asarray(y[:n], steady.t.dtype), steady.symmetries)
-    nearby = place.put(nearby, first + NEARBY * (last - first))
+    nearby = with_value(nearby, place, first + NEARBY * (last - first))
     nearby_y = _solution(nearby, v)
     if not isinstance(nearby_y, str):
         _, _, *nearby_svd = _parts(nearby, nearby_y, positions, (rows, columns))
@@ -422,7 +423,7 @@ def _frame(
             u, sizes, vt = nearby_svd
             rank = int(np.sum(sizes > DEPENDENT * sizes[0]))
             before = first - NEARBY * (last - first)
-            earlier = _solution(place.put(nearby, before), v)
+            earlier = _solution(with_value(nearby, place, before), v)
             first, y = (first, y) if isinstance(earlier, str) else (before, earlier)
     dtype = steady.t.dtype
     arrays = [np.asarray(a, dtype) for a in (u[:, :rank].T, vt[rank:], y / columns, rows, columns, unit)]
@@ -452,187 +453,39 @@ def _parts(steady, y, positions, units=None):
     return rows, columns, u, sizes, vt
 
 
-class _Launch(NamedTuple):
-    """A branch still to be traced, from a critical point in a direction."""
-
-    critical: int
-    direction: np.ndarray
-
-
-class _Run:
-    """The branches and critical points found so far, and the branches still to be traced."""
-
-    def __init__(self, tracer: SteadyTracer, most: int, crossings: bool):
-        self.tracer, self.most, self.crossings = tracer, most, crossings
-        self.paths: list[BranchPath] = []
-        self.found: list[CriticalPoint] = []
-        self.branches_at: list[set[int]] = []
-        self.waiting: list[_Launch] = []
-
-    def main(self, z, towards):
-        """Trace the first branch, and all that cross."""
-        start = np.zeros_like(z)
-        start[-1] = towards
-        corrected = self.tracer.corrected(z, np.eye(z.size)[-1])
-        begin = self.tracer.point(z if corrected is None else corrected, start)
-        if isinstance(begin, str):
-            raise ValueError(f"the branch cannot begin at the start: {begin}.")
-        self._follow(begin)
-        while self.waiting and len(self.paths) < MOST_BRANCHES:
-            launch = self.waiting.pop(0)
-            halves = [self._from(launch, sign) for sign in (1.0, -1.0)]
-            whole = _joined(halves)
-            if whole.points[1:]:
-                self.paths.append(whole)
-            else:
-                for branches_at in self.branches_at:
-                    branches_at.discard(len(self.paths))
-
-    def _follow(self, begin: BranchPoint):
-        path = self.tracer.trace(begin, self.most, self._step)
-        self._describe_infinity(path)
-        self.paths.append(path)
-
-    def _from(self, launch: _Launch, sign: float) -> BranchPath:
-        """Trace one half of a branch that crosses another."""
-        critical = self.found[launch.critical]
-        jacobian = self.tracer.at(critical.z)[1]
-        point = self.tracer.point(critical.z, sign * launch.direction)
-        if isinstance(point, str):
-            return BranchPath([], point)
-        begin = BranchPoint(
-            critical.z, jacobian, sign * launch.direction, 0.0, point.outputs, None, point.negative, launch.critical
-        )
-        path = self.tracer.trace(begin, self.most, self._step, FIRST)
-        self._describe_infinity(path)
-        return path
-
-    def _describe_infinity(self, path):
-        """State where a branch goes to infinity, with a critical point if the parameter there can be solved for."""
-        if path.status != "infinity":
-            return
-        point, name = path.points[-1], self.tracer.frame.place.name
-        path.status = f"infinity, near {name} = {point.z[-1] * self.tracer.unit:.6g}"
-        found = escape(self.tracer, point)
-        if found:
-            path.status = f"infinity, at {name} = {found.z[-1] * self.tracer.unit:.10g}"
-            self.found.append(found)
-            self.branches_at.append({len(self.paths)})
-
-    def _step(self, before: BranchPoint, after: BranchPoint, path: BranchPath) -> str | None:
-        """Put the critical points between two points into the path; return why the branch ends, or None."""
-        points = path.points
-        if len(points) >= LINE and points[0].critical is not None:
-            last = np.array([p.z[-1] for p in points[-LINE:]])
-            if np.ptp(last) < LINE_WITHIN:
-                self.found[points[0].critical].kind = "line of equilibria"
-                return "a line of equilibria, which goes on"
-        ended = None
-        # A turn that was not located, in a step past a crossing, is that crossing.
-        all_critical = [c for c in between(self.tracer, before, after) if c.located or not self._crosses(before, after)]
-        if before.sign * after.sign < 0 and not any(critical.directions for critical in all_critical):
-            return AGAIN
-        for critical in all_critical:
-            number, known = self._number(critical)
-            kept = self.found[number]
-            along = (self.tracer.weights * (after.z - before.z)) / np.linalg.norm(after.z - before.z)
-            self.branches_at[number].add(len(self.paths))
-            if known and any(abs(_cosine(self.tracer, d, after.z - before.z)) > 0.95 for d in kept.used):
-                if kept.directions:
-                    ended = f"a known crossing, at {self._value(kept)}"
-            followed = max(kept.directions, key=lambda d: abs(d @ along)) if kept.directions else None
-            if followed is not None:
-                kept.used.append(followed)
-                self.waiting = [w for w in self.waiting if w.critical != number or abs(w.direction @ along) <
-                                0.95 * np.sqrt(along @ along)]  # fmt: skip
-                if not known and self.crossings:
-                    others = [d for d in kept.directions if d is not followed]
-                    self.waiting += [_Launch(number, d) for d in others]
-                    kept.used += others
-            path.points.append(self._point(kept, number, after))
-        return ended
-
-    def _crosses(self, before: BranchPoint, after: BranchPoint) -> bool:
-        """Whether a known critical point is as near to a point as another one."""
-        length = lambda z: np.sqrt(self.tracer.weights @ z**2)
-        return any(length(found.z - before.z) <= 2 * length(after.z - before.z) for found in self.found)
-
-    def _value(self, found):
-        return f"{self.tracer.frame.place.name} = {found.z[-1] * self.tracer.unit:.6g}"
-
-    def _point(self, found, number, after):
-        """The point of a branch at a critical point."""
-        point = self.tracer.point(found.z, after.tangent)
-        if isinstance(point, str):
-            point = after
-        return BranchPoint(
-            found.z, point.jacobian, after.tangent, after.sign, point.outputs, None, after.negative, number
-        )
-
-    def _number(self, found: CriticalPoint) -> tuple[int, bool]:
-        """The number of a critical point among those found, and whether it was known already."""
-        for i, other in enumerate(self.found):
-            if np.max(np.abs(self.tracer.weights * (other.z - found.z))) < SAME * self.tracer.size(found.z):
-                return i, True
-        self.found.append(found)
-        self.branches_at.append(set())
-        return len(self.found) - 1, False
-
-    def result(self, along, first, last, s) -> Branches:
-        """The result in the user's structure."""
-        branches = [_branch(path, self.tracer) for path in self.paths]
-        critical = [self._critical(i) for i in range(len(self.found))]
-        order = sorted(range(len(critical)), key=lambda i: abs(critical[i].parameter - first))
-        names = coordinates.names(s.q)
-        status = "all followed" if not self.waiting else f"{len(self.waiting)} crossing branches were not followed"
-        return Branches(
-            branches, [critical[i] for i in order], along, float(first), float(last), tuple(names), s.params,
-            status,
-        )  # fmt: skip
-
-    def _critical(self, i) -> Critical:
-        found = self.found[i]
-        branches_at = {k for k in self.branches_at[i] if k < len(self.paths)}
-        branches_at |= {k for k, path in enumerate(self.paths) if any(p.critical == i for p in path.points)}
-        point = self.tracer.point(found.z, self._some_direction(found))
-        outputs = point.outputs if not isinstance(point, str) else None
-        outputs = outputs or jax.tree.map(lambda x: x * np.nan, self.paths[0].points[0].outputs)
-        value = found.z[-1] * self.tracer.unit
-        _, q, v, multipliers, _ = outputs
-        if found.kind == "escape":
-            q = jax.tree.map(lambda x: np.full_like(x, np.inf), q)
-        return Critical(
-            found.kind, np.asarray(value), q, v, multipliers, found.derivative, np.asarray(found.frequency),
-            np.asarray(found.accuracy * self.tracer.unit), tuple(sorted(branches_at)),
-        )  # fmt: skip
-
-    def _some_direction(self, found):
-        return found.directions[0] if found.directions else np.ones_like(found.z)
+def _result(run: Follower, first: float, last: float, s: State) -> Branches:
+    """The result in the user's structure."""
+    critical = [_critical(run, i) for i in range(len(run.found))]
+    critical.sort(key=lambda c: abs(c.parameter - first))
+    status = "all followed" if not run.waiting else f"{len(run.waiting)} crossing branches were not followed"
+    return Branches(
+        [_branch(path) for path in run.paths], critical, run.problem.along.name, float(first), float(last),
+        tuple(coordinates.names(s.q)), s.params, status,
+    )  # fmt: skip
 
 
-def _cosine(tracer, a, b):
-    def inner(a: np.ndarray, b: np.ndarray) -> float:
-        return (tracer.weights * a) @ b
-
-    return inner(a, b) / np.sqrt(inner(a, a) * inner(b, b))
-
-
-def _joined(halves: list[BranchPath]) -> BranchPath:
-    """Join both halves of a branch, from one end through the critical point to the other end."""
-    first, second = halves
-    points = [*second.points[:0:-1], *first.points]
-    status = first.status if not second.points[1:] else f"{second.status}, and {first.status}"
-    if first.status == second.status:
-        status = first.status
-    return BranchPath(points, status)
+def _critical(run: Follower, i: int) -> Critical:
+    found, unit = run.found[i], run.problem.unit
+    if found.point is not None:
+        outputs = found.point.outputs
+    else:
+        outputs = jax.tree.map(lambda x: x * np.nan, run.paths[0].points[0].outputs)
+    q = jax.tree.map(lambda x: np.full_like(x, np.inf), outputs.q) if found.kind == "escape" else outputs.q
+    return Critical(
+        found.kind, np.asarray(found.z[-1] * unit), q, outputs.v, outputs.multipliers, found.derivative,
+        np.asarray(found.frequency), np.asarray(found.accuracy * unit),
+        tuple(k for k, path in enumerate(run.paths) if i in path.through),
+    )  # fmt: skip
 
 
-def _branch(path: BranchPath, tracer: SteadyTracer) -> Branch:
-    outputs = [p.outputs for p in path.points]
-    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *outputs)
-    stable = np.array([p.growing for p in path.points], object)
-    # At a critical point a root is zero up to round-off, so the nearest other point decides the stability.
-    known = [i for i, n in enumerate(stable) if n is not None]
-    filled = [stable[min(known, key=lambda j: (abs(j - i), -j))] if known else 0 for i in range(len(stable))]
+def _branch(path: BranchPath) -> Branch:
+    parameter, q, v, multipliers, roots = jax.tree.map(lambda *x: np.stack(x), *(p.outputs for p in path.points))
     critical = tuple(sorted({p.critical for p in path.points if p.critical is not None}))
-    return Branch(parameter, q, v, multipliers, np.array([n == 0 for n in filled]), roots, path.status, critical)
+    return Branch(parameter, q, v, multipliers, stable_along(path.points), roots, path.status, critical)
+
+
+def stable_along(points: list[BranchPoint]) -> np.ndarray:
+    """Whether each point of a branch is known to be stable, by the nearest point that is not critical."""
+    known = [i for i, point in enumerate(points) if point.growing is not None]
+    nearest = [min(known, key=lambda j: (abs(j - i), -j), default=None) for i in range(len(points))]
+    return np.array([j is not None and points[j].growing == 0 for j in nearest])

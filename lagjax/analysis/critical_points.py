@@ -41,42 +41,50 @@ is transcritical.
 Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §5.20-5.26; Govaerts, ch. 3.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax.analysis import balance as equations
-from lagjax.analysis.arclength import BranchPoint, Number, Tracer, no_such_number, numbers_in
+from lagjax.analysis.arclength import (
+    NUMBER,
+    Along,
+    BranchPoint,
+    CriticalPoint,
+    Monitor,
+    Problem,
+    count_changes,
+    no_such_number,
+    numbers_in,
+    sign_changes,
+)
 from lagjax.analysis.balance import Steady
 from lagjax.analysis.equilibria import GROWS_ABOVE
 from lagjax.jaxtools import compiled
-from lagjax.numerics import independent_rows, newton_in_python
+from lagjax.numerics import newton_in_python
 
 FOLD, BRANCH, MULTIPLE, FLUTTER, COLLISION, ESCAPE = "fold", "branch", "multiple", "flutter", "collision", "escape"
 
 
-class ParameterPlace(eqx.Module):
-    """The location of a branch's parameter: a number in `params`, or a held rate or momentum (`of_params` is None)."""
+HELD = "held"
 
-    name: str = eqx.field(static=True)
-    of_params: Number | None
-    entry: int = eqx.field(static=True, default=0)
 
-    def put(self, s: Steady, value) -> Steady:
-        """The problem with this value of the parameter."""
-        if self.of_params is None:
-            return replace(s, held=s.held.at[self.entry].set(value))
-        return s.of(self.of_params.put(s.params, value))
+def with_value(steady: Steady, along: Along, value) -> Steady:
+    """The problem with this value of the parameter: a number in `params`, or a held rate or momentum."""
+    if along.number is None:
+        return replace(steady, held=steady.held.at[along.entry].set(value))
+    return steady.of(along.number.put(steady.params, value))
 
-    def get(self, s: Steady):
-        """The value of the parameter in the problem."""
-        return s.held[self.entry] if self.of_params is None else self.of_params.get(s.params)
+
+def value_in(steady: Steady, along: Along):
+    """The value of the parameter in the problem."""
+    return steady.held[along.entry] if along.number is None else along.number.get(steady.params)
 
 
 class Frame(eqx.Module):
@@ -93,11 +101,11 @@ class Frame(eqx.Module):
     rows: Float[Array, " R"]
     columns: Float[Array, " N"]
     unit: Float[Array, ""]
-    place: ParameterPlace
+    along: Along
 
     def split(self, z):
         """The problem at a point, and its unknowns in the user's units."""
-        return self.place.put(self.steady, z[-1] * self.unit), z[:-1] * self.columns
+        return with_value(self.steady, self.along, z[-1] * self.unit), z[:-1] * self.columns
 
     def residual(self, z):
         """E(y, μ)."""
@@ -106,19 +114,19 @@ class Frame(eqx.Module):
         return jnp.concatenate([self.combinations @ full, self.free @ (z[:-1] - self.reference)])
 
 
-def place_of(steady: Steady, along: str) -> ParameterPlace:
+def along_named(steady: Steady, name: str) -> Along:
     """Find a parameter by name, `"omega"`, `"spring.k"`, `"k[1]"`; or a held rate `"v.psi"` or momentum `"p.psi"`."""
     names = steady.model.names
     for kind, hold in (("v", equations.VELOCITY), ("p", equations.MOMENTUM)):
         held_names = [f"{kind}.{names[i]}" if names[i] != "q" else kind for i in steady.symmetries.places]
         held_names = held_names or [f"{kind}[{i}]" for i in range(steady.symmetries.count)]
-        if along in held_names and steady.symmetries.hold == hold:
-            return ParameterPlace(along, None, held_names.index(along))
+        if name in held_names and steady.symmetries.hold == hold:
+            return Along(name, HELD, None, held_names.index(name))
     numbers = numbers_in(steady.params)
-    if along not in numbers:
+    if name not in numbers:
         more = 'and "v.psi" for the velocity of a cyclic coordinate psi that is held (with hold="momentum": "p.psi")'
-        raise no_such_number(along, steady.params, more)
-    return ParameterPlace(along, numbers[along])
+        raise no_such_number(name, steady.params, more)
+    return Along(name, NUMBER, numbers[name])
 
 
 @compiled
@@ -136,9 +144,19 @@ def full_jacobian(steady: Steady, y):
     return equations.balance(steady, y), jax.jacfwd(lambda y: equations.balance(steady, y))(y)
 
 
+class SteadyOutputs(NamedTuple):
+    """The outputs of a point: the state, by name its multipliers, and the characteristic roots of its small motions."""
+
+    parameter: Array
+    q: PyTree
+    v: PyTree
+    multipliers: dict[str, Array]
+    roots: Array
+
+
 @compiled
-def outputs_at(frame: Frame, z):
-    """The outputs of a point: parameter, q, v, multipliers, and the characteristic roots of its small motions."""
+def outputs_at(frame: Frame, z) -> SteadyOutputs:
+    """The outputs of a point."""
     s, y = frame.split(z)
     x, rates, multipliers = s.parts(y)
     u = s.velocity(x, rates)
@@ -148,7 +166,7 @@ def outputs_at(frame: Frame, z):
     by_name = s.model.split(multipliers) if s.m else {}
     jacobian = jax.jacfwd(lambda y: equations.balance(s, y))(y)
     roots = equations.characteristic_roots(s, y, jacobian, derivatives=False)
-    return z[-1] * frame.unit, s.model.tree(x), s.model.tree(u), by_name, roots
+    return SteadyOutputs(z[-1] * frame.unit, s.model.tree(x), s.model.tree(u), by_name, roots)
 
 
 @compiled
@@ -161,18 +179,12 @@ def dynamic(frame: Frame, z):
     """K, C, M of `D(s)`, bordered by the independent constraints."""
     s, y = frame.split(z)
     d = equations.departures(s, y, jax.jacfwd(lambda y: equations.balance(s, y))(y))
-    m = d.rows.shape[0]
-    kept = independent_rows(d.rows) & jnp.any(d.rows != 0, axis=1) if m else jnp.zeros(0, bool)
-
-    def keep(rows: Array):
-        return jnp.where(kept[:, None], rows, 0.0)
-
-    holonomic = s.model.holonomic[:, None]
-    rows, slopes, none = keep(d.rows), keep(d.slopes), jnp.zeros((s.n, m), d.rows.dtype)
+    d, kept = d.independent()
+    holonomic, none = s.model.holonomic[:, None], jnp.zeros_like(d.rows.T)
     corner = jnp.diag(jnp.where(kept, 0.0, 1.0)).astype(d.rows.dtype)
-    stiffness = jnp.block([[d.stiffness, -keep(d.pushes).T], [jnp.where(holonomic, rows, slopes), corner]])
-    damping = jnp.block([[d.damping, none], [jnp.where(holonomic, 0.0, rows), 0 * corner]])
-    mass = jnp.block([[d.mass, none], [0 * rows, 0 * corner]])
+    stiffness = jnp.block([[d.stiffness, -d.pushes.T], [jnp.where(holonomic, d.rows, d.slopes), corner]])
+    damping = jnp.block([[d.damping, none], [jnp.where(holonomic, 0.0, d.rows), 0 * corner]])
+    mass = jnp.block([[d.mass, none], [0 * d.rows, 0 * corner]])
     return stiffness, damping, mass
 
 
@@ -242,330 +254,65 @@ def extended_by_params(kind: str, frame: Frame, big, guide):
     return jax.jacfwd(residual)(floats)
 
 
-class SteadyTracer(Tracer):
-    """Steady motions of a `Frame`. `fastest`: the size of the fastest root so far, the unit of the roots' round-off."""
-
-    def __init__(self, frame: Frame, low: float, high: float):
-        super().__init__(low, high)
-        self.frame, self.fastest = frame, 0.0
-        size, self.positions = frame.columns.size, frame.steady.n
-        self.weights = np.zeros(size + 1)
-        self.weights[: self.positions] = 1.0
-        self.weights[-1] = 1.0
-        self.dtype = np.dtype(frame.columns.dtype)
-        self.unit = float(frame.unit)
-
-    def at(self, z):
-        value, jacobian, largest = jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
-        return value, jacobian, float(largest)
-
-    def described(self, z, jacobian, tangent) -> BranchPoint:
-        outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
-        sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
-        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
-        return BranchPoint(z, jacobian, tangent, float(sign), outputs, self._growing(outputs[-1]), negative)
-
-    def _growing(self, roots) -> int | None:
-        """The number of growing roots; None if the roots are not known."""
-        known = roots[np.isfinite(roots)]
-        if not known.size:
-            return None
-        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
-        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))
-
-
-NEWTON = 12
+# Newton's method for extended systems takes at most so many steps; a count is bisected so often before it begins.
+NEWTON, HALVINGS = 12, 14
 # A direction whose component along the parameter is smaller leaves the parameter constant.
 ACROSS = 1e-5
-# Changes of the parameter below this fraction of its range count as none.
-CONSTANT = 1e-9
 # Branches meet where the unfolding β of a branch point is smaller; the equations are scaled to order one.
 MEETS = 1e-8
+# A branch whose last so many points agree in the parameter to this accuracy is a line of equilibria.
+LINE, LINE_WITHIN = 40, 1e-9
 
 
-@dataclass
-class CriticalPoint:
-    """A critical point: its kind, z, the tangents of crossing branches, a frequency, the parameter's derivatives."""
+class _Solution(NamedTuple):
+    """A solution `big` of the extended system of a kind: z and null vectors; `accuracy` is the last step of μ."""
 
+    problem: "SteadyProblem"
     kind: str
-    z: np.ndarray
-    directions: list[np.ndarray]
-    frequency: float
-    derivative: Any
+    big: np.ndarray
+    guide: np.ndarray
     accuracy: float
-    used: list[np.ndarray]
-    located: bool = True
+
+    @property
+    def z(self) -> np.ndarray:
+        return self.big[: self.problem.frame.columns.size + 1]
+
+    @property
+    def rest(self) -> np.ndarray:
+        return self.big[self.problem.frame.columns.size + 1 :]
+
+    def named(self, kind: str, **more) -> CriticalPoint:
+        """The critical point, with the derivatives of its parameter by every number in `params`."""
+        return CriticalPoint(kind, self.z, self.accuracy, derivative=self._derivative(), **more)
+
+    def _derivative(self):
+        given = self.kind, self.problem.frame, *self.problem.cast(self.big, self.guide)
+        _, jacobian = extended_at(*given)
+        by_params = extended_by_params(*given)
+        leaves, structure = jax.tree.flatten(by_params)
+        if not leaves:
+            return by_params
+        flat = np.concatenate([np.asarray(x, float).reshape(np.shape(x)[0], -1) for x in leaves], axis=1)
+        of_parameter = _least_squares(np.asarray(jacobian, float), flat)[self.z.size - 1]
+        slopes = -self.problem.unit * of_parameter
+        places = np.cumsum([0, *(np.asarray(x)[0].size for x in leaves)])
+        parts = [slopes[i:j].reshape(np.shape(x)[1:]) for i, j, x in zip(places, places[1:], leaves)]
+        return jax.tree.unflatten(structure, parts)
 
 
-def between(tracer: SteadyTracer, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
-    """All critical points between two neighbouring points of a branch."""
-    found = []
-    if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
-        # On a line of equilibria only round-off changes.
-        return []
-    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
-    if crosses and (point := _branch_point(tracer, a, b)):
-        found.append(point)
-    if folds and not found:
-        found.append(_fold(tracer, a, b))
-    known = a.growing is not None and b.growing is not None
-    if known and a.growing != b.growing and not found and (point := _loses_stability(tracer, a, b)):
-        found.append(point)
-    if not found and (a.negative - b.negative) % 2 == 0 and a.negative != b.negative:
-        point = _multiple_zero(tracer, *_halved(tracer, a, b, lambda p: p.negative))
-        found += [point] if point else []
-    return found
-
-
-def _halved(tracer, a, b, count_of):
-    """Bisect a branch between a and b, where a count changes: two points much nearer to the change."""
-    low, high, left, right = 0.0, 1.0, a, b
-    for _ in range(14):
-        share = 0.5 * (low + high)
-        middle = tracer.between(a, b, share)
-        if middle is None or count_of(middle) is None:
-            break
-        if count_of(middle) == count_of(left):
-            low, left = share, middle
-        else:
-            high, right = share, middle
-    return left, right
-
-
-def _null_vectors(jacobian):
-    """Approximate left and right null vectors of E_y."""
-    u, _, vt = np.linalg.svd(jacobian[:, :-1])
-    return u[:, -1], vt[-1]
-
-
-def _guess_between(tracer, a, b, share):
-    """A first guess for z between two points."""
-    share = float(np.clip(share, 0.02, 0.98))
-    point = tracer.between(a, b, share)
-    return point.z if point else a.z + share * (b.z - a.z)
-
-
-def _inside(tracer, a, b, z):
-    """Whether a solution lies between the points, or nearly so."""
-    step = b.z - a.z
-    length = np.sqrt(tracer.weights @ step**2)
-    share = (tracer.weights * step) @ (z - a.z) / length**2
-    aside = z - a.z - share * step
-    return -0.2 < share < 1.2 and np.sqrt(tracer.weights @ aside**2) < 0.5 * length
-
-
-def _branch_point(tracer, a, b):
-    sizes = [np.linalg.slogdet(np.concatenate([p.jacobian, (tracer.weights * p.tangent)[None]]))[1] for p in (a, b)]
-    share = 1 / (1 + np.exp(np.clip(sizes[1] - sizes[0], -50, 50)))
-    z = _guess_between(tracer, a, b, share)
-    psi, _ = _null_vectors(tracer.at(z)[1])
-    big = _newton(tracer, BRANCH, np.concatenate([z, psi, [0.0]]), np.zeros(1))
-    if big is None or not _inside(tracer, a, b, big[0][: z.size]):
-        return None
-    big, accuracy = big
-    if abs(big[-1]) > MEETS:
-        return None
-    directions = _directions(tracer, big)
-    if not directions:
-        return None
-    kind = "pitchfork" if any(abs(t[-1]) < ACROSS for t in directions) else "transcritical"
-    return CriticalPoint(
-        kind, big[: z.size], directions, 0.0, _derivative(tracer, BRANCH, big, np.zeros(1)), accuracy, []
-    )
-
-
-def _directions(tracer, big):
-    """The unit tangents of both branches through a branch point."""
-    n = tracer.frame.columns.size
-    z, psi = big[: n + 1], big[n + 1 : 2 * n + 1]
-    jacobian = tracer.at(z)[1]
-    basis = np.linalg.svd(jacobian)[2][-2:]
-
-    def form(i: int, j: int) -> float:
-        return float(psi @ np.asarray(curvature(tracer.frame, *tracer.cast(z, basis[i], basis[j]))))
-
-    a, b, c = form(0, 0), form(0, 1), form(1, 1)
-    disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
-    if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
-        return []
-    # This form gives both roots without cancellation.
-    root = -(b + np.copysign(np.sqrt(disc), b))
-    pairs = [(root, a), (c, root)]
-    tangents = []
-    for alpha, beta in pairs:
-        t = alpha * basis[0] + beta * basis[1]
-        tangents.append(t / np.sqrt(tracer.weights @ t**2))
-    return tangents
-
-
-def _fold(tracer, a, b):
-    share = a.tangent[-1] / (a.tangent[-1] - b.tangent[-1])
-    z = _guess_between(tracer, a, b, share)
-    psi, phi = _null_vectors(tracer.at(z)[1])
-    solved = _newton(tracer, FOLD, np.concatenate([z, psi]), np.zeros(1))
-    if solved is None or not _inside(tracer, a, b, solved[0][: z.size]):
-        off = np.sqrt(tracer.weights @ (b.z - a.z) ** 2) * max(abs(a.tangent[-1]), abs(b.tangent[-1]))
-        return CriticalPoint("fold", z, [], 0.0, None, float(off), [], located=False)
-    big, accuracy = solved
-    return CriticalPoint("fold", big[: z.size], [], 0.0, _derivative(tracer, FOLD, big, np.zeros(1)), accuracy, [])
-
-
-def escape(tracer: SteadyTracer, point: BranchPoint) -> CriticalPoint | None:
-    """The critical point where the solution of linear equations goes to infinity, from a point far out."""
-    n = tracer.frame.columns.size
-    half, here = point.z.copy(), tracer.at(point.z)[1][:, :-1]
-    half[:n] *= 0.5
-    # The equations are linear if the Jacobian is the same halfway.
-    if np.max(np.abs(tracer.at(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
-        return None
-    psi = np.linalg.svd(here)[0][:, -1]
-    guide = np.append(np.zeros(n), 0.0)
-    start = np.concatenate([np.zeros(n), point.z[-1:], psi])
-    solved = _newton(tracer, ESCAPE, start, guide)
-    if solved is None:
-        return None
-    big, accuracy = solved
-    z = np.concatenate([point.z[:n], big[n : n + 1]])
-    return CriticalPoint("escape", z, [], 0.0, _derivative(tracer, ESCAPE, big, guide), accuracy, [])
-
-
-def _loses_stability(tracer, a, b):
-    """Where the number of growing roots changes without a crossing branch or a fold: flutter, or several zeros."""
-    left, right = _halved(tracer, a, b, lambda p: p.growing)
-    few, many = (left, right) if left.growing < right.growing else (right, left)
-    root = _newly_growing_root(few, many)
-    size = np.nanmax(np.abs(many.outputs[-1]))
-    if abs(root.imag) < 1e-3 * abs(size) and abs(root.imag) <= 30 * abs(root.real):
-        return _multiple_zero(tracer, few, many) or _divergence(tracer, a, b, few, many)
-    return _flutter(tracer, few, many, root)
-
-
-def _newly_growing_root(few, many):
-    """The root that grows at `many` but not at `few`."""
-    known = many.outputs[-1][np.isfinite(many.outputs[-1])]
-    grows = known[np.argsort(-known.real)][: many.growing]
-    # Of several growing roots the slowest is the one that has just begun to grow.
-    root = grows[np.argmin(grows.real)]
-    return complex(root.real, abs(root.imag))
-
-
-def _multiple_zero(tracer, few, many):
-    z, n = few.z, tracer.frame.columns.size
-    _, phi = _null_vectors(few.jacobian)
-    solved = _newton(tracer, MULTIPLE, np.concatenate([z, phi]), phi)
-    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
-        return None
-    big, accuracy = solved
-    derivative = _derivative(tracer, MULTIPLE, big, phi)
-    return CriticalPoint("multiple zero", big[: n + 1], [], 0.0, derivative, accuracy, [])
-
-
-def _divergence(tracer, a, b, few, many):
-    """Where a root leaves zero while other roots are always zero.
-
-    With k roots that are always zero the characteristic polynomial begins with `c s^k`, and c changes its sign. Its
-    coefficients, computed from the roots, are accurate to round-off, although a zero of multiplicity k is off by the
-    k-th root of round-off.
-    """
-    fastest = tracer.fastest
-
-    def count_zeros(point: BranchPoint) -> int:
-        return int(np.sum(np.abs(point.outputs[-1]) < 1e-5 * fastest))
-
-    zeros = min(count_zeros(a), count_zeros(b))
-
-    def product(roots):
-        known = roots[np.isfinite(roots)]
-        return float(np.poly(known / fastest)[known.size - zeros].real)
-
-    best, off = tracer.zero_between(a, b, lambda point: product(point.outputs[-1])) or (many, np.inf)
-    if off > tracer.eps**0.6 * tracer.size(best.z):
-        return CriticalPoint("divergence", many.z, [], 0.0, None, float(np.max(np.abs(few.z - many.z))), [])
-    derivative = _slopes(tracer, best, lambda z, other: product(other.point(z, best.tangent).outputs[-1]))
-    return CriticalPoint("divergence", best.z, [], 0.0, derivative, off, [])
-
-
-def _slopes(tracer, point, value):
-    """Derivatives of the parameter at which `value(z, tracer)` is zero along a branch, by central differences."""
-    number, steady = tracer.frame.place.of_params, tracer.frame.steady
-    row = np.zeros_like(point.z)
-    row[-1] = 1.0
-    h = tracer.eps ** (1 / 3)
-
-    def at(other, z, parameter):
-        corrected = other.corrected(z, row, parameter)
-        return np.nan if corrected is None else value(corrected, other)
-
-    here = point.z[-1]
-    by_parameter = (at(tracer, point.z, here + h) - at(tracer, point.z, here - h)) / (2 * h)
-    floats, rest = eqx.partition(steady.params, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(floats)
-
-    def by(i, entry):
-        step = h * max(abs(float(np.ravel(leaves[i])[entry])), h)
-
-        def moved(sign):
-            leaf = np.array(leaves[i])
-            leaf.reshape(-1)[entry] += sign * step
-            params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
-            frame = replace(tracer.frame, steady=steady.of(params))
-            return at(SteadyTracer(frame, tracer.low, tracer.high), point.z, here)
-
-        return -tracer.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
-
-    def is_parameter(i: int, entry: int) -> bool:
-        return number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
-
-    slopes = [np.reshape([0.0 if is_parameter(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
-             for i, x in enumerate(leaves)]  # fmt: skip
-    return structure.unflatten(slopes)
-
-
-def _near(tracer, a, b, z):
-    return np.max(np.abs(tracer.weights * (z - a.z))) < 1e-2 + 10 * np.max(np.abs(b.z - a.z))
-
-
-def _flutter(tracer, few, many, root):
-    """The onset of flutter: a pair of roots that crosses the imaginary axis, or two pairs that meet on it."""
-    n = tracer.frame.columns.size
-    roots = many.outputs[-1][np.isfinite(many.outputs[-1])]
-    omega = abs(root.imag)
-    # Without damping the mirror image of a growing root decays, so two roots are near this point of the axis.
-    roots_nearby = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
-    kind = COLLISION if roots_nearby > 1 else FLUTTER
-    stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(tracer.frame, few.z.astype(tracer.dtype)))
-    matrix = stiffness + 1j * omega * damping - omega**2 * mass
-    size = np.max(np.abs(stiffness) + omega * np.abs(damping) + omega**2 * np.abs(mass), axis=1)
-    matrix = matrix / np.where(size > 0, size, 1.0)[:, None]
-    w = np.conj(np.linalg.svd(matrix)[2][-1])
-    guide = np.concatenate([w.real, w.imag])
-    start = [few.z, [omega], w.real, w.imag]
-    if kind == COLLISION:
-        slope = omega * (damping + 2j * omega * mass) / np.where(size > 0, size, 1.0)[:, None]
-        second = -np.linalg.pinv(matrix, rcond=1e-5) @ (slope @ w)
-        second = second - w * (np.conj(w) @ second)
-        start += [second.real, second.imag]
-    solved = _newton(tracer, kind, np.concatenate(start), guide)
-    if solved is None or not _near(tracer, few, many, solved[0][: n + 1]):
-        return CriticalPoint("flutter", few.z, [], omega, None, float(np.max(np.abs(few.z - many.z))), [])
-    big, accuracy = solved
-    return CriticalPoint(
-        "flutter", big[: n + 1], [], abs(float(big[n + 1])), _derivative(tracer, kind, big, guide), accuracy, []
-    )
-
-
-def _newton(tracer, kind, big, guide):
-    """Solve the extended system by Newton's method with steps of least norm; also returns the parameter's last step."""
+def _solved(problem, kind, start, guide=np.zeros(1)) -> _Solution | None:
+    """Solve an extended system by Newton's method with steps of least norm; None if it does not converge."""
 
     def step(big):
-        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, tracer.frame, *tracer.cast(big, guide)))
+        value, jacobian = (np.asarray(x, float) for x in extended_at(kind, problem.frame, *problem.cast(big, guide)))
         finite = np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))
         return _least_squares(jacobian, value) if finite else None
 
-    found = newton_in_python(step, big, NEWTON, enough=4 * tracer.eps, free=4, noise=tracer.eps**0.5)
-    if found is None or not found.lengths[-1] < tracer.eps**0.6:
+    limits = {"enough": 4 * problem.eps, "noise": problem.eps**0.5}
+    found = newton_in_python(step, np.concatenate(start), NEWTON, free=4, **limits)
+    if found is None or not found.lengths[-1] < problem.eps**0.6:
         return None
-    return found.y, abs(float(found.step[tracer.frame.columns.size]))
+    return _Solution(problem, kind, found.y, guide, abs(float(found.step[problem.frame.columns.size])))
 
 
 def _least_squares(matrix, known):
@@ -579,16 +326,238 @@ def _least_squares(matrix, known):
     return (np.linalg.lstsq(scaled, known, rcond=1e-10)[0].T / columns).T
 
 
-def _derivative(tracer, kind, big, guide):
-    """The derivatives of the critical parameter by every number in `params`, a tree like `params`."""
-    _, jacobian = extended_at(kind, tracer.frame, *tracer.cast(big, guide))
-    by_params = extended_by_params(kind, tracer.frame, *tracer.cast(big, guide))
-    n, unit = tracer.frame.columns.size, tracer.unit
-    leaves, structure = jax.tree.flatten(by_params)
-    if not leaves:
-        return by_params
-    flat = np.concatenate([np.asarray(x, float).reshape(np.shape(x)[0], -1) for x in leaves], axis=1)
-    slopes = -unit * _least_squares(np.asarray(jacobian, float), flat)[n]
-    places = np.cumsum([0, *(np.asarray(x)[0].size for x in leaves)])
-    parts = [slopes[i:j].reshape(np.shape(x)[1:]) for i, j, x in zip(places, places[1:], leaves)]
-    return jax.tree.unflatten(structure, parts)
+def _null_vectors(jacobian):
+    """Approximate left and right null vectors of E_y."""
+    u, _, vt = np.linalg.svd(jacobian[:, :-1])
+    return u[:, -1], vt[-1]
+
+
+def _guess_between(problem, a, b, share):
+    """A first guess for z between two points, and the left null vector there."""
+    share = float(np.clip(share, 0.02, 0.98))
+    point = problem.between(a, b, share)
+    z = point.z if point else a.z + share * (b.z - a.z)
+    return z, _null_vectors(problem.residual(z)[1])[0]
+
+
+def _inside(problem, a, b, z):
+    """Whether a solution lies between the points, or nearly so."""
+    step, length = b.z - a.z, problem.length(b.z - a.z)
+    share = (problem.weights * step) @ (z - a.z) / length**2
+    return -0.2 < share < 1.2 and problem.length(z - a.z - share * step) < 0.5 * length
+
+
+def _near(problem, a, b, z):
+    """Whether a solution lies near two points that are close to each other."""
+    return np.max(np.abs(problem.weights * (z - a.z))) < 1e-2 + 10 * np.max(np.abs(b.z - a.z))
+
+
+def _branch_point(problem, a, b) -> CriticalPoint | None:
+    """Where another branch crosses; None if there is none."""
+    sizes = [np.linalg.slogdet(np.concatenate([p.jacobian, (problem.weights * p.tangent)[None]]))[1] for p in (a, b)]
+    share = 1 / (1 + np.exp(np.clip(sizes[1] - sizes[0], -50, 50)))
+    solved = _solved(problem, BRANCH, [*_guess_between(problem, a, b, share), [0.0]])
+    if solved is None or not _inside(problem, a, b, solved.z) or abs(solved.rest[-1]) > MEETS:
+        return None
+    directions = _directions(problem, solved.z, solved.rest[:-1])
+    if not directions:
+        return None
+    kind = "pitchfork" if any(abs(t[-1]) < ACROSS for t in directions) else "transcritical"
+    return solved.named(kind, directions=directions)
+
+
+def _directions(problem, z, psi):
+    """The unit tangents of both branches through a branch point."""
+    basis = np.linalg.svd(problem.residual(z)[1])[2][-2:]
+
+    def form(i: int, j: int) -> float:
+        return float(psi @ np.asarray(curvature(problem.frame, *problem.cast(z, basis[i], basis[j]))))
+
+    a, b, c = form(0, 0), form(0, 1), form(1, 1)
+    disc, size = b * b - a * c, max(abs(a), abs(b), abs(c))
+    if not np.isfinite(size) or size == 0 or disc <= 1e-9 * size**2:
+        return []
+    # This form gives both roots without cancellation.
+    root = -(b + np.copysign(np.sqrt(disc), b))
+    tangents = [alpha * basis[0] + beta * basis[1] for alpha, beta in ((root, a), (c, root))]
+    return [t / problem.length(t) for t in tangents]
+
+
+def _fold(problem, a, b) -> CriticalPoint:
+    """Where the parameter turns."""
+    z, psi = _guess_between(problem, a, b, a.tangent[-1] / (a.tangent[-1] - b.tangent[-1]))
+    solved = _solved(problem, FOLD, [z, psi])
+    if solved is None or not _inside(problem, a, b, solved.z):
+        off = problem.length(b.z - a.z) * max(abs(a.tangent[-1]), abs(b.tangent[-1]))
+        return CriticalPoint("fold", z, float(off), located=False)
+    return solved.named("fold")
+
+
+def _loses_stability(problem, a, b) -> CriticalPoint | None:
+    """Where the number of growing roots changes without a crossing branch or a fold: flutter, or several zeros."""
+    left, right = problem.halved(a, b, lambda p: p.growing, HALVINGS)
+    few, many = (left, right) if left.growing < right.growing else (right, left)
+    root = _newly_growing_root(many)
+    size = np.nanmax(np.abs(many.outputs.roots))
+    if abs(root.imag) < 1e-3 * abs(size) and abs(root.imag) <= 30 * abs(root.real):
+        return _multiple_zero(problem, few, many) or _divergence(problem, a, b, few, many)
+    return _flutter(problem, few, many, root)
+
+
+def _newly_growing_root(many):
+    """The root that has just begun to grow: of several growing ones the slowest."""
+    known = many.outputs.roots[np.isfinite(many.outputs.roots)]
+    grows = known[np.argsort(-known.real)][: many.growing]
+    root = grows[np.argmin(grows.real)]
+    return complex(root.real, abs(root.imag))
+
+
+def _two_zeros(problem, a, b) -> CriticalPoint | None:
+    """Where two eigenvalues of E_y vanish together."""
+    return _multiple_zero(problem, *problem.halved(a, b, lambda p: p.negative, HALVINGS))
+
+
+def _multiple_zero(problem, few, many) -> CriticalPoint | None:
+    """Where the stiffness vanishes in several directions, next to a point."""
+    _, phi = _null_vectors(few.jacobian)
+    solved = _solved(problem, MULTIPLE, [few.z, phi], phi)
+    return None if solved is None or not _near(problem, few, many, solved.z) else solved.named("multiple zero")
+
+
+def _divergence(problem, a, b, few, many) -> CriticalPoint:
+    """Where a root leaves zero while other roots are always zero.
+
+    With k roots that are always zero the characteristic polynomial begins with `c s^k`, and c changes its sign. Its
+    coefficients, computed from the roots, are accurate to round-off, although a zero of multiplicity k is off by the
+    k-th root of round-off.
+    """
+    fastest = problem.fastest
+    zeros = min(int(np.sum(np.abs(point.outputs.roots) < 1e-5 * fastest)) for point in (a, b))
+
+    def product(point: BranchPoint) -> float:
+        known = point.outputs.roots[np.isfinite(point.outputs.roots)]
+        return float(np.poly(known / fastest)[known.size - zeros].real)
+
+    best, off = problem.zero_between(a, b, product) or (many, np.inf)
+    if off > problem.eps**0.6 * problem.size(best.z):
+        return CriticalPoint("divergence", many.z, float(np.max(np.abs(few.z - many.z))))
+    derivative = _slopes(problem, best, lambda z, other: product(other.point(z, best.tangent)))
+    return CriticalPoint("divergence", best.z, off, derivative=derivative)
+
+
+def _slopes(problem, point, value):
+    """Derivatives of the parameter at which `value(z, problem)` is zero along a branch, by central differences."""
+    number, steady = problem.along.number, problem.frame.steady
+    row = np.eye(point.z.size)[-1]
+    h = problem.eps ** (1 / 3)
+
+    def at(other, z, parameter):
+        corrected = other.corrected(z, row, parameter)
+        return np.nan if corrected is None else value(corrected, other)
+
+    here = point.z[-1]
+    by_parameter = (at(problem, point.z, here + h) - at(problem, point.z, here - h)) / (2 * h)
+    floats, rest = eqx.partition(steady.params, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(floats)
+
+    def by(i, entry):
+        step = h * max(abs(float(np.ravel(leaves[i])[entry])), h)
+
+        def moved(sign):
+            leaf = np.array(leaves[i])
+            leaf.reshape(-1)[entry] += sign * step
+            params = eqx.combine(structure.unflatten([*leaves[:i], jnp.asarray(leaf), *leaves[i + 1 :]]), rest)
+            frame = replace(problem.frame, steady=steady.of(params))
+            return at(SteadyProblem(frame, problem.low, problem.high), point.z, here)
+
+        return -problem.unit * (moved(1) - moved(-1)) / (2 * step) / by_parameter
+
+    def is_parameter(i: int, entry: int) -> bool:
+        return number is not None and leaves[i] is jax.tree.leaves(steady.params)[number.leaf] and entry == number.entry
+
+    slopes = [np.reshape([0.0 if is_parameter(i, j) else by(i, j) for j in range(np.size(x))], np.shape(x))
+             for i, x in enumerate(leaves)]  # fmt: skip
+    return structure.unflatten(slopes)
+
+
+def _flutter(problem, few, many, root) -> CriticalPoint:
+    """The onset of flutter: a pair of roots that crosses the imaginary axis, or two pairs that meet on it."""
+    roots = many.outputs.roots[np.isfinite(many.outputs.roots)]
+    omega = abs(root.imag)
+    # Without damping the mirror image of a growing root decays, so two roots are near this point of the axis.
+    roots_nearby = np.sum(np.abs(roots - 1j * omega) < max(4 * abs(root.real), 1e-9 * omega))
+    kind = COLLISION if roots_nearby > 1 else FLUTTER
+    stiffness, damping, mass = (np.asarray(x, float) for x in dynamic_at(problem.frame, few.z.astype(problem.dtype)))
+    matrix = stiffness + 1j * omega * damping - omega**2 * mass
+    size = np.max(np.abs(stiffness) + omega * np.abs(damping) + omega**2 * np.abs(mass), axis=1)
+    matrix = matrix / np.where(size > 0, size, 1.0)[:, None]
+    w = np.conj(np.linalg.svd(matrix)[2][-1])
+    start = [few.z, [omega], w.real, w.imag]
+    if kind == COLLISION:
+        slope = omega * (damping + 2j * omega * mass) / np.where(size > 0, size, 1.0)[:, None]
+        second = -np.linalg.pinv(matrix, rcond=1e-5) @ (slope @ w)
+        second = second - w * (np.conj(w) @ second)
+        start += [second.real, second.imag]
+    solved = _solved(problem, kind, start, np.concatenate([w.real, w.imag]))
+    if solved is None or not _near(problem, few, many, solved.z):
+        return CriticalPoint("flutter", few.z, float(np.max(np.abs(few.z - many.z))), frequency=omega)
+    return solved.named("flutter", frequency=abs(float(solved.rest[0])))
+
+
+# The determinant, the direction of the parameter, the growing roots, and the negative eigenvalues of E_y.
+MONITORS = (
+    Monitor(lambda point: point.sign, sign_changes, _branch_point),
+    Monitor(lambda point: point.tangent[-1], sign_changes, _fold),
+    Monitor(lambda point: point.growing, count_changes, _loses_stability),
+    Monitor(lambda point: point.negative, lambda a, b: a != b and (a - b) % 2 == 0, _two_zeros),
+)
+
+
+class SteadyProblem(Problem):
+    """Steady motions of a `Frame`. `fastest`: the size of the fastest root so far, the unit of the roots' round-off."""
+
+    monitors, crossings = MONITORS, True
+
+    def __init__(self, frame: Frame, low: float, high: float):
+        super().__init__(low, high)
+        self.frame, self.along, self.fastest = frame, frame.along, 0.0
+        size, self.positions = frame.columns.size, frame.steady.n
+        self.weights = np.where((np.arange(size + 1) < self.positions) | (np.arange(size + 1) == size), 1.0, 0.0)
+        self.dtype = np.dtype(frame.columns.dtype)
+        self.unit = float(frame.unit)
+
+    def residual(self, z):
+        value, jacobian, largest = jax.tree.map(np.asarray, evaluated(self.frame, z.astype(self.dtype)))
+        return value, jacobian, float(largest)
+
+    def described(self, z, jacobian, tangent) -> BranchPoint:
+        outputs = jax.tree.map(np.asarray, outputs_at(self.frame, z.astype(self.dtype)))
+        sign = np.linalg.slogdet(np.concatenate([jacobian, (self.weights * tangent)[None]]))[0]
+        negative = int(np.sum(np.linalg.eigvals(jacobian[:, :-1]).real < 0))
+        return BranchPoint(z, jacobian, tangent, float(sign), outputs, self._growing(outputs.roots), negative)
+
+    def _growing(self, roots) -> int | None:
+        """The number of growing roots; None if the roots are not known."""
+        known = roots[np.isfinite(roots)]
+        if not known.size:
+            return None
+        self.fastest = max(self.fastest, float(np.max(np.abs(known))))
+        return int(np.sum(known.real > GROWS_ABOVE[self.dtype] * self.fastest))
+
+    def ends(self, points, after, origin) -> str | None:
+        if origin is not None and np.ptp([p.z[-1] for p in points[-LINE:]]) < LINE_WITHIN and len(points) >= LINE:
+            origin.kind = "line of equilibria"
+            return "a line of equilibria, which goes on"
+        return None
+
+    def escape(self, point) -> CriticalPoint | None:
+        """Where the solution of linear equations goes to infinity."""
+        n = self.frame.columns.size
+        half, here = point.z.copy(), self.residual(point.z)[1][:, :-1]
+        half[:n] *= 0.5
+        # The equations are linear if the Jacobian is the same halfway.
+        if np.max(np.abs(self.residual(half)[1][:, :-1] - here)) > 1e-9 * np.max(np.abs(here)):
+            return None
+        psi = np.linalg.svd(here)[0][:, -1]
+        solved = _solved(self, ESCAPE, [np.zeros(n), point.z[-1:], psi], np.zeros(n + 1))
+        return solved and replace(solved.named("escape"), z=np.append(point.z[:n], solved.z[-1]))

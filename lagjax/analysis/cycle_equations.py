@@ -34,6 +34,7 @@ Chaos 1 (1991) 745; Muñoz-Almaraz et al., *Physica D* 181 (2003) 1 (families of
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -42,27 +43,40 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax.analysis.arclength import BranchPoint, Number, Tracer
+from lagjax.analysis.arclength import (
+    Along,
+    BranchPoint,
+    CriticalPoint,
+    Monitor,
+    Problem,
+    count_changes,
+    sign_changes,
+    zero,
+)
 from lagjax.analysis.flow import Changes, Flow, SwitchingFlow
-from lagjax.analysis.monodromy import Reasons, directions, orthonormal
-from lagjax.analysis.shooting import TURN, OrbitRequest, integral_at
+from lagjax.analysis.monodromy import Reasons, directions, orthonormal, without
+from lagjax.analysis.shooting import (
+    SAMPLED_AT,
+    TURN,
+    Goal,
+    OrbitRequest,
+    change_in_a_period,
+    closing_rows,
+    comes_back,
+    held_off,
+    in_parts,
+    integral_at,
+    left_open,
+    slope_of_integral,
+    times_of,
+)
 from lagjax.integrate import Switches
 from lagjax.jaxtools import compiled
 
-# Times, in periods, at which the accelerations of a driven system are compared.
-SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
 # The number of points between which the extreme coordinates are interpolated, and of short steps to each point.
 POINTS, SUBSTEPS = 96, 8
-ENERGY, PERIOD, ENTRY, NUMBER = "energy", "period", "entry", "number"
-
-
-class Along(eqx.Module):
-    """The parameter of a branch: a number in `params`, the energy, the period, or an entry of the first state."""
-
-    name: str = eqx.field(static=True)
-    kind: str = eqx.field(static=True)
-    number: Number | None = None
-    entry: int = eqx.field(static=True, default=0)
+# The parameter is a number in `params`, the energy, the period, or an entry of the first state.
+ENERGY, PERIOD, ENTRY = "energy", "period", "entry"
 
 
 class Drive(eqx.Module):
@@ -83,7 +97,7 @@ class OrbitFrame(eqx.Module):
     """The data that stay the same along a branch: the flow at its start, units, and held quantities.
 
     - `scale` (2n,): the size of each coordinate and velocity; `period`: its unit; `unit`: that of the parameter.
-    - `turns` (n,): whole turns of each coordinate; `integral`, `z` (2n,): the energy and the state at the start.
+    - `turns` (n,): whole turns of each coordinate; `goal`: the energy and the state at the start, which may be held.
     - `slope`: the size of the energy's gradient; `sizes` (c,): the sizes of the constraints' gradients.
     - `drive`: None unless a drive sets the period and makes it change with the parameter.
     - `free` (d, N), `reference` (N,): V and y_0, the fixed combinations of unknowns and the point they refer to.
@@ -95,8 +109,7 @@ class OrbitFrame(eqx.Module):
     period: Float[Array, ""]
     unit: Float[Array, ""]
     turns: Float[Array, " n"]
-    integral: Float[Array, ""]
-    z: Float[Array, " 2n"]
+    goal: Goal
     slope: Float[Array, ""]
     sizes: Float[Array, " c"]
     drive: Drive | None
@@ -142,22 +155,21 @@ def orbit_at(frame: OrbitFrame, z, guide: Guide) -> Evaluated:
     """Follow the flow through all parts, with tangents."""
     flow, nodes, period = frame.split(z)
     count, size, scale = frame.parts, frame.scale.size, frame.scale
-    times, span = _times(frame, period), period / count
+    times, span = times_of(frame.t, period, count), period / count
     columns = jnp.concatenate([jnp.eye(size, dtype=z.dtype), jnp.zeros((size, 2), z.dtype)], axis=1)
 
     def part(j, t, node):
         return flow.passage(t, node, span, columns, scale, changes=_changes(frame, flow, z, j, span))
 
-    if count == 1:
-        passed = jax.tree.map(lambda x: x[None], part(0, times[0], nodes[0]))
-    else:
-        passed = jax.vmap(part)(jnp.arange(count), times, nodes)
-    closing, slopes = _closing(frame, nodes, passed)
+    passed = in_parts(part, jnp.arange(count), times, nodes)
+    closing = left_open(frame.asked, nodes, passed.z, frame.turns, scale)
+    bases = jnp.broadcast_to(jnp.eye(size, dtype=z.dtype), (count, size, size))
+    slopes = closing_rows(passed.frame, bases).at[-size:].multiply(comes_back(frame.asked, z.dtype)[:, None])
 
     def others(z: Array):
         return _others(frame, z, guide)
 
-    value = jnp.concatenate([closing, others(z)])
+    value = jnp.concatenate([closing.reshape(-1), others(z)])
     jacobian = jnp.concatenate([slopes, jax.jacfwd(others)(z)])
 
     good = jnp.all(passed.ended) & jnp.all(jnp.isfinite(jacobian))
@@ -182,10 +194,6 @@ def _ways(switches: Switches | None):
     return ways if switches.modes is None else jnp.concatenate([ways[:, None], switches.modes[-1]], axis=1)
 
 
-def _times(frame, period):
-    return frame.t + period * jnp.arange(frame.parts, dtype=period.dtype) / frame.parts
-
-
 def _changes(frame, flow, z, j, span) -> Changes:
     """How parameters and times change with the frame columns: with μ, with log T, and not at all with the state."""
     last = jnp.eye(z.size, dtype=z.dtype)[-1]
@@ -207,30 +215,13 @@ def _changes(frame, flow, z, j, span) -> Changes:
     return Changes(jax.tree.map(rows, by_number), by_log_period(j * span), by_log_period(span))
 
 
-def _closing(frame, nodes, passed):
-    """The distance from each part's end to the next part's start, and its Jacobian."""
-    count, (size, n) = frame.parts, (frame.scale.size, frame.turns.size)
-    comes_back = np.concatenate([1.0 - np.array(frame.asked.relative, float), np.ones(n)])
-    first = nodes[0] + jnp.concatenate([TURN * frame.turns, jnp.zeros_like(frame.turns)])
-    values = (passed.z - jnp.concatenate([nodes[1:], first[None]])) / frame.scale[None]
-    rows = jnp.zeros((count, size, count * size + 2), values.dtype)
-    for j in range(count):
-        after = (j + 1) % count
-        rows = rows.at[j, :, j * size : (j + 1) * size].add(passed.frame[j, :, :size])
-        rows = rows.at[j, :, after * size : (after + 1) * size].add(-np.eye(size))
-        rows = rows.at[j, :, -2:].set(passed.frame[j, :, size:])
-    keep = np.ones((count, size))
-    keep[-1] = comes_back
-    return (values * keep).reshape(-1), (rows * keep[:, :, None]).reshape(count * size, -1)
-
-
 def _others(frame: OrbitFrame, z, guide):
     """All equations except those that close the motion."""
     flow, nodes, period = frame.split(z)
     along, asked, value = frame.along, frame.asked, z[-1] * frame.unit
     parts = []
     if flow.dimension < frame.scale.size:
-        off = jax.vmap(flow.start.residual)(_times(frame, period), nodes)
+        off = jax.vmap(flow.start.residual)(times_of(frame.t, period, frame.parts), nodes)
         parts.append((off / frame.sizes[None]).reshape(-1))
     first = nodes[0] / frame.scale
     if asked.moves:
@@ -241,12 +232,13 @@ def _others(frame: OrbitFrame, z, guide):
         parts.append(drive_off(frame, flow.start, period)[None])
     elif not asked.free:
         parts.append(z[-2:-1])
-    if asked.energy or along.kind == ENERGY:
-        goal = value if along.kind == ENERGY else frame.integral
-        parts.append((integral_at(flow.start, frame.t, nodes[0]) - goal)[None] / frame.slope)
-    parts += [(first[i] - frame.z[i] / frame.scale[i])[None] for i in asked.held]
-    if along.kind == ENTRY:
-        parts.append((first[along.entry] - value / frame.scale[along.entry])[None])
+    goal = frame.goal
+    if along.kind == ENERGY:
+        goal = goal._replace(integral=value)
+    elif along.kind == ENTRY:
+        goal = goal._replace(z=jnp.asarray(goal.z).at[along.entry].set(value))
+    held = held_off(flow.start, frame.t, nodes[0], asked, goal, frame.slope, frame.scale)
+    parts += [off[None] for off in held]
     return jnp.concatenate([*parts, frame.free @ (z[:-1] - frame.reference)])
 
 
@@ -265,9 +257,7 @@ def _changed(frame, flow, period):
     def at(t: Array):
         return flow.rate(t, drive.z)[flow.size :] / frame.scale[flow.size :]
 
-    # Sampled at the same phases for every period.
-    times = frame.t + period * jnp.asarray(SAMPLED_AT, period.dtype)
-    return jax.vmap(at)(times + period) - jax.vmap(at)(times)
+    return change_in_a_period(at, frame.t, period)
 
 
 def drive_of(flow: Flow, t, z, period, scale) -> Drive:
@@ -310,7 +300,9 @@ def path_at(frame: OrbitFrame, z):
     if isinstance(flow, SwitchingFlow):
         return flow.path(frame.t, nodes[0], period, POINTS)
     each, span = -(-POINTS // frame.parts), period / frame.parts
-    states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(_times(frame, period), nodes)
+    states = jax.vmap(lambda t, node: flow.path(t, node, span, each, SUBSTEPS))(
+        times_of(frame.t, period, frame.parts), nodes
+    )
     states = jnp.concatenate([states[:, :-1].reshape(-1, frame.scale.size), states[-1, -1:]])
     return period * jnp.arange(len(states), dtype=z.dtype) / (len(states) - 1), states
 
@@ -318,16 +310,11 @@ def path_at(frame: OrbitFrame, z):
 @compiled
 def sizes_at(flow: Flow, t, z, period, scale):
     """The energy, the sizes of its gradient and of the constraints' gradients, in units of `scale`; and the drive."""
-    slope = jax.grad(lambda z: integral_at(flow, t, z))(z) * scale
-    size = jnp.linalg.norm(slope)
     rows = jnp.zeros(0, z.dtype)
     if flow.dimension < z.size:
         rows = jnp.linalg.norm(flow.normals(t, z, scale), axis=1)
-
-    def positive(x: Array):
-        return jnp.where(x > 0, x, 1.0)
-
-    return integral_at(flow, t, z), positive(size), positive(rows), drive_of(flow, t, z, period, scale)
+    size = slope_of_integral(flow, t, z, scale)[1]
+    return integral_at(flow, t, z), size, jnp.where(rows > 0, rows, 1.0), drive_of(flow, t, z, period, scale)
 
 
 @compiled
@@ -345,6 +332,11 @@ def drive_by_parameter(frame: OrbitFrame, z):
 # A driven system repeats if it changes by less than this from one period to the next, relative to its change in a
 # period.
 SAME = 1e-5
+# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
+# equilibrium is a state of rest too. A period of so many times the first one grows without end.
+AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
+# How often a branch is bisected where a pair leaves the unit circle, but nothing smooth shows it.
+HALVINGS = 40
 # A multiplier within this many square roots of the error of N is on the unit circle: a double one is off by that much.
 ON_CIRCLE = 3.0
 
@@ -368,12 +360,57 @@ class OrbitOutputs(NamedTuple):
     moves: float
 
 
-class OrbitTracer(Tracer):
-    """Cycles of an `OrbitFrame`. `guide`: the last point of the branch."""
+def _turn(problem, a, b) -> CriticalPoint | None:
+    """Where the parameter turns."""
+    # At a pitchfork it turns along the side branch, where the multiplier only touches 1.
+    kind = "fold" if a.sign * b.sign < 0 or not problem.isolated else "branch point"
+    return zero(kind, lambda p: p.tangent[-1], problem, a, b)
 
-    def __init__(self, frame: OrbitFrame, low: float, high: float, guide: Guide, crosses: bool):
+
+def _torus(problem, a, b) -> CriticalPoint | None:
+    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
+    many = a if a.growing > b.growing else b
+    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
+    slowest = min(outside, key=abs, default=1.0)
+    if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
+        return None
+    found = zero("torus", lambda p: p.outputs.pairs, problem, a, b)
+    if found is not None:
+        return found
+    left, right = problem.halved(a, b, lambda p: p.growing, HALVINGS)
+    if left is a and right is b:
+        return None
+    point = right if left is a else left
+    return CriticalPoint("torus", point.z, abs(float(right.z[-1] - left.z[-1])), point=point)
+
+
+def _zero_of(kind: str, name: str, alone: bool) -> Monitor:
+    """A smooth function of the multipliers, which is zero at critical points of a kind."""
+    value = lambda point: getattr(point.outputs, name)
+    return Monitor(value, sign_changes, partial(zero, kind, value), alone, smooth=True)
+
+
+# The direction of the parameter, χ₊, χ₋, and the multipliers outside the unit circle.
+MONITORS = (
+    Monitor(lambda point: point.tangent[-1], sign_changes, _turn),
+    _zero_of("branch point", "plus", alone=True),
+    _zero_of("period doubling", "minus", alone=False),
+    Monitor(lambda point: point.growing, count_changes, _torus),
+)
+
+
+class CycleProblem(Problem):
+    """Cycles of an `OrbitFrame`.
+
+    `guide`: the last point of the branch. `isolated`: whether only trivial directions lead from a cycle to others at
+    the same parameter; if not, χ₊ is zero everywhere and shows nothing.
+    """
+
+    monitors = MONITORS
+
+    def __init__(self, frame: OrbitFrame, low: float, high: float, guide: Guide, isolated: bool):
         super().__init__(low, high)
-        self.frame, self.guide, self.crosses = frame, guide, crosses
+        self.frame, self.along, self.guide, self.isolated = frame, frame.along, guide, isolated
         nodes = frame.parts * frame.scale.size
         self.positions = nodes
         self.weights = np.append(np.full(nodes, 1 / frame.parts), [1.0, 1.0])
@@ -408,7 +445,7 @@ class OrbitTracer(Tracer):
             self.cached = key, jax.tree.map(np.asarray, orbit_at(self.frame, z, self.guide))
         return self.cached[1]
 
-    def at(self, z):
+    def residual(self, z):
         evaluation = self.evaluated(z)
         if np.isfinite(evaluation.amplified):
             self.amplified = float(evaluation.amplified)
@@ -424,10 +461,9 @@ class OrbitTracer(Tracer):
         if float(evaluation.apart) > max(SAME, 1e3 * self.eps):
             return "the system is not the same after any period near the last one: its drive has no common period"
         if self.ways is not None and not np.array_equal(self.ways, evaluation.ways):
-            near = f"{self.frame.along.name} = {z[-1] * self.unit:.6g}"
             return (
-                f"other switches, near {near}: the start comes to a switch (another state of the cycle as the start of "
-                "lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
+                f"other switches, near {self.value_of(z)}: the start comes to a switch (another state of the cycle as "
+                "the start of lj.periodic_orbit goes on), or the motion grazes, or a phase begins or ends"
             )
         if not self.repeats(z)[0]:
             return "the period of the drive changes, which only accelerations of the first phase show"
@@ -438,32 +474,55 @@ class OrbitTracer(Tracer):
         size = np.abs(left)
         within = ON_CIRCLE * np.sqrt(self.noise)
         growing = int(np.sum(size > 1 + within)) if np.all(np.isfinite(size)) else None
-        below = int(np.sum((np.imag(left) == 0) & (np.real(left) < -1)))
         period = float(self.frame.period) * np.exp(z[-2])
         nodes = z[:-2].reshape(self.frame.parts, -1) * np.asarray(self.frame.scale)
         outputs = OrbitOutputs(
-            z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.crosses else 1.0, minus,
+            z[-1] * self.unit, period, nodes, multipliers, low, high, plus if self.isolated else 1.0, minus,
             self._pairs(left), float(np.max((high - low) / np.asarray(self.frame.scale)[: len(low)])),
         )  # fmt: skip
-        return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing, below)
+        return BranchPoint(z, jacobian, tangent, float(np.sign(outputs.plus)), outputs, growing)
+
+    def ends(self, points, after, origin) -> str | None:
+        before, name = points[-1], self.along.name
+        if self.frame.asked.moves:
+            largest = max(point.outputs.moves for point in points)
+            shrinks = after.outputs.moves < AT_REST * largest
+            if shrinks or self.guide.rate @ self.evaluated(after.z).guide.rate < 0:
+                if before.outputs.moves < HALF * largest:
+                    return f"a state of rest, near {name} = {self._at_rest(points):.6g}"
+                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
+                return f"a period that grows without end, near {self.value_of(before.z)}"
+        if after.outputs.period > ENDLESS * float(self.frame.period):
+            return f"a period that grows without end, near {self.value_of(after.z)}"
+        return None
+
+    def _at_rest(self, points) -> float:
+        """The parameter, extrapolated to a motion of size zero.
+
+        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
+        compared with the range is round-off.
+        """
+        b, power = points[-1].outputs, 1 if self.along.kind == ENTRY else 2
+        parameter = b.parameter
+        if len(points) > 1:
+            a = points[-2].outputs
+            m, n = a.moves**power, b.moves**power
+            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
+        return 0.0 if abs(parameter) < 1e-9 * self.unit else parameter
 
     def _multipliers(self, evaluation: Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """All multipliers, the trivial ones first as exactly 1; and the nontrivial ones alone, by falling size."""
         count = int(np.sum(evaluation.there))
-        reduced = self._without(evaluation, evaluation.whole)
-        left = np.linalg.eigvals(reduced)
+        left = np.linalg.eigvals(without(evaluation.trivial, evaluation.whole))
         left = left[np.argsort(np.abs(left - 1), kind="stable")][count:]
         left = left[
             np.lexsort((-left.imag, -np.round(np.abs(left) / max(np.max(np.abs(left), initial=0.0), 1e-300), 9)))
         ]
         return np.concatenate([np.ones(count, complex), left.astype(complex)]), left.astype(complex)
 
-    def _without(self, evaluation, matrix):
-        rest = np.eye(len(matrix)) - evaluation.trivial.T @ evaluation.trivial
-        return rest @ matrix @ rest + evaluation.trivial.T @ evaluation.trivial
-
     def _product(self, evaluation, shift):
-        return float(np.linalg.det(self._without(evaluation, evaluation.whole + shift * np.eye(len(evaluation.whole)))))
+        shifted = evaluation.whole + shift * np.eye(len(evaluation.whole))
+        return float(np.linalg.det(without(evaluation.trivial, shifted)))
 
     def _pairs(self, left):
         """A function that changes its sign where a pair leaves the unit circle.

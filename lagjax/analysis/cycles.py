@@ -4,7 +4,6 @@ At a critical point a multiplier passes 1 or -1, or a pair leaves the unit circl
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,38 +11,37 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
-from lagjax.analysis.arclength import AT_EDGE, BranchPath, BranchPoint, no_such_number, numbers_in
+from lagjax.analysis.arclength import NUMBER, Along, no_such_number, numbers_in, range_from
+from lagjax.analysis.balance import side_by_side
 from lagjax.analysis.branches import (
-    OTHER_MARK,
-    STABLE,
-    UNKNOWN,
-    UNSTABLE,
     draw_by_stability,
+    draw_critical,
+    how_many,
     name_stability,
+    number_in,
     stability_in_words,
+    stable_along,
+    verdicts_of,
 )
 from lagjax.analysis.cycle_equations import (
     ENERGY,
     ENTRY,
-    NUMBER,
     PERIOD,
-    Along,
+    CycleProblem,
     Guide,
     OrbitFrame,
-    OrbitTracer,
     drive_by_parameter,
     sizes_at,
 )
 from lagjax.analysis.flow import any_flow
+from lagjax.analysis.following import AT_EDGE, Follower
 from lagjax.analysis.monodromy import OrbitProblem, any_problem_of, tolerance_of, user_system
 from lagjax.analysis.periodic_orbit import PeriodicOrbit
-from lagjax.analysis.shooting import OrbitRequest, guessed
+from lagjax.analysis.shooting import Goal, OrbitRequest, guessed
 from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
 from lagjax.system import State, checked, coordinates
-
-MARKS = {"fold": ("s", 1), "branch point": ("o", 2), "period doubling": ("D", 3), "torus": ("^", 4)}
 
 
 class CriticalOrbit(eqx.Module):
@@ -152,16 +150,11 @@ class OrbitBranch(eqx.Module):
     def draw(self, axis, name: str | None = None):
         """Draw the largest value of one coordinate, by default the first, or `"period"`, on matplotlib axes."""
         name = self._names()[0] if name is None else name
-        y, verdicts = self._values(name), self._verdicts()
-        draw_by_stability(axis, np.asarray(self.parameter), y, verdicts, plot.COLOURS[0])
-        name_stability(axis, [verdicts])
+        y = self._values(name)
+        draw_by_stability(axis, np.asarray(self.parameter), y, self.verdicts, plot.COLOURS[0])
+        name_stability(axis, [self.verdicts])
         for c in self.critical:
-            marker, colour = MARKS.get(c.kind, OTHER_MARK)
-            axis.plot(
-                float(c.parameter), y[c.index], marker, color=plot.COLOURS[colour], markeredgecolor="white",
-                markersize=7, linestyle="", zorder=4,
-                label=None if c.kind in axis.get_legend_handles_labels()[1] else c.kind,
-            )  # fmt: skip
+            draw_critical(axis, c, y[c.index])
         axis.set(xlabel=self.along, ylabel=name if name == "period" else f"largest {name}")
 
     def _names(self):
@@ -170,19 +163,16 @@ class OrbitBranch(eqx.Module):
     def _values(self, name: str):
         if name == "period":
             return np.asarray(self.period)
-        leaves = [np.asarray(x).reshape(len(self), -1) for x in jax.tree.leaves(self.high)]
-        return np.concatenate(leaves, axis=1)[:, self._names().index(name)]
+        return side_by_side(self.high)[:, self._names().index(name)]
 
-    def _verdicts(self):
-        known = np.all(np.isfinite(self.multipliers), axis=1)
-        return np.where(known, np.where(self.stable, STABLE, UNSTABLE), UNKNOWN)
+    @property
+    def verdicts(self) -> np.ndarray:
+        """The stability of each cycle: STABLE, UNSTABLE or UNKNOWN."""
+        return verdicts_of(self.stable, np.all(np.isfinite(self.multipliers), axis=1))
 
     def __repr__(self):
-        count = len(self.critical)
-        points = f"{count} critical point{'s' * (count != 1)}" if count else "no critical point"
-
-        def number(x: float) -> str:
-            return f"{0.0 if abs(x) < 1e-13 * abs(self.last - self.first) else float(x):.10g}"
+        def number(x) -> str:
+            return number_in(x, self.last - self.first)
 
         reached = [float(np.min(self.parameter)), float(np.max(self.parameter))]
         reached = reached if self.first <= self.last else reached[::-1]
@@ -194,10 +184,12 @@ class OrbitBranch(eqx.Module):
         ]
         low, high = np.min(self.period), np.max(self.period)
         rows.append(("periods", f"{low:.6g}" + (f" to {high:.6g}" if high - low > 1e-9 * high else "")))
-        rows.append(("stability", stability_in_words(self._verdicts())))
+        rows.append(("stability", stability_in_words(self.verdicts)))
         where = f", {self.along} = {number(self.parameter[-1])}" if self.status == AT_EDGE else ""
         rows.append(("ends at", f"{self.status}{where}"))
-        return labelled(f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {points}", rows)
+        return labelled(
+            f"Branch of cycles along {self.along}, {span}: {len(self)} of them, with {how_many(self.critical)}", rows
+        )
 
 
 def _torus_angle(c: CriticalOrbit):
@@ -211,122 +203,10 @@ def _torus_angle(c: CriticalOrbit):
     return f"a pair at ±{np.angle(pair):.6g} rad"
 
 
-HALVINGS = 40
-# A function whose middle value at three points is below this fraction of the outer ones may be zero twice in between.
-DIPS, VERTICES = 0.3, 8
-
-
-class FoundOrbit(NamedTuple):
-    """The kind of a critical point, the point, how far off its parameter may be, and whether it was located."""
-
-    kind: str
-    point: BranchPoint
-    accuracy: float
-    located: bool = True
-
-
-def between(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint) -> list[FoundOrbit]:
-    """All critical points between two neighbouring points."""
-    found = []
-    crosses, folds = a.sign * b.sign < 0, a.tangent[-1] * b.tangent[-1] < 0
-    if folds:
-        # At a pitchfork the parameter turns along the side branch, where the multiplier only touches 1.
-        kind = "fold" if crosses or not tracer.crosses else "branch point"
-        found.append(_zero(tracer, a, b, kind, lambda p: p.tangent[-1]))
-    elif crosses:
-        found.append(_zero(tracer, a, b, "branch point", lambda p: p.outputs.plus))
-    if a.outputs.minus * b.outputs.minus < 0:
-        found.append(_zero(tracer, a, b, "period doubling", lambda p: p.outputs.minus))
-    if a.growing is not None and b.growing is not None and a.growing != b.growing and not found:
-        found.append(_torus(tracer, a, b))
-    return [one for one in found if one is not None]
-
-
-def dips(tracer: OrbitTracer, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[FoundOrbit | BranchPoint]:
-    """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
-    for kind, of in (("branch point", lambda p: p.outputs.plus), ("period doubling", lambda p: p.outputs.minus)):
-        left, middle, right = of(a), of(b), of(c)
-        same = left * middle > 0 and middle * right > 0
-        if not (same and abs(middle) < DIPS * min(abs(left), abs(right))):
-            continue
-        lowest = _beyond_zero(tracer, a, b, c, of)
-        if lowest is not None:
-            sides = [_zero(tracer, a, lowest, kind, of), _zero(tracer, lowest, c, kind, of)]
-            return [one for one in (sides[0], lowest, sides[1]) if one is not None]
-    return []
-
-
-def _beyond_zero(tracer, a, b, c, of):
-    """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
-
-    def length(p: BranchPoint, q: BranchPoint) -> float:
-        return float(np.sqrt(tracer.weights @ (q.z - p.z) ** 2))
-
-    whole = length(a, b) + length(b, c)
-    x, f = [0.0, length(a, b) / whole, 1.0], [of(a), of(b), of(c)]
-    sign, tried = np.sign(f[0]), set(x)
-    for _ in range(VERTICES):
-        near = np.argsort(np.abs(np.array(x) - x[int(np.argmin(np.abs(f)))]))[:3]
-        (x0, x1, x2), (f0, f1, f2) = np.array(x)[near], np.array(f)[near]
-        slope, bend = (f1 - f0) / (x1 - x0), ((f2 - f1) / (x2 - x1) - (f1 - f0) / (x1 - x0)) / (x2 - x0)
-        if not np.isfinite(bend) or bend * sign <= 0:
-            return None
-        vertex = 0.5 * (x0 + x1) - slope / (2 * bend)
-        point = tracer.between(a, c, vertex) if 0 < vertex < 1 and vertex not in tried else None
-        if point is None:
-            return None
-        if of(point) * sign < 0:
-            return point
-        tried.add(vertex)
-        x.append(vertex)
-        f.append(of(point))
-    return None
-
-
-def _zero(tracer, a, b, kind, of) -> FoundOrbit | None:
-    found = tracer.zero_between(a, b, of)
-    if found is None:
-        return None
-    point, off = found
-    if np.isfinite(off):
-        return FoundOrbit(kind, point, off * tracer.unit)
-    # Somewhere between the two points: by a straight line, and how far the parameter changes on the way.
-    share = of(a) / (of(a) - of(b))
-    point = tracer.between(a, b, share) or replace(a if share < 0.5 else b)
-    length, steepest = np.sqrt(tracer.weights @ (b.z - a.z) ** 2), max(abs(a.tangent[-1]), abs(b.tangent[-1]))
-    off = max(abs(float((b.z - a.z)[-1])), float(length * steepest))
-    return FoundOrbit(kind, point, off * tracer.unit, located=False)
-
-
-def _torus(tracer, a, b) -> FoundOrbit | None:
-    """The point where a pair leaves the unit circle; None if what begins to grow is not a pair."""
-    many = a if a.growing > b.growing else b
-    outside = [x for x in many.outputs.multipliers if abs(x) > 1]
-    slowest = min(outside, key=abs, default=1.0)
-    if abs(np.imag(slowest)) < 1e-3 * abs(slowest):
-        return None
-    found = _zero(tracer, a, b, "torus", lambda p: p.outputs.pairs)
-    if found is not None:
-        return found
-    low, high, point = 0.0, 1.0, None
-    for _ in range(HALVINGS):
-        share = 0.5 * (low + high)
-        middle = tracer.between(a, b, share)
-        if middle is None or middle.growing is None or share in (low, high):
-            break
-        point = middle
-        low, high = (share, high) if middle.growing == a.growing else (low, share)
-    off = abs(float(b.z[-1] - a.z[-1])) * (high - low) * tracer.unit
-    return None if point is None else FoundOrbit("torus", point, off)
-
-
 # Singular values of the equations below this fraction of the largest count as zero.
 DEPENDENT = 1e-7
 # The period of a drive counts as constant if its logarithm changes by less.
 CONSTANT = 1e-9
-# Fractions of the largest motion: the branch ends at rest below the first; below the second, a start that passes an
-# equilibrium is a state of rest too. A period of so many times the first one grows without end.
-AT_REST, HALF, ENDLESS = 1e-3, 0.5, 1e3
 
 
 def continue_orbits(
@@ -374,9 +254,8 @@ def continue_orbits(
     place, asked = _along(along, orbit, problem)
     frame, z = _frame(orbit, problem, place, asked, tolerance_of(rtol, s.t.dtype), to)
     first, last = float(z[-1] * frame.unit), float(to)
-    low, high = sorted((float(z[-1]), last / float(frame.unit)))
-    tracer, path, found = _traced(frame, z, low, high, np.sign(last - first), most_points)
-    return _result(orbit, problem, place, tracer, path, found, along, first, last)
+    run = _followed(frame, z, *sorted((float(z[-1]), last / float(frame.unit))), np.sign(last - first), most_points)
+    return _result(orbit, problem, run, first, last)
 
 
 def _check(orbit):
@@ -427,7 +306,7 @@ def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, O
         )
     free = asked._replace(free=True, energy=False, held=())
     if along == ENERGY:
-        return Along(along, ENERGY), free
+        return Along(along, ENERGY), free._replace(energy=True)
     if along == PERIOD:
         if not reasons.energy:
             raise ValueError(
@@ -435,7 +314,8 @@ def _along(along, orbit: PeriodicOrbit, problem: OrbitProblem) -> tuple[Along, O
                 f"Fix: a number in the parameters, along={next(iter(numbers), 'mu')!r}."
             )
         return Along(along, PERIOD), free._replace(free=False)
-    return Along(along, ENTRY, None, entries.index(along)), free
+    entry = entries.index(along)
+    return Along(along, ENTRY, None, entry), free._replace(held=(entry,))
 
 
 @compiled
@@ -455,18 +335,13 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     integral, slope, sizes, drive = sizes_at(flow.start, s.t, nodes[0], period, scale)
     first = {ENERGY: integral, PERIOD: period, ENTRY: nodes[0][place.entry]}.get(place.kind)
     first = place.number.get(s.params) if place.number is not None else first
-    first, last = float(first), float(to)
-    if not np.isfinite(last) or first == last:
-        raise ValueError(
-            f"to={to} leaves the parameter {place.name!r} no range: it starts at {first:.6g}.\n"
-            f"Fix: to={2 * first or 1.0:.6g}, and the first value in that of the orbit."
-        )
-    unit = np.asarray(abs(last - first), s.t.dtype)
+    first = float(first)
+    unit = np.asarray(abs(range_from(first, to, place.name, "that of the orbit") - first), s.t.dtype)
     y = np.append((nodes / np.asarray(scale)).reshape(-1), 0.0)
-    no_rows = jnp.zeros((0, y.size), s.t.dtype)
+    no_rows, goal = jnp.zeros((0, y.size), s.t.dtype), Goal(integral, nodes[0])
     frame = OrbitFrame(
-        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), integral, nodes[0],
-        slope, sizes, None, no_rows, y, place, asked, problem.reasons, len(nodes),
+        flow, jnp.asarray(s.t), scale, period, unit, jnp.asarray(flat(orbit.turns), s.t.dtype), goal, slope, sizes,
+        None, no_rows, y, place, asked, problem.reasons, len(nodes),
     )  # fmt: skip
     z = np.append(y, first / unit)
     if not problem.reasons.autonomous and place.kind == NUMBER:
@@ -476,42 +351,37 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     return frame, z
 
 
-def _traced(frame, z, low, high, towards, most) -> tuple[OrbitTracer, BranchPath, list[FoundOrbit]]:
-    """Trace the branch from its start."""
+def _followed(frame, z, low, high, towards, most) -> Follower:
+    """Follow the branch from its start."""
     size = frame.scale.size
     guide = Guide(z[:size], np.zeros(size, z.dtype))
-    tracer = OrbitTracer(frame, low, high, guide, True)
-    tracer.guide = tracer.evaluated(z).guide
-    if frame.drive is None and frame.along.kind == NUMBER and not tracer.repeats(z)[1]:
+    problem = CycleProblem(frame, low, high, guide, True)
+    problem.guide = problem.evaluated(z).guide
+    if frame.drive is None and frame.along.kind == NUMBER and not problem.repeats(z)[1]:
         raise ValueError(
             f"along={frame.along.name!r}: the period of the drive changes with it, and is seen only in guards, resets "
             "or other phases than the first.\nUsual cause: a moving wall, whose frequency is the parameter.\n"
             "Fix: time in units of the period, with a drive such as cos(t) and the frequency in L; or "
             "lj.periodic_orbit for each value."
         )
-    free = _free_directions(tracer, z)
+    free = _free_directions(problem, z)
     if len(free):
         # Directions that are free at the start lead to other orbits at the same parameter; holding them selects one.
         frame = replace(frame, free=jnp.asarray(free, frame.t.dtype))
-        tracer = OrbitTracer(frame, low, high, tracer.guide, _free_are_trivial(frame, len(free)))
-    row = np.eye(z.size)[-1]
-    corrected = tracer.corrected(z, row)
-    begin = tracer.point(z if corrected is None else corrected, towards * row)
+        problem = CycleProblem(frame, low, high, problem.guide, _free_are_trivial(frame, len(free)))
+    begin = problem.begin(z, towards)
     if isinstance(begin, str):
         raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
-    tracer.moved_to(begin)
-    follower = _Follower(tracer)
-    path = tracer.trace(begin, most, follower.step)
-    if path.status == "infinity":
-        path.status = f"infinity, near {frame.along.name} = {path.points[-1].outputs.parameter:.6g}"
-    return tracer, path, follower.found
+    run = Follower(problem, most)
+    run.follow(begin)
+    return run
 
 
-def _free_directions(tracer, z):
+def _free_directions(problem, z):
     """Directions from the start to neighbouring orbits at the same parameter, (d, N)."""
-    _, jacobian, _ = tracer.at(z)
+    _, jacobian, _ = problem.residual(z)
     _, sizes, right = np.linalg.svd(jacobian)
-    rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * tracer.noise) * sizes[0]))
+    rank = int(np.sum(sizes > max(DEPENDENT, 1e2 * problem.noise) * sizes[0]))
     kernel = right[rank:]
     if len(kernel) < 2:
         return np.zeros((0, z.size - 1))
@@ -528,88 +398,28 @@ def _free_are_trivial(frame, count):
     return count <= known
 
 
-class _Follower:
-    """Inspects each step of a branch, and collects its critical points."""
-
-    def __init__(self, tracer: OrbitTracer):
-        self.tracer, self.found = tracer, []
-
-    def step(self, before: BranchPoint, after: BranchPoint, path: BranchPath) -> str | None:
-        """Put the critical points between two points into the path; return why the branch ends, or None."""
-        tracer, name = self.tracer, self.tracer.frame.along.name
-        if tracer.frame.asked.moves:
-            largest = max(point.outputs.moves for point in path.points)
-            shrinks = after.outputs.moves < AT_REST * largest
-            if shrinks or tracer.guide.rate @ tracer.evaluated(after.z).guide.rate < 0:
-                if before.outputs.moves < HALF * largest:
-                    return f"a state of rest, near {name} = {self._at_rest(path.points):.6g}"
-                # The orbit now begins and ends at an equilibrium, which takes infinitely long.
-                return f"a period that grows without end, near {name} = {before.outputs.parameter:.6g}"
-        if after.outputs.period > ENDLESS * float(tracer.frame.period):
-            return f"a period that grows without end, near {name} = {after.outputs.parameter:.6g}"
-        all_critical, earlier = between(tracer, before, after), path.points[-2:-1]
-        self._insert(path, all_critical, before, after)
-        if not all_critical and earlier and earlier[0].critical is None and before.critical is None:
-            self._insert(path, dips(tracer, earlier[0], before, after), before, after)
-        return None
-
-    def _insert(self, path, all_critical, before, after):
-        """Insert points into the path, each before or after its last point."""
-        place = len(path.points) - 1
-        along = self.tracer.weights * (after.z - before.z)
-        for critical in all_critical:
-            point = critical.point if isinstance(critical, FoundOrbit) else critical
-            if isinstance(critical, FoundOrbit):
-                point.critical = len(self.found)
-                # A multiplier has size 1 there, so the nearest other point decides the stability.
-                point.growing = None
-                self.found.append(critical)
-            if along @ (point.z - before.z) < 0:
-                path.points.insert(place, point)
-                place += 1
-            else:
-                path.points.append(point)
-
-    def _at_rest(self, points):
-        """The parameter, extrapolated to a motion of size zero.
-
-        It is linear in the square of the size; a coordinate of the start, in the size. A value that is negligible
-        compared with the range is round-off.
-        """
-        frame, b = self.tracer.frame, points[-1].outputs
-        parameter, power = b.parameter, 1 if frame.along.kind == ENTRY else 2
-        if len(points) > 1:
-            a = points[-2].outputs
-            m, n = a.moves**power, b.moves**power
-            parameter = b.parameter + (b.parameter - a.parameter) * n / (m - n) if m > n else parameter
-        return 0.0 if abs(parameter) < 1e-9 * float(frame.unit) else parameter
-
-
-def _result(orbit, problem, place, tracer, path, found, along, first, last) -> OrbitBranch:
+def _result(orbit, problem: OrbitProblem, run: Follower, first: float, last: float) -> OrbitBranch:
     """The result in the user's structure."""
+    (path,), cast, n = run.paths, run.problem.cast, len(coordinates.names(orbit.q))
     outputs = [p.outputs for p in path.points]
 
     def trees(rows: list[np.ndarray]):
-        return coordinates.like(orbit.q, np.asarray(np.stack(rows), tracer.dtype))
+        return coordinates.like(orbit.q, cast(rows)[0])
 
-    n = len(coordinates.names(orbit.q))
-    known = [i for i, p in enumerate(path.points) if p.growing is not None]
-    nearest = [min(known, key=lambda j: (abs(j - i), -j)) for i in range(len(outputs)) if known]
-    stable = np.array([path.points[j].growing == 0 for j in nearest] or [False] * len(outputs))
-    critical = [
-        CriticalOrbit(
-            found[p.critical].kind, np.asarray(p.outputs.parameter), np.asarray(found[p.critical].accuracy), i,
-            p.outputs.multipliers, found[p.critical].located,
-        ) for i, p in enumerate(path.points) if p.critical is not None
-    ]  # fmt: skip
-
+    critical = []
+    for i, point in enumerate(path.points):
+        if point.critical is not None:
+            found, at = run.found[point.critical], point.outputs
+            accuracy = np.asarray(found.accuracy * run.problem.unit)
+            critical.append(
+                CriticalOrbit(found.kind, np.asarray(at.parameter), accuracy, i, at.multipliers, found.located)
+            )
     return OrbitBranch(
-        *tracer.cast([s.parameter for s in outputs], [s.period for s in outputs]),
+        *cast([s.parameter for s in outputs], [s.period for s in outputs]),
         trees([s.nodes[0][:n] for s in outputs]), trees([s.nodes[0][n:] for s in outputs]),
-        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable,
-        np.stack([s.multipliers for s in outputs]),
-        np.stack(tracer.cast(*(s.nodes for s in outputs))), critical, _with_floats(orbit, problem), place, along,
-        first, last, path.status,
+        trees([s.low for s in outputs]), trees([s.high for s in outputs]), stable_along(path.points),
+        np.stack([s.multipliers for s in outputs]), cast([s.nodes for s in outputs])[0], critical,
+        _with_floats(orbit, problem), run.problem.along, run.problem.along.name, first, last, path.status,
     )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from lagjax.analysis.linearise import Linearisation
+from lagjax.analysis.linearise import Linearisation, pencil
 from lagjax.numerics import Roots, dense, general_roots, lapack, roots_beside_zeros, symmetric_roots, zero_count
 
 STABLE, ASYMPTOTIC, GYROSCOPIC, DIVERGENCE, FLUTTER, UNDECIDED, UNSTEADY = range(7)
@@ -118,7 +118,7 @@ def _gyroscopic(linear) -> Motions:
     rate = _rate(K, G)
     G, K = G / rate, K / rate**2
     eye, nil = jnp.eye(d, dtype=M.dtype), jnp.zeros_like(M)
-    A, E = jnp.block([[nil, eye], [-K, -G]]), jnp.block([[eye, nil], [nil, M]])
+    E, A = pencil(linear.parts._replace(mass=M, velocity=G, position=K, drift=nil, transfer=eye))
     roots = general_roots(A, E)
     values, zero = _cleaned(roots, zero_count(A, E, roots.values))
     # A root within round-off of the imaginary axis is taken to be on it.
@@ -163,9 +163,7 @@ def _general(linear) -> Motions:
     drift = drift * of_q[None, :] / of_q[:, None]
     rate = _rate(K, C, drift)
     K, C, drift = K / rate**2, C / rate, drift / rate
-    nil = jnp.zeros_like(transfer)
-    A = jnp.block([[drift, transfer], [-K, -C]])
-    E = jnp.block([[jnp.eye(count, dtype=M.dtype), nil], [nil.T, M]])
+    E, A = pencil(p._replace(mass=M, velocity=C, position=K, drift=drift, transfer=transfer))
     roots, zero = roots_beside_zeros(A, E)
     values = jnp.where(zero, 0.0, roots.values)
     # Velocity directions that change no position η and cause no force are other speeds of a steady motion.

@@ -35,6 +35,7 @@ from lagjax.analysis.balance import (
     Steady,
     SteadySymmetries,
     merged,
+    side_by_side,
 )
 from lagjax.analysis.degenerate import CREEPS_BELOW, nearest, soft_below
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
@@ -225,7 +226,7 @@ def equilibria(
         if isinstance(starts, list) or velocities is not None or not _is_a_state(system, t, starts, params):
             raise
         return equilibria(system, params, starts=[starts], cyclic=cyclic, hold=hold, t=t)
-    moving = None if velocities is None or is_traced(v) else _moving(v, count)
+    moving = None if velocities is None or is_traced(v) else np.any(side_by_side(v) != 0, axis=0)
     if cyclic is None and velocities is not None and moving is None:
         raise ValueError(
             "JAX is tracing the velocities, so it is not known which coordinates move.\n"
@@ -369,10 +370,6 @@ def _is_one(velocities, q: PyTree):
     if isinstance(velocities, list) or jax.tree.structure(velocities) != jax.tree.structure(q):
         return False
     return all(jnp.ndim(x) == y.ndim - 1 for x, y in zip(jax.tree.leaves(velocities), jax.tree.leaves(q)))
-
-
-def _moving(v: PyTree, count):
-    return np.any(np.concatenate([np.asarray(x).reshape(count, -1) for x in jax.tree.leaves(v)], axis=1) != 0, axis=0)
 
 
 @partial(compiled, in_numpy=True)

@@ -31,7 +31,7 @@ checked numerically: the accelerations at the state, and the matrices there and 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,13 +40,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
+from lagjax.analysis.balance import SINGULAR_BELOW
 from lagjax.jaxtools import compiled, is_eager, is_traced, remembered
 from lagjax.mechanics import explain_failure, forcing_and_inertia, invariance, response, where
 from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, lapack
 from lagjax.system import Model, State, check_system, constraints, coordinates, prepare
-
-# The reduced mass matrix is singular if its reciprocal condition, after scaling, is below this.
-SINGULAR_BELOW = {np.dtype("float64"): 1e-13, np.dtype("float32"): 1e-6}
 
 
 class LinearisationKind(NamedTuple):
@@ -102,6 +100,15 @@ class LinearParts(NamedTuple):
     sound: Bool[Array, ""]
     independent: Bool[Array, " m"]
     raw: Raw
+
+
+def pencil(parts: LinearParts, xp: Any = jnp):
+    """E and A of `E ẏ = A y`, y = (η, w): the pair of matrices from which all roots and shapes come."""
+    eye, corner = xp.eye(parts.drift.shape[0], dtype=parts.mass.dtype), xp.zeros_like(parts.transfer)
+    return (
+        xp.block([[eye, corner], [corner.T, parts.mass]]),
+        xp.block([[parts.drift, parts.transfer], [-parts.position, -parts.velocity]]),
+    )
 
 
 def parts_of(kind: LinearisationKind, model: Model, s: State) -> LinearParts:
@@ -453,12 +460,7 @@ class Linearisation(eqx.Module):
 
     def first_order(self) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
         """Return E and A of `E ẏ = A y`, y = (positions, velocities), without positions that nothing depends on."""
-        p = self.parts
-        eye, corner = jnp.eye(p.drift.shape[0], dtype=p.mass.dtype), jnp.zeros_like(p.transfer)
-        return (
-            jnp.block([[eye, corner], [corner.T, p.mass]]),
-            jnp.block([[p.drift, p.transfer], [-p.position, -p.velocity]]),
-        )
+        return pencil(self.parts)
 
     def eigenvalues(self) -> Complex[Array, " k"]:
         """Return all characteristic roots, `[1/t]`; a zero for each coordinate that nothing depends on."""

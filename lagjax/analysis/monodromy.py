@@ -36,6 +36,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.flow import TOLERANCE, Flow, SwitchingFlow, any_flow, flow_of, independent_rows_of, scale_of
+from lagjax.analysis.shooting import TURN, in_parts, times_of
 from lagjax.integrate import InElements, integrate, phases_in, traced_phases
 from lagjax.jaxtools import WATCHED, compiled, depends, is_eager, is_traced, numpy_of
 from lagjax.mechanics import are_angles, explain_failure, invariance
@@ -134,7 +135,6 @@ def _length(row):
 
 # The factor on the tolerance of the second run, which measures the error of the first.
 LOOSER = 10.0
-TURN = 2 * np.pi
 
 
 class Period(NamedTuple):
@@ -249,16 +249,13 @@ def _followed(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop
     first = flow.onto_constraints(t, first, scale)
     nodes = first[None] if nodes is None else nodes.at[0].set(first)
     count = len(nodes)
-    times = t + period * jnp.arange(count, dtype=t.dtype) / count
+    times = times_of(t, period, count)
     bases = [flow.tangent_space(t, z, scale) for t, z in zip(times, nodes)]
 
     def part(t: Array, z: Array, basis: Array):
         return flow.passage(t, z, period / count, basis, scale, True, differentiable)
 
-    if count == 1:
-        passed = jax.tree.map(lambda x: x[None], part(times[0], nodes[0], bases[0]))
-    else:
-        passed = jax.vmap(part)(times, nodes, jnp.stack(bases))
+    passed = in_parts(part, times, nodes, jnp.stack(bases))
     whole, after = jnp.eye(bases[0].shape[1], dtype=t.dtype), [*bases[1:], bases[0]]
     for basis, frame in zip(after, passed.frame):
         whole = basis.T @ frame @ whole
@@ -267,7 +264,7 @@ def _followed(system, s, nodes, period, rtol, reasons, rows, is_angle, in_a_loop
     ended = jnp.all(passed.ended) & jnp.all(jnp.isfinite(whole))
     if passed.returns is not None:
         ended = ended & jnp.all(passed.returns)
-    multipliers, trivial = _sorted(_without(rows_of, whole), jnp.sum(there))
+    multipliers, trivial = _sorted(without(rows_of, whole), jnp.sum(there))
     matrix = scale[:, None] * (bases[0] @ whole @ _coordinates(flow, bases[0])) / scale[None]
     multipliers = jnp.where(ended, multipliers, jnp.nan)
     apart = _apart(flow, reasons, is_angle, passed.z[-1] - first, scale)
@@ -282,9 +279,9 @@ def _coordinates(flow: Flow | SwitchingFlow, basis):
     return jnp.linalg.solve(free.T @ free, free.T)
 
 
-def _without(rows, matrix):
+def without(rows, matrix):
     """The matrix with eigenvalue 1 in the directions of `rows`, which are decoupled from the rest."""
-    rest = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - rows.T @ rows
+    rest = np.eye(matrix.shape[0], dtype=matrix.dtype) - rows.T @ rows
     return rest @ matrix @ rest + rows.T @ rows
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, PyTree
 
 from lagjax.analysis import degenerate
-from lagjax.analysis.balance import Steady, SteadySymmetries
+from lagjax.analysis.balance import Steady, SteadySymmetries, side_by_side
 from lagjax.analysis.eigenmodes import (
     ASYMPTOTIC,
     DIVERGENCE,
@@ -27,7 +27,7 @@ from lagjax.analysis.eigenmodes import (
     Motions,
     motions_of,
 )
-from lagjax.analysis.linearise import Linearisation, linearise, linearised
+from lagjax.analysis.linearise import Linearisation, linearise, linearised, pencil
 from lagjax.display import Animation, plots
 from lagjax.integrate import drawn
 from lagjax.jaxtools import compiled, is_eager, is_traced
@@ -186,7 +186,7 @@ def reason_of(modes) -> str:
 
 def label_of(i: int, modes) -> str:
     """A mode in a few words."""
-    linearisation, shape = modes.linearisation, np.abs(_flat(modes)[i])
+    linearisation, shape = modes.linearisation, np.abs(side_by_side(modes.shapes)[i])
     moved = [linearisation.names[j] for j in np.argsort(-shape.round(6), kind="stable") if shape[j] > NAMED_ABOVE]
     named = ", ".join(moved[:4]) + (", ..." if len(moved) > 4 else "")
     if bool(modes.zero[i]):
@@ -207,12 +207,6 @@ def label_of(i: int, modes) -> str:
     return f"{words}: {named}"
 
 
-def _flat(modes):
-    """The shapes as (k, N)."""
-    leaves = [np.asarray(x) for x in jax.tree.leaves(modes.shapes)]
-    return np.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
-
-
 ZERO_BELOW = 1e-9
 NEWTON_STEPS, STEADY_AFTER = 8, 1e-9
 
@@ -226,16 +220,15 @@ def with_neutral(linearisation, shapes, zero):
     words = [""] * len(zero)
     if not np.any(zero):
         return shapes, words
-    p, kind = linearisation.parts, linearisation.kind
-    drift, transfer, position, velocity = (np.asarray(x) for x in (p.drift, p.transfer, p.position, p.velocity))
-    A = np.block([[drift, transfer], [-position, -velocity]])
+    p, kind = jax.tree.map(np.asarray, linearisation.parts), linearisation.kind
+    A = pencil(p, np)[1]
     # Rows have different units, so each is scaled by its largest entry.
     size = np.max(np.abs(A), axis=1, keepdims=True)
     basis = null_space(A / np.where(size > 0, size, 1.0), ZERO_BELOW).T
-    count = drift.shape[0]
+    count = p.drift.shape[0]
     # A direction with a displacement is described by it, one without a displacement by its velocities.
-    still = basis[:, :count] @ np.asarray(p.positions).T
-    moving = basis[:, count:] @ np.asarray(p.velocities).T + basis[:, :count] @ np.asarray(p.turning).T
+    still = basis[:, :count] @ p.positions.T
+    moving = basis[:, count:] @ p.velocities.T + basis[:, :count] @ p.turning.T
     reduced = _reduced(np.concatenate([still, moving], axis=1))
     shapes, n = np.array(shapes), shapes.shape[1]
     for i, row in zip(np.flatnonzero(zero), reduced):

@@ -24,6 +24,7 @@ Source: Seydel, *Practical Bifurcation and Stability Analysis*, §7.4-7.5; Muño
 (families of conservative systems); Stoer & Bulirsch, §7.3.5 (multiple shooting).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -138,6 +139,83 @@ def _nearest(difference, turn_shifts, scale, asked):
     return jnp.where(apart[nearest] > BETTER * apart[PIECES], PIECES, nearest)
 
 
+# The equations of a cycle, which branches of cycles have too (`cycle_equations.py`).
+
+# Times, in periods, at which the rates of a driven system are compared.
+SAMPLED_AT = (0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912)
+
+
+class Goal(NamedTuple):
+    """The values that may be held: the Jacobi integral, and the entries of the state."""
+
+    integral: Float[Array, ""]
+    z: Float[Array, " 2n"]
+
+
+def times_of(t, period, count):
+    """The times of the nodes, (K,)."""
+    return t + period * jnp.arange(count, dtype=period.dtype) / count
+
+
+def in_parts(part: Callable, *given):
+    """What `part(*one)` returns of each of K parts of a period, in lanes where there are several."""
+    if len(given[0]) > 1:
+        return jax.vmap(part)(*given)
+    return jax.tree.map(lambda x: x[None], part(*(x[0] for x in given)))
+
+
+def comes_back(asked: OrbitRequest, dtype):
+    """A mask of (q, v): 1 for the entries that have to come back, 0 for relative coordinates."""
+    return jnp.asarray(np.concatenate([1.0 - np.array(asked.relative), np.ones(len(asked.relative))]), dtype)
+
+
+def left_open(asked: OrbitRequest, nodes, ends, turns, scale) -> Float[Array, "K 2n"]:
+    """How far the end of each part is from the next node, in units of `scale`."""
+    first = nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
+    left = (ends - jnp.concatenate([nodes[1:], first[None]])) / scale[None]
+    return left.at[-1].multiply(comes_back(asked, left.dtype))
+
+
+def closing_rows(frames: Float[Array, "K s k+e"], bases: Float[Array, "K s k"]) -> Float[Array, "K*s K*k+e"]:
+    """The derivative of what is left open: by coordinates along the `bases` at each node, then by e other numbers.
+
+    `frames`: how the end of each part changes. Relative coordinates count like all others.
+    """
+    (count, size, k), others = bases.shape, frames.shape[2] - bases.shape[2]
+    rows = jnp.zeros((count, size, count * k + others), bases.dtype)
+    for j in range(count):
+        after = (j + 1) % count
+        rows = rows.at[j, :, j * k : (j + 1) * k].add(frames[j, :, :k])
+        rows = rows.at[j, :, after * k : (after + 1) * k].add(-bases[after])
+    return rows.at[:, :, count * k :].set(frames[:, :, k:]).reshape(count * size, -1)
+
+
+def held_off(flow: Flow | SwitchingFlow, t, z, asked: OrbitRequest, goal: Goal, size, scale) -> list[Array]:
+    """How far what is held is from its goal: the energy in units of `size`, entries of z in those of `scale`."""
+    off = [(integral_at(flow, t, z) - goal.integral) / size] if asked.energy else []
+    return off + [(z[i] - goal.z[i]) / scale[i] for i in asked.held]
+
+
+def integral_at(flow: Flow | SwitchingFlow, t, z):
+    """The Jacobi integral v·p - L."""
+    x, u = jnp.split(z, 2)
+    value, p = jax.value_and_grad(flow.model.lagrangian, argnums=2)(t, x, u)
+    return u @ p - value
+
+
+def slope_of_integral(flow: Flow | SwitchingFlow, t, z, scale):
+    """The gradient of the Jacobi integral, with z in units of `scale`, and its size; 1 where it is zero."""
+    slope = jax.grad(partial(integral_at, flow, t))(z) * scale
+    size = jnp.linalg.norm(slope)
+    return slope, jnp.where(size > 0, size, 1.0)
+
+
+def change_in_a_period(rate: Callable, t, period):
+    """How a function of time changes from one period to the next, at the same phases of every period."""
+    times = t + period * jnp.asarray(SAMPLED_AT, period.dtype)
+    return jax.vmap(rate)(times + period) - jax.vmap(rate)(times)
+
+
 MOST = 40
 # The damping in units of the residual: its least and first values, its growth after a failed step, where to give up.
 LEAST_DAMPING, FIRST_DAMPING, DAMPING_FACTOR, TOO_MUCH_DAMPING = 0.01, 0.03, 8.0, 1e4
@@ -206,13 +284,6 @@ class Step(NamedTuple):
     moves: Float[Array, "K 2n"]
     log_period: Float[Array, ""]
     displacement: Float[Array, " 2n"]
-
-
-class Goal(NamedTuple):
-    """The values that may be held: the Jacobi integral and the state of the guess."""
-
-    integral: Float[Array, ""]
-    z: Float[Array, " 2n"]
 
 
 def closed(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, most) -> SearchResult:
@@ -286,7 +357,8 @@ def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) ->
     candidate = OrbitCandidate(nodes, found.candidate.period)
     no_frame = jnp.zeros((flow.size * 2, 0), nodes.dtype)
     passage = partial(flow.passage, span=found.candidate.period / len(nodes), frame=no_frame, scale=scale)
-    ends = jnp.stack([passage(t, z, differentiable=True).z for t, z in zip(_times(t, candidate), nodes)])
+    times = times_of(t, candidate.period, len(nodes))
+    ends = jnp.stack([passage(t, z, differentiable=True).z for t, z in zip(times, nodes)])
     residual = _residual(flow, t, candidate, ends, asked, goal, found.guess)
     # The value is that of the search, the derivative that of the step.
     change = residual - lax.stop_gradient(residual)
@@ -294,11 +366,6 @@ def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) ->
     candidate = OrbitCandidate(nodes + scale[None] * step.moves, candidate.period * (1 + step.log_period))
     displacement = ends[-1] - nodes[0] + scale * step.displacement
     return found._replace(candidate=candidate, evaluation=evaluation._replace(displacement=displacement))
-
-
-def _times(t, candidate):
-    count = len(candidate.nodes)
-    return t + candidate.period * jnp.arange(count, dtype=t.dtype) / count
 
 
 def _next_candidate(flow, t, search, asked, scale):
@@ -310,18 +377,15 @@ def _next_candidate(flow, t, search, asked, scale):
     part = jnp.minimum(1.0, LONGEST_STEP / jnp.where(longest > 0, longest, 1.0))
     candidate = OrbitCandidate(best.nodes + part * scale[None] * moves, best.period * jnp.exp(part * log_period))
     onto = jax.vmap(partial(flow.onto_constraints, scale=scale))
-    return candidate._replace(nodes=onto(_times(t, candidate), candidate.nodes))
+    return candidate._replace(nodes=onto(times_of(t, candidate.period, len(best.nodes)), candidate.nodes))
 
 
 def _evaluate(flow, t, candidate, asked, goal, guess) -> OrbitEvaluation:
     """Follow the flow from each node to the next, with the tangent spaces."""
-    times, span, scale = _times(t, candidate), candidate.period / len(candidate.nodes), guess.scale
+    count, scale = len(candidate.nodes), guess.scale
+    times, span = times_of(t, candidate.period, count), candidate.period / count
     bases = jax.vmap(lambda t, z: flow.tangent_space(t, z, scale))(times, candidate.nodes)
-    part = partial(flow.passage, span=span, scale=scale)
-    if len(candidate.nodes) == 1:
-        passed = jax.tree.map(lambda x: x[None], part(times[0], candidate.nodes[0], frame=bases[0]))
-    else:
-        passed = jax.vmap(lambda t, z, basis: part(t, z, frame=basis))(times, candidate.nodes, bases)
+    passed = in_parts(lambda t, z, basis: flow.passage(t, z, span, basis, scale), times, candidate.nodes, bases)
     displacement = passed.z[-1] - candidate.nodes[0]
     residual = _residual(flow, t, candidate, passed.z, asked, goal, guess)
     matrix, moves = _equations(flow, t, candidate, passed, bases, scale, asked)
@@ -339,19 +403,11 @@ def _evaluate(flow, t, candidate, asked, goal, guess) -> OrbitEvaluation:
 
 def _equations(flow, t, candidate, passed, bases, scale, asked):
     """The matrix (rows, K k + 1) of a Newton step, in units of `scale`, and how far the state moves in a period."""
-    count, size, k = len(candidate.nodes), 2 * flow.size, bases.shape[2]
-    comes_back = _comes_back(asked, t.dtype)
-    rates = flow.rates(_times(t, candidate), candidate.nodes, passed, candidate.period / count)
+    count, _, k = bases.shape
+    rates = flow.rates(times_of(t, candidate.period, count), candidate.nodes, passed, candidate.period / count)
     rates = rates * candidate.period / scale[None]
-    here, rates = rates[0], rates[count:] / count
-    blocks = []
-    for j in range(count):
-        after = (j + 1) % count
-        row = jnp.zeros((size, count * k + 1), t.dtype)
-        row = row.at[:, j * k : (j + 1) * k].add(passed.frame[j])
-        row = row.at[:, after * k : (after + 1) * k].add(-bases[after])
-        row = row.at[:, -1].set(rates[j] if asked.free else 0.0)
-        blocks.append(row)
+    here, by_log_period = rates[0], rates[count:] / count if asked.free else jnp.zeros_like(rates[count:])
+    blocks = [closing_rows(jnp.concatenate([passed.frame, by_log_period[:, :, None]], axis=2), bases)]
 
     def on_first_node(gradient: Array):
         return jnp.append(gradient @ bases[0], jnp.zeros((count - 1) * k + 1, t.dtype))[None]
@@ -360,42 +416,31 @@ def _equations(flow, t, candidate, passed, bases, scale, asked):
         blocks.append(on_first_node(here / jnp.where(jnp.any(here != 0), jnp.linalg.norm(here), 1.0)))
     # Held quantities have priority over the closing residual.
     blocks += [HELD_WEIGHT * on_first_node(row) for row in _held_slopes(flow, t, candidate, scale, asked)]
-    return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back))
+    return jnp.concatenate(blocks), jnp.max(jnp.abs(here * comes_back(asked, t.dtype)))
 
 
 def _residual(flow, t, candidate, ends, asked, goal, guess):
     """The residual, in the order of the matrix rows."""
-    scale, turns = guess.scale, guess.turns
-    first = candidate.nodes[0] + jnp.concatenate([TURN * turns, jnp.zeros_like(turns)])
-    left = (ends - jnp.concatenate([candidate.nodes[1:], first[None]])) / scale[None]
-    left = left.at[-1].multiply(_comes_back(asked, left.dtype))
-    parts = [left.reshape(-1)]
+    z, scale = candidate.nodes[0], guess.scale
+    parts = [left_open(asked, candidate.nodes, ends, guess.turns, scale).reshape(-1)]
     if asked.moves:
-        parts.append(jnp.zeros(1, left.dtype))
+        parts.append(jnp.zeros(1, scale.dtype))
+    size = lax.stop_gradient(slope_of_integral(flow, t, lax.stop_gradient(z), scale)[1]) if asked.energy else 1.0
+    held = held_off(flow, t, z, asked, goal, size, scale)
     if asked.energy:
-        slope = jax.grad(lambda z: integral_at(flow, t, z))(lax.stop_gradient(candidate.nodes[0])) * scale
-        size = lax.stop_gradient(jnp.linalg.norm(slope))
-        excess = integral_at(flow, t, candidate.nodes[0]) - goal.integral
         # A value below the round-off of its terms is set to zero, but keeps its derivative.
         terms = jnp.abs(goal.integral) + jnp.abs(flow.model.lagrangian(t, *jnp.split(goal.z, 2)))
-        is_round_off = lax.stop_gradient(jnp.abs(excess) <= ROUND_OFFS * jnp.finfo(excess.dtype).eps * terms)
-        excess = jnp.where(is_round_off, excess - lax.stop_gradient(excess), excess)
-        parts.append(HELD_WEIGHT * (excess / jnp.where(size > 0, size, 1.0))[None])
-    parts += [(HELD_WEIGHT * (candidate.nodes[0][i] - goal.z[i]) / scale[i])[None] for i in asked.held]
-    return jnp.concatenate(parts)
-
-
-def _comes_back(asked, dtype):
-    """A mask of (q, v): 1 for the entries that have to come back, 0 for relative coordinates."""
-    return jnp.asarray(np.concatenate([1.0 - np.array(asked.relative), np.ones(len(asked.relative))]), dtype)
+        round_off = ROUND_OFFS * jnp.finfo(terms.dtype).eps * terms / size
+        fixed = lax.stop_gradient(held[0])
+        held[0] = jnp.where(jnp.abs(fixed) <= round_off, held[0] - fixed, held[0])
+    return jnp.concatenate([*parts, *(HELD_WEIGHT * off[None] for off in held)])
 
 
 def _held_slopes(flow, t, candidate, scale, asked):
     """The gradients of the held quantities, normalised, in units of `scale`."""
     if asked.energy:
-        slope = jax.grad(lambda z: integral_at(flow, t, z))(candidate.nodes[0]) * scale
-        size = jnp.linalg.norm(slope)
-        yield slope / jnp.where(size > 0, size, 1.0)
+        slope, size = slope_of_integral(flow, t, candidate.nodes[0], scale)
+        yield slope / size
     for i in asked.held:
         yield jnp.eye(2 * flow.size, dtype=scale.dtype)[i]
 
@@ -404,7 +449,7 @@ def _step(matrix, residual, bases, asked, rtol, damping):
     """The Levenberg-Marquardt step."""
     count, size = bases.shape[:2]
     last = slice((count - 1) * size, count * size)
-    masked = matrix.at[last].multiply(_comes_back(asked, matrix.dtype)[:, None])
+    masked = matrix.at[last].multiply(comes_back(asked, matrix.dtype)[:, None])
     left, sizes, right = jnp.linalg.svd(masked, full_matrices=False)
     zero_below = jnp.maximum(ZERO_TOLERANCES * rtol, ZERO_BELOW) * jnp.maximum(1.0, sizes[0] / HELD_WEIGHT)
     counts = sizes > zero_below
@@ -414,18 +459,10 @@ def _step(matrix, residual, bases, asked, rtol, damping):
     return Step(moves, solved[-1] if asked.free else jnp.zeros_like(rtol), matrix[last] @ solved)
 
 
-def integral_at(flow, t, z):
-    """The Jacobi integral v·p - L."""
-    x, u = jnp.split(z, 2)
-    value, p = jax.value_and_grad(flow.model.lagrangian, argnums=2)(t, x, u)
-    return u @ p - value
-
-
 def _changed(flow: Flow, t, candidate, scale):
     """The largest change of the rate of one state over a period, at some times, in units of `scale` per period."""
-    times = t + candidate.period * jnp.asarray([0.0, 0.137, 0.291, 0.443, 0.618, 0.787, 0.912], t.dtype)
-    rate = jax.vmap(lambda t: flow.rate(t, candidate.nodes[0]) / scale)
-    return jnp.max(jnp.abs(rate(times) - rate(times + candidate.period))) * candidate.period
+    change = change_in_a_period(lambda t: flow.rate(t, candidate.nodes[0]) / scale, t, candidate.period)
+    return jnp.max(jnp.abs(change)) * candidate.period
 
 
 def _changed_flow(flow: SwitchingFlow, t, search, scale):

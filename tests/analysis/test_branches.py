@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.analysis.arclength import BranchPath, Tracer
+from lagjax.analysis.following import BranchPath, closes
 from lagjax.scenes import bead_on_hoop, cross_rails
 from tests.analysis.steady_systems import (  # fmt: skip  # fmt: skip
     BUCKLING,
@@ -220,13 +220,13 @@ def test_a_branch_that_stalls():
 def test_a_path_that_comes_back_is_closed():
     """Within a step of its start and in the same direction; twins: the other direction, a step away, too few points."""
     circle = np.linspace(0.0, 2 * np.pi, 41)
-    tracer = SimpleNamespace(weights=np.ones(2))
+    plane = SimpleNamespace(weights=np.ones(2), length=np.linalg.norm)
 
-    def closes(angles, turned=1.0, step=0.2):
+    def comes_back(angles, turned=1.0, step=0.2):
         along = [np.array([-np.sin(a), np.cos(a)]) for a in angles]
         along[-1] = turned * along[-1]
         points = [SimpleNamespace(z=5.0 + np.array([np.cos(a), np.sin(a)]), tangent=v) for a, v in zip(angles, along)]
-        return Tracer.closes(tracer, BranchPath(points), step)
+        return closes(plane, BranchPath(points), step)
 
-    assert closes(circle) and closes(circle[:-1], step=0.16)
-    assert not (closes(circle, -1.0) or closes(circle[:-1], step=0.15) or closes(circle[::8]))
+    assert comes_back(circle) and comes_back(circle[:-1], step=0.16)
+    assert not (comes_back(circle, -1.0) or comes_back(circle[:-1], step=0.15) or comes_back(circle[::8]))

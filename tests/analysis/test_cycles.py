@@ -7,9 +7,9 @@ import pytest
 from scipy import integrate, optimize, special
 
 import lagjax as lj
-from lagjax.analysis.arclength import BranchPoint
+from lagjax.analysis.arclength import BranchPoint, zero
 from lagjax.analysis.cycle_equations import extent
-from lagjax.analysis.cycles import CriticalOrbit, _zero
+from lagjax.analysis.cycles import CriticalOrbit
 from tests.analysis import closed_forms as known
 from tests.analysis.test_flow import BELT, FLIPS, block, bounce_of, bouncing, stick_slip
 from tests.systems import PARAMS, pendulum, rod_pendulum
@@ -116,7 +116,8 @@ def test_a_branch_that_turns():
 class Nearby:
     """A branch between points whose zero cannot be refined."""
 
-    unit, weights = 2.0, np.ones(2)
+    def length(self, step):
+        return np.linalg.norm(step)
 
     def zero_between(self, a, b, of):
         return b, np.inf
@@ -129,11 +130,12 @@ def test_a_candidate_that_is_not_located():
     """It is listed beside the nearer point, with what is known of its parameter."""
     points = [BranchPoint(np.array(z), np.eye(2), np.array(along), 1.0, None, 0, 0)
               for z, along in (([0.0, 1.0], [1.0, 0.3]), ([0.6, 1.0], [1.0, -0.1]))]  # fmt: skip
-    found = _zero(Nearby(), *points, "fold", lambda p: p.tangent[-1])
-    assert found is not None and not found.located and found.point is not points[1]
+    found = zero("fold", lambda p: p.tangent[-1], Nearby(), *points)
+    assert found is not None and not found.located
     np.testing.assert_array_equal(found.point.z, points[1].z)
-    np.testing.assert_allclose(found.accuracy, 0.6 * 0.3 * 2.0)
-    listed = CriticalOrbit("fold", np.asarray(2.0), np.asarray(found.accuracy), 1, np.ones(2, complex), found.located)
+    np.testing.assert_allclose(found.accuracy, 0.6 * 0.3)
+    off = np.asarray(2.0 * found.accuracy)
+    listed = CriticalOrbit("fold", np.asarray(2.0), off, 1, np.ones(2, complex), found.located)
     assert repr(listed) == "fold at 2 (to 4e-01)"
 
 

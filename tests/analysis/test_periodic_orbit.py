@@ -49,7 +49,7 @@ def test_pendulum_that_goes_around():
     orbit = lj.periodic_orbit(pendulum, (0.0, rate), 1.0, PARAMS)
     energy = rate**2 / 2 - G_OVER_L
     exact = integrate.quad(lambda q: 1 / np.sqrt(2 * (energy + G_OVER_L * np.cos(q))), -np.pi, np.pi, epsabs=1e-13)[0]
-    assert float(orbit.turns) == 1.0 and "turns      q +1" in repr(orbit)
+    assert float(orbit.turns) == 1.0 and "turns     q +1" in repr(orbit)
     np.testing.assert_allclose(orbit.period, exact, rtol=1e-11)
     assert closes(orbit) < 1e-8
     with pytest.warns(lj.OrbitWarning, match="no periodic orbit was found near this start"):
