@@ -252,67 +252,54 @@ def _states(model: Model, ends: Ends, found: FoundPath, t: Float[Array, " T"]):
     return model.tree(y[:, : model.n]), model.tree(u), split
 
 
-class Measures(NamedTuple):
-    """What a path alone says of a motion along it."""
-
-    action: Array | np.ndarray
-    index: Array | np.ndarray
-    amplification: Array | np.ndarray
-    mesh_error: Array | np.ndarray
-    elements: int
-    conjugate_times: np.ndarray | None = None
-
-
-def _connection(
-    model: Model, ends: Ends, aim: shoot.Aim, course: tuple, trajectory: Trajectory | None, missed: Array | np.ndarray,
-    converged: Array | np.ndarray, measures: Measures, tried: str = "", alone: str = "",
-) -> Connection:  # fmt: skip
-    """An answer; `course`: t, q, v and multipliers at the outputs."""
-    t, q, v, multipliers = course
-    action, index, amplification, mesh_error, count, times = measures
+def _connection(model: Model, ends: Ends, aim: shoot.Aim, course: tuple, **others) -> Connection:
+    """An answer; `course`: t, q, v and multipliers at the outputs, and the motion if there is one."""
     return Connection(
-        t, q, v, multipliers, trajectory, model.tree(aim.u), jax.tree.map(lambda x: x[-1], v),
-        shoot.duration(ends, aim), action, index, amplification, missed, mesh_error, converged, times, (), tried, count,
-        why_not_variational(model, ends), alone,
+        *course, start_velocity=model.tree(aim.u), end_velocity=jax.tree.map(lambda x: x[-1], course[2]),
+        duration=shoot.duration(ends, aim), why_not_variational=why_not_variational(model, ends), **others,
     )  # fmt: skip
 
 
-def _by_motion(
-    model: Model, ends: Ends, aim: shoot.Aim, trajectory: Trajectory, missed: Array, well: Array, measures: Measures,
-    tried: str = "",
-) -> Connection:  # fmt: skip
-    """A motion, without a start velocity where it misses the end, or else is no answer."""
-    converged = well & shoot.meets(trajectory, missed)
-    aim = jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), aim)
-    return _connection(model, ends, aim, _course(trajectory), trajectory, missed, converged, measures, tried)
-
-
 def _course(trajectory: Trajectory) -> tuple:
-    return trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers
+    return trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory
+
+
+def _by_motion(model: Model, ends: Ends, shot: shoot.Shot, well: Array, **measures) -> Connection:
+    """A motion, without a start velocity where it misses the end, or else is no answer."""
+    converged = well & shoot.meets(shot.trajectory, shot.size)
+    aim = jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), shot.aim)
+    fields = dict(missed=shot.size, converged=converged, conjugate_times=None, **measures)
+    return _connection(model, ends, aim, _course(shot.trajectory), **fields)
 
 
 def _by_path(model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | str, outputs: int) -> Connection:
     """The motion where it meets the end; else the path alone, and why."""
     error, at_nodes = np.max(solved.errors), np.asarray(solved.index)
-    why = why_not_variational(model, ends)
-    times = None if why or ends.kind == COMPLETE else conjugate_times(model, ends, solved.found, at_nodes)
-    index = np.asarray(-1 if why else at_nodes[-1])
-    measures = Measures(solved.action, index, solved.amplification, error, len(solved.found.path.y), times)
+    why, times = why_not_variational(model, ends), None
+    if not why and ends.kind != COMPLETE:
+        times = conjugate_times(model, ends, solved.found, at_nodes)
+    measures = dict(
+        action=solved.action, index=np.asarray(-1 if why else at_nodes[-1]), amplification=solved.amplification,
+        mesh_error=error, elements=len(solved.found.path.y), conjugate_times=times,
+    )  # fmt: skip
     if not isinstance(shot, str):
-        course = _course(shot.trajectory)
-        return _connection(model, ends, shot.aim, course, shot.trajectory, shot.size, np.asarray(True), measures)
+        found = dict(missed=shot.size, converged=np.asarray(True))
+        return _connection(model, ends, shot.aim, _course(shot.trajectory), **found, **measures)
     t = shoot.times(ends, solved.aim, outputs)
-    found = np.asarray(shot == shoot.SINGULAR and error <= UNRESOLVED[np.dtype(ends.x_a.dtype)])
-    course, unknown = (t, *_states(model, ends, solved.found, t)), np.asarray(np.nan, solved.aim.u.dtype)
-    return _connection(model, ends, solved.aim, course, None, unknown, found, measures, alone=shot)
+    resolved = error <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
+    found = dict(missed=np.asarray(np.nan, t.dtype), converged=np.asarray(shot == shoot.SINGULAR and resolved))
+    return _connection(
+        model, ends, solved.aim, (t, *_states(model, ends, solved.found, t), None), **found, **measures, alone=shot
+    )
 
 
 def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, rtol=None, **options) -> Connection:
     """The motion from a start that was found without a path, or that comes nearest."""
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
-    unknown, missed = jnp.full((), jnp.nan, found.aim.u.dtype), misses_of(model, ends, found.aim, trajectory)
-    none = Measures(unknown, jnp.asarray(-1), unknown, unknown, 0)
-    return _by_motion(model, ends, found.aim, trajectory, missed, found.part >= 1, none)
+    shot = shoot.Shot(found.aim, misses_of(model, ends, found.aim, trajectory), trajectory)
+    unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
+    none = dict(action=unknown, index=jnp.asarray(-1), amplification=unknown, mesh_error=unknown)
+    return _by_motion(model, ends, shot, found.part >= 1, **none)
 
 
 def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
@@ -359,13 +346,13 @@ def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int,
         found = found_by_shooting(model, ends, *start, 2, rtol)
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
-    error, why = jnp.max(solved.errors), why_not_variational(model, ends)
-    well = (solved.part >= 1) & (error < COARSE)
-    good = well & shoot.meets(shot.trajectory, shot.size)
-    action = jnp.where(good, _action(model, ends, solved.found), jnp.nan)
-    index = jnp.asarray(-1) if why else solved.index[-1]
-    measures = Measures(action, index, solved.amplification, error, count)
-    return _by_motion(model, ends, shot.aim, shot.trajectory, shot.size, well, measures, guess.name)
+    error = jnp.max(solved.errors)
+    well = (solved.part >= 1) & (error < COARSE) & shoot.meets(shot.trajectory, shot.size)
+    return _by_motion(
+        model, ends, shot, well, action=jnp.where(well, _action(model, ends, solved.found), jnp.nan),
+        index=jnp.asarray(-1) if why_not_variational(model, ends) else solved.index[-1],
+        amplification=solved.amplification, mesh_error=error, elements=count, tried=guess.name,
+    )  # fmt: skip
 
 
 @eqx.filter_custom_jvp

@@ -16,7 +16,7 @@ Source: Marsden & West, *Acta Numerica* 10 (2001) 357, §2.2.6; Jay, *SIAM J. Nu
 Ober-Blöbaum & Saake, *Adv. Comput. Math.* 41 (2015) 955 (order).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,8 +68,8 @@ def rule_of_degree(s: int) -> Rule:
     points, weights = legendre.leggauss(s)
     node_weights = 2 / (s * (s + 1) * legendre.legval(x, last) ** 2)
     nodes, points = (x + 1) / 2, (points + 1) / 2
-    at_points = lagrange(nodes, points)
-    return Rule(nodes, node_weights / 2, points, weights / 2, *at_points, lagrange(nodes, nodes)[1])
+    to_points, to_nodes = derivatives(nodes, points), derivatives(nodes, nodes)
+    return Rule(nodes, node_weights / 2, points, weights / 2, basis(nodes, points), to_points, to_nodes)
 
 
 def basis(nodes: np.ndarray, at: Float[Array, "..."]) -> Float[Array, "... m"]:
@@ -78,20 +78,21 @@ def basis(nodes: np.ndarray, at: Float[Array, "..."]) -> Float[Array, "... m"]:
     >>> print(basis(np.array([0.0, 1.0]), np.array(0.25)))
     [0.75 0.25]
     """
-    xp, own = numpy_of(at), np.eye(len(nodes), dtype=bool)
+    xp: Any = numpy_of(at)
+    own = np.eye(len(nodes), dtype=bool)
     factors = (xp.reshape(at, (-1, 1, 1)) - nodes[None, None]) / (nodes[:, None] - nodes + own)[None]
     return xp.prod(xp.where(own[None], 1.0, factors), axis=2).astype(at.dtype).reshape(*at.shape, len(nodes))
 
 
-def lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (k, m) from values at `nodes` (m,) to values and derivatives of their polynomial at `at` (k,)."""
-    slopes = np.zeros((len(at), len(nodes)))
+def derivatives(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Matrix (k, m) from values at `nodes` (m,) to derivatives of their polynomial at `at` (k,)."""
+    found = np.zeros((len(at), len(nodes)))
     for j, node in enumerate(nodes):
         others = np.delete(nodes, j)
         factors = (at[:, None] - others[None]) / (node - others)[None]
         for k, other in enumerate(others):
-            slopes[:, j] += np.delete(factors, k, axis=1).prod(axis=1) / (node - other)
-    return basis(nodes, at), slopes
+            found[:, j] += np.delete(factors, k, axis=1).prod(axis=1) / (node - other)
+    return found
 
 
 def integrals(points: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -104,8 +105,7 @@ def integrals(points: np.ndarray, start: np.ndarray) -> np.ndarray:
     x, weights = legendre.leggauss(len(points))
     lengths = points - start
     at = start[:, None] + lengths[:, None] * (x + 1) / 2
-    values = lagrange(points, at.ravel())[0].reshape(len(points), len(points), -1)
-    return np.einsum("i,k,ikj->ij", lengths, weights / 2, values)
+    return np.einsum("i,k,ikj->ij", lengths, weights / 2, basis(points, at))
 
 
 def linear_motion(
@@ -119,11 +119,12 @@ def linear_motion(
     >>> print(end.round(7))
     [[2.7182818]]
     """
-    xp, size = numpy_of((h, matrices, known)), matrices.shape[0] * matrices.shape[1]
+    xp: Any = numpy_of((h, matrices, known))
+    size = matrices.shape[0] * matrices.shape[1]
     # y_i = y_0 + h Σ_j (∫_0^{c_i} l_j) ẏ_j, and ẏ_j = M_j y_j; from the end on, 1 stands in the place of 0.
     reach = integrals(rule.points, np.full(rule.degree, float(backward))).astype(known.dtype)
     system = np.eye(size, dtype=known.dtype) - h * xp.einsum("ij,jab->iajb", reach, matrices).reshape(size, size)
-    inverse = np.linalg.inv if xp is np else dense.inverse
+    inverse: Any = np.linalg.inv if xp is np else dense.inverse
     inside = (inverse(system) @ xp.tile(known, (rule.degree, 1))).reshape(rule.degree, *known.shape)
     change = h * xp.einsum("j,jab,jbc->ac", rule.weights.astype(known.dtype), matrices, inside)
     return inside, known - change if backward else known + change

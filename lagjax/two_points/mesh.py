@@ -18,11 +18,13 @@ Without the second half of that rule the cut would not be where the control jump
 Gauss's points alone, and one that is beyond them in between costs less.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 from numpy.polynomial import legendre
 
 from lagjax.jaxtools import numpy_of, once
@@ -51,7 +53,8 @@ def places(parts: Float[Array, " K+1"], nodes: np.ndarray) -> Float[Array, " R"]
     >>> print(places(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.5, 1.0])), places(even(2), np.array([0.5])))
     [0.  0.5 1.  2.  3. ] [0.25 0.75]
     """
-    xp, inside = numpy_of(parts), nodes[:-1] if _are_shared(nodes) else nodes
+    xp: Any = numpy_of(parts)
+    inside = nodes[:-1] if _are_shared(nodes) else nodes
     found = (parts[:-1, None] + xp.diff(parts)[:, None] * inside[None].astype(parts.dtype)).ravel()
     return xp.concatenate([found, parts[-1:]]) if _are_shared(nodes) else found
 
@@ -83,20 +86,12 @@ def cut(parts: Float[Array, " K+1"], pieces: int = 2) -> Float[Array, " K2+1"]:
     return places(parts, np.arange(pieces + 1) / pieces)
 
 
-class Located(NamedTuple):
-    """The element of each place, its length, and at which part of it the place is."""
-
-    element: Array
-    length: Array
-    inside: Array
-
-
-def located(parts: Float[Array, " K+1"], at: Float[Array, " T"]) -> Located:
-    """The elements of places; what is beyond the mesh belongs to the first or the last one."""
-    xp = numpy_of((parts, at))
+def located(parts: Float[Array, " K+1"], at: Float[Array, " T"]) -> tuple[Array, Array, Array]:
+    """By place: the element, its length, and which part of it that is; the first and last go on beyond the mesh."""
+    xp: Any = numpy_of((parts, at))
     i = xp.clip(xp.searchsorted(parts, at, side="right") - 1, 0, len(parts) - 2)
     length = parts[i + 1] - parts[i]
-    return Located(i, length, (at - parts[i]) / length)
+    return i, length, (at - parts[i]) / length
 
 
 def between(
@@ -110,6 +105,22 @@ def between(
     """
     xp, (i, _, inside) = numpy_of((parts, values, at)), located(parts, at)
     return xp.einsum("tr,trn->tn", basis(nodes, inside), values[i])
+
+
+def stacked(tree: PyTree[Float[Array, "T ..."]]) -> Float[Array, "T n"]:
+    """All numbers of a tree at each time, in rows."""
+    xp, leaves = numpy_of(tree), jax.tree.leaves(tree)
+    return xp.concatenate([xp.reshape(x, (len(x), -1)) for x in leaves], axis=1)
+
+
+def in_groups(function: Callable, size: int, *arrays: np.ndarray) -> PyTree[np.ndarray]:
+    """A function of many elements or places, so many at a time: one program serves any number of them."""
+    count, found = len(arrays[0]), []
+    for start in range(0, count, size):
+        pieces = (x[start : start + size] for x in arrays)
+        filled = (np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) for x in pieces)
+        found.append(jax.tree.map(np.asarray, function(*filled)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
 
 
 def highest(values: Float[Array, "K s+1 n"]) -> Float[Array, "K n"]:
@@ -147,23 +158,18 @@ class Mesh(NamedTuple):
     jumps: dict[int, list[Jump]]
 
     @property
-    def moves(self) -> np.ndarray:
-        """Which of the places may move, (K + 1,)."""
-        return np.isin(np.arange(len(self.parts)), list(self.jumps))
-
-    @property
     def count(self) -> int:
         """The number of elements."""
         return len(self.parts) - 1
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Between which values each place may move."""
-        low, high, moves = self.parts.copy(), self.parts.copy(), self.moves
+        low, high = self.parts.copy(), self.parts.copy()
         for i in self.jumps:
             before, after = self.parts[i] - self.parts[i - 1], self.parts[i + 1] - self.parts[i]
             # Two neighbours that both move each have half of what lies between them.
-            low[i] -= before * ((0.5 if moves[i - 1] else 1.0) - APART)
-            high[i] += after * ((0.5 if moves[i + 1] else 1.0) - APART)
+            low[i] -= before * ((0.5 if i - 1 in self.jumps else 1.0) - APART)
+            high[i] += after * ((0.5 if i + 1 in self.jumps else 1.0) - APART)
         return low, high
 
     def halved(self) -> "Mesh":

@@ -341,15 +341,12 @@ def _searched(
     tried = "; ".join(f"{plan.name}: {_in_words(answer)}" for plan, answer in found)
     # The least one on few elements need not be one on many: the next ones follow.
     ordered = sorted((x for _, x in found if is_found(x)), key=lambda x: x.cost) or [solved]
-    layout, fine, accuracy, more = _refined(question, mesh, layout, ordered[0], most, tol)
-    iterations += more
-    for coarse in ordered[1:]:
-        if is_found(fine):
-            break
+    while True:
         layout = Layout(question.plant, mesh.count)
-        layout, fine, accuracy, more = _refined(question, mesh, layout, coarse, most, tol)
+        layout, fine, accuracy, more = _refined(question, mesh, layout, ordered.pop(0), most, tol)
         iterations += more
-    return layout, fine, accuracy, iterations, tried
+        if is_found(fine) or not ordered:
+            return layout, fine, accuracy, iterations, tried
 
 
 def _in_words(answer: SolverAnswer) -> str:

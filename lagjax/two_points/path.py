@@ -35,11 +35,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from lagjax.jaxtools import compiled, numpy_of, once
+from lagjax.jaxtools import compiled, numpy_of
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points import elements, mesh
-from lagjax.two_points.elements import Defects, Rule, basis, lagrange, rule_of_degree
+from lagjax.two_points.elements import Defects, Rule, basis, rule_of_degree
 
 FIXED, NATURAL, COMPLETE = "fixed", "natural", "complete"
 
@@ -85,7 +85,7 @@ class Path(NamedTuple):
 
     def nodes(self, ends: Ends) -> Float[Array, "K s+1 N"]:
         """All nodes of each element, the first one included."""
-        xp = numpy_of((self, ends))
+        xp: Any = numpy_of((self, ends))
         y, none = xp.asarray(self.y), np.zeros(self.y.shape[2] - ends.x_a.size, self.y.dtype)
         first = xp.concatenate([xp.asarray(ends.x_a), none])
         before = xp.concatenate([first[None], y[:-1, -1]])
@@ -99,10 +99,6 @@ class Path(NamedTuple):
     def rule(self) -> Rule:
         """The elements, which have one degree."""
         return rule_of_degree(self.y.shape[1])
-
-    def node_times(self, ends: Ends) -> Float[Array, "K s"]:
-        """The times of all nodes but the first."""
-        return ends.t_a + self.duration(ends) * mesh.after_first(self.parts, self.y.shape[1])
 
     def at(self, ends: Ends, t: Float[Array, " T"]) -> Float[Array, "T n"]:
         """The positions at any times."""
@@ -451,18 +447,12 @@ def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:
     nodes, n = path.nodes(ends), ends.x_a.size
     if nodes.shape[2] == n:
         return nodes
-    weights = jnp.asarray(_continuation(path.y.shape[1]), nodes.dtype)
+    inner = path.rule().nodes[1:]
+    weights = jnp.asarray(basis(inner, np.zeros(())), nodes.dtype)
     nodes = nodes.at[0, 0, n:].set(weights @ nodes[0, 1:, n:])
     if ends.kind == NATURAL:
         return nodes
     return nodes.at[-1, -1, n:].set(weights[::-1] @ nodes[-1, :-1, n:])
-
-
-@once
-def _continuation(s: int) -> np.ndarray:
-    """The weights of all nodes but the first in the polynomial through them, at the first."""
-    nodes = rule_of_degree(s).nodes
-    return lagrange(nodes[1:], nodes[:1])[0][0]
 
 
 # Newton's steps onto the constraints for the nodes of a straight start.
@@ -500,8 +490,9 @@ def path_through(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Floa
     nu = jnp.zeros(ends.border - ends.free_time, x.dtype)
     border = jnp.concatenate([nu, ends.duration[None]]) if ends.free_time else nu
     empty = Path(parts, x, border)
+    t = ends.t_a + empty.duration(ends) * mesh.after_first(parts, x.shape[1])
     onto = jax.vmap(lambda t, x: onto_constraints(model, t, x))
-    x = onto(empty.node_times(ends).ravel(), x.reshape(-1, x.shape[2])).reshape(x.shape)
+    x = onto(t.ravel(), x.reshape(-1, x.shape[2])).reshape(x.shape)
     return empty._replace(y=jnp.concatenate([x, jnp.zeros((*x.shape[:2], m), x.dtype)], axis=2))
 
 
@@ -564,5 +555,5 @@ def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
 def halved(ends: Ends, path: Path) -> tuple[Float[Array, "K2 s n"], Float[Array, " K2+1"]]:
     """The nodes on elements of half the length, and where these meet."""
     parts = mesh.cut(path.parts)
-    x = path.at(ends, path._replace(parts=parts, y=jnp.repeat(path.y, 2, axis=0)).node_times(ends).ravel())
-    return x.reshape(-1, path.y.shape[1], ends.x_a.size), parts
+    t = ends.t_a + path.duration(ends) * mesh.after_first(parts, path.y.shape[1])
+    return path.at(ends, t.ravel()).reshape(*t.shape, -1), parts

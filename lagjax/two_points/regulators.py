@@ -76,7 +76,7 @@ from lagjax.system import (
 )
 from lagjax.two_points.control_problem import Controlled, check_number, checked_cost, controlled, velocity_name
 from lagjax.two_points.elements import linear_motion, rule_of_degree
-from lagjax.two_points.mesh import cut, places
+from lagjax.two_points.mesh import cut, in_groups, places, stacked
 from lagjax.two_points.steering import Plan, plan_of
 
 # Rows of constraints with smaller singular values, relative, say nothing that others do not.
@@ -265,9 +265,11 @@ def about_trajectory(
 def _regulated(given: Controlled, controls: Callable, trajectory: Trajectory, cost: Callable, knots: np.ndarray, end):
     """K and x₀ on elements between knots, and S at the start."""
     rule, t = rule_of_degree(POINTS), places(knots, rule_of_degree(POINTS).points)
-    x, u = _together(partial(_states, trajectory), t)
+    x, u = in_groups(partial(_states, trajectory), TOGETHER, t)
     w = np.stack([coordinates.vector(controls(t)) for t in t])
-    about = deviations(*_together(partial(_derivatives, given, cost), t, x, u, w), coordinates.names(given.controls))
+    about = deviations(
+        *in_groups(partial(_derivatives, given, cost), TOGETHER, t, x, u, w), coordinates.names(given.controls)
+    )
     a, b, q, cross, r = about
     m, by_cross, by_b = a.shape[1], np.linalg.solve(r, cross.mT), np.linalg.solve(r, b.mT)
     a_less = a - b @ by_cross
@@ -292,19 +294,9 @@ def _cost_to_go(y: np.ndarray) -> np.ndarray:
     return np.linalg.solve(x.mT, y.mT)
 
 
-def _together(function: Callable, *arrays: np.ndarray):
-    """A function of many points, some at a time: one program serves any number of them."""
-    count, found = len(arrays[0]), []
-    for i in range(0, count, TOGETHER):
-        more = max(0, i + TOGETHER - count)
-        part = (np.concatenate([x[i : i + TOGETHER], np.repeat(x[-1:], more, axis=0)]) for x in arrays)
-        found.append(jax.tree.map(np.asarray, function(*part)))
-    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
-
-
 def _states(trajectory: Trajectory, t: np.ndarray) -> list[np.ndarray]:
     now = trajectory.at(t)
-    return [np.concatenate([np.reshape(y, (len(t), -1)) for y in jax.tree.leaves(x)], axis=1) for x in (now.q, now.v)]
+    return [stacked(now.q), stacked(now.v)]
 
 
 @compiled

@@ -41,6 +41,7 @@ from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradie
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 from lagjax.two_points.elements import residual
+from lagjax.two_points.mesh import stacked
 from lagjax.two_points.path import FIXED, NATURAL, Ends, FoundPath, Path, end_rows, path_through, unfound
 from lagjax.two_points.starts import PathGuess, sizes_of
 
@@ -201,9 +202,8 @@ class ShotCourse(NamedTuple):
 
     def strays(self, ends: Ends, trajectory: Trajectory) -> Float[Array, ""]:
         """How far a motion is from the path at its outputs, in units of the path's sizes."""
-        xp, count = numpy_of((trajectory.t, self, ends)), len(trajectory.t)
-        x = [xp.reshape(xp.asarray(q), (count, -1)) for q in jax.tree.leaves(trajectory.q)]
-        off = xp.concatenate(x, axis=1) - self.path.at(ends, trajectory.t)
+        xp = numpy_of((trajectory.t, self, ends))
+        off = stacked(trajectory.q) - self.path.at(ends, trajectory.t)
         return xp.max(xp.abs(off) / xp.asarray(self.sizes)[None])
 
     def allows(self) -> Float[Array, ""]:
@@ -394,12 +394,11 @@ DIFFERENCE = {np.dtype("float64"): 1e-5, np.dtype("float32"): 3e-3}
 
 
 class Place(NamedTuple):
-    """The last z found, for a part ε of the way, with its W and the size of the last step, relative."""
+    """The last z found, for a part ε of the way, with its W."""
 
     z: Float[Array, " z"]
     response: Float[Array, "z r"]
     part: Float[Array, ""]
-    size: Float[Array, ""]
 
 
 class _VelocitySearch(NamedTuple):
@@ -416,11 +415,10 @@ class _VelocitySearch(NamedTuple):
 
 
 class FoundVelocity(NamedTuple):
-    """The start velocity and the time, for a part of the way: all of it, where they were found; the last step."""
+    """The start velocity and the time, for a part of the way: all of it, where they were found."""
 
     aim: Aim
     part: Float[Array, ""]
-    size: Float[Array, ""]
 
 
 @compiled
@@ -432,10 +430,7 @@ def _start(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arra
 def misses_of(model: Model, ends: Ends, aim: Aim, trajectory: Trajectory) -> Float[Array, ""]:
     """By how much a motion misses what is asked, in units of what that changes by along it; without derivatives."""
     model, ends, aim, trajectory = stop_gradient((model, ends, aim, trajectory))
-    x, u = (
-        jnp.concatenate([jnp.reshape(y, (len(trajectory.t), -1)) for y in jax.tree.leaves(tree)], axis=1)
-        for tree in (trajectory.q, trajectory.v)
-    )
+    x, u = stacked(trajectory.q), stacked(trajectory.v)
     moved = jnp.maximum(jnp.max(jnp.abs(x - x[:1]), axis=0), jnp.max(jnp.abs(u), axis=0) * duration(ends, aim))
     still = jnp.max(moved) <= 0
     moved = jnp.where(still, 1.0, jnp.maximum(moved, 1e-3 * jnp.max(moved)))
@@ -476,7 +471,7 @@ def _next(
     at_round_off = (search.size < SETTLED) & (size > STEP_SHRINKS / 2 * search.size)
     there = fine & ((size < jnp.where(part < 1.0, SMALL_PART, SMALL)) | at_round_off)
     lost = ~there & ~(fine & (size < STEP_SHRINKS * search.size) & (search.steps < STEPS))
-    place = jax.tree.map(lambda new, old: jnp.where(there, new, old), Place(search.z, response, part, size), before)
+    place = jax.tree.map(lambda new, old: jnp.where(there, new, old), Place(search.z, response, part), before)
     z = jnp.where(lost | there, place.z, search.z - step)
     more = jnp.where(lost, search.more / 3, jnp.where(there, 1.5 * search.more, search.more))
     again, motions = lost | there, search.motions + 1
@@ -497,7 +492,7 @@ def found_by_shooting(
     units = jnp.concatenate([jnp.full(n, jnp.where(speed > 0, speed, 1.0)), 0 * start[n:] + ends.duration])
     units = stop_gradient(units)
     zero, none = jnp.zeros((), start.dtype), jnp.zeros((), int)
-    place = Place(start, jnp.zeros((count, rows), start.dtype), zero, zero + jnp.inf)
+    place = Place(start, jnp.zeros((count, rows), start.dtype), zero)
     search = _VelocitySearch(
         place, start, jnp.zeros(rows, start.dtype), zero + 1, zero + jnp.inf, none, none, jnp.asarray(True)
     )
@@ -514,9 +509,9 @@ def found_by_shooting(
         while search.going:
             search = iterate(search)
         place, z = search.place, np.asarray(search.place.z)
-        return FoundVelocity(_on_tangent(model, ends, Aim(z[:n], z[n:])), place.part, place.size)
+        return FoundVelocity(_on_tangent(model, ends, Aim(z[:n], z[n:])), place.part)
     place = stop_gradient(lax.while_loop(lambda search: search.going, iterate, search).place)
     last = Aim(place.z[:n], place.z[n:])
     found = implicit(model, ends, last, place.response, outputs, rtol)
     aim = jax.tree.map(lambda old, new: jnp.where(place.part < 1.0, old, new), last, found)
-    return FoundVelocity(_on_tangent(model, ends, aim), place.part, place.size)
+    return FoundVelocity(_on_tangent(model, ends, aim), place.part)

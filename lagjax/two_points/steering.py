@@ -23,6 +23,7 @@ from lagjax.jaxtools import has_jumps
 from lagjax.system import System, Traced, coordinates, takes_of
 from lagjax.two_points.control_problem import Question
 from lagjax.two_points.elements import basis
+from lagjax.two_points.mesh import stacked
 from lagjax.two_points.nonlinear_program import SolverAnswer
 from lagjax.two_points.transcription import Layout
 
@@ -59,7 +60,7 @@ class Plan(eqx.Module):
         """The controls at times (T,), as vectors (T, n)."""
         return self._vectors(np.asarray(t), np)
 
-    def _vectors(self, t: Float[Array, "..."], xp: Any) -> Float[Array, "... n"]:
+    def _vectors(self, t: ArrayLike, xp: Any) -> Any:
         starts, widths, rows = (xp.asarray(x) for x in (self.starts, self.widths, self.rows))
         place = xp.searchsorted(starts[1:], t, side="right")
         values = basis(np.array(self.nodes), (t - starts[place]) / widths[place])
@@ -328,7 +329,7 @@ def _defects(question: Question, trajectory: Trajectory) -> dict[str, float]:
 
 def _columns(tree: PyTree) -> dict[str, np.ndarray]:
     names = coordinates.names(jtu.tree_map(lambda x: np.asarray(x)[0], tree))
-    return dict(zip(names, np.concatenate([np.reshape(x, (len(x), -1)).T for x in jtu.tree_leaves(tree)])))
+    return dict(zip(names, stacked(tree).T))
 
 
 def is_found(solved: SolverAnswer) -> bool:

@@ -14,7 +14,7 @@ Leyendecker, Ober-Blöbaum, Marsden & Ortiz, *Optim. Control Appl. Meth.* 31 (20
 """
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from lagjax.two_points.elements import (
     rule_of_degree,
     velocity_constraints,
 )
-from lagjax.two_points.mesh import Mesh, between, places, rows_of
+from lagjax.two_points.mesh import Mesh, between, in_groups, places, rows_of
 
 INTERPOLATIONS = "smooth", "linear", "constant"
 
@@ -106,6 +106,29 @@ class Element(NamedTuple):
     node_multipliers: Array
     point_multipliers: Array
 
+    def equations(self, plant: Plant) -> tuple[Array, Array]:
+        """The cost of an element, and its part of the equations: virtual work, g, phi, and bounded velocities."""
+        rule = plant.rule
+        total = self.end[0] - plant.t_a
+        t, h = plant.t_a + total * self.parts[0], total * (self.parts[1] - self.parts[0])
+        states = at_points(rule, t, h, self.q)
+        u = basis(plant.control_nodes, rule.points) @ self.controls
+
+        def at_point(t: Array, x: Array, v: Array, u: Array, multipliers: Array):
+            model = plant.model(u)
+            force, p = force_and_momentum(model, t, x, v, multipliers)
+            cost = 0.0
+            if plant.cost is not None:
+                cost = plant.cost(t, model.tree(x), model.tree(v), plant.control(u), plant.params)
+            return force, p, velocity_constraints(model, t, x, v), jnp.asarray(cost, x.dtype)
+
+        force, p, phi, cost = jax.vmap(at_point)(*states, u, self.point_multipliers)
+        # Constraints are to hold whatever the controls are: these are taken where the element begins.
+        nodes = jnp.concatenate([self.q, self.node_multipliers], axis=1)
+        missed = defects(plant.model(u[0]), rule, t, h, nodes, force, p)
+        rows = missed.work, missed.g[1:], phi, states.u[:, list(plant.bounded)]
+        return h * jnp.sum(rule.weights * cost), jnp.concatenate([jnp.ravel(x) for x in rows])
+
 
 class PlanEnds(NamedTuple):
     """What the conditions at both ends see; the controls are those of the first and of the last element.
@@ -119,51 +142,26 @@ class PlanEnds(NamedTuple):
     controls: Array
     impulse: Array
 
+    def equations(self, plant: Plant) -> tuple[Array, Array]:
+        """The cost of the end, and the equations there: momenta, constraints at both ends, conditions."""
+        ts, at = (plant.t_a, self.end[0]), basis(plant.control_nodes, np.array([0.0, 1.0]))
+        rows, of_constraints = [], []
+        for i, sign in ((0, 1.0), (1, -1.0)):
+            model = plant.model(at[i] @ self.controls[i])
 
-def of_element(plant: Plant, z: Element) -> tuple[Array, Array]:
-    """The cost of an element, and its part of the equations: virtual work, g, phi, and bounded velocities."""
-    rule = plant.rule
-    total = z.end[0] - plant.t_a
-    t, h = plant.t_a + total * z.parts[0], total * (z.parts[1] - z.parts[0])
-    states = at_points(rule, t, h, z.q)
-    u = basis(plant.control_nodes, rule.points) @ z.controls
+            def g(t: Array, x: Array, model: Model = model):
+                return constraints.position_residual(model, t, x)
 
-    def at_point(t: Array, x: Array, v: Array, u: Array, multipliers: Array):
-        model = plant.model(u)
-        force, p = force_and_momentum(model, t, x, v, multipliers)
-        cost = 0.0
-        if plant.cost is not None:
-            cost = plant.cost(t, model.tree(x), model.tree(v), plant.control(u), plant.params)
-        return force, p, velocity_constraints(model, t, x, v), jnp.asarray(cost, x.dtype)
-
-    force, p, phi, cost = jax.vmap(at_point)(*states, u, z.point_multipliers)
-    # Constraints are to hold whatever the controls are: these are taken where the element begins.
-    nodes = jnp.concatenate([z.q, z.node_multipliers], axis=1)
-    missed = defects(plant.model(u[0]), rule, t, h, nodes, force, p)
-    rows = missed.work, missed.g[1:], phi, states.u[:, list(plant.bounded)]
-    return h * jnp.sum(rule.weights * cost), jnp.concatenate([jnp.ravel(x) for x in rows])
-
-
-def of_ends(plant: Plant, z: PlanEnds) -> tuple[Array, Array]:
-    """The cost of the end, and the equations there: momenta, constraints at the start and at the end, conditions."""
-    ts, at = (plant.t_a, z.end[0]), basis(plant.control_nodes, np.array([0.0, 1.0]))
-    rows, of_constraints = [], []
-    for i, sign in ((0, 1.0), (1, -1.0)):
-        model = plant.model(at[i] @ z.controls[i])
-
-        def g(t: Array, x: Array, model: Model = model):
-            return constraints.position_residual(model, t, x)
-
-        p = jax.grad(model.lagrangian, argnums=2)(ts[i], z.q[i], z.v[i])
-        phi, back = jax.vjp(lambda v: velocity_constraints(model, ts[i], z.q[i], v), z.v[i])
-        # Velocity constraints hold at points inside, and what the last step misses them by is returned at the end.
-        rows.append(sign * p + (back(z.impulse)[0] if i else 0.0))
-        value, rate = jax.jvp(g, (ts[i], z.q[i]), (jnp.ones_like(ts[i]), z.v[i]))
-        of_constraints += [rate, phi] if i else [value, rate, phi]
-    last = ts[1], plant.form.tree(z.q[1]), plant.form.tree(z.v[1]), plant.params
-    conditions = [] if plant.end is None else [coordinates.flatten(plant.end(*last))[0]]
-    cost = 0.0 if plant.end_cost is None else plant.end_cost(*last)
-    return jnp.asarray(cost, z.q.dtype), jnp.concatenate([*rows, *of_constraints, *conditions])
+            p = jax.grad(model.lagrangian, argnums=2)(ts[i], self.q[i], self.v[i])
+            phi, back = jax.vjp(lambda v: velocity_constraints(model, ts[i], self.q[i], v), self.v[i])
+            # Velocity constraints hold at points inside, and what the last step misses them by is returned at the end.
+            rows.append(sign * p + (back(self.impulse)[0] if i else 0.0))
+            value, rate = jax.jvp(g, (ts[i], self.q[i]), (jnp.ones_like(ts[i]), self.v[i]))
+            of_constraints += [rate, phi] if i else [value, rate, phi]
+        last = ts[1], plant.form.tree(self.q[1]), plant.form.tree(self.v[1]), plant.params
+        conditions = [] if plant.end is None else [coordinates.flatten(plant.end(*last))[0]]
+        cost = 0.0 if plant.end_cost is None else plant.end_cost(*last)
+        return jnp.asarray(cost, self.q.dtype), jnp.concatenate([*rows, *of_constraints, *conditions])
 
 
 def _split(form: tuple, z: Array):
@@ -172,21 +170,12 @@ def _split(form: tuple, z: Array):
     return kind(*(z[a:b].reshape(shape) for a, b, shape in zip(ends, ends[1:], shapes)))
 
 
-def _function(plant: Plant, form: tuple):
-    of = of_element if form[0] is Element else of_ends
-
-    def function(z: Array):
-        return of(plant, _split(form, z))
-
-    return function
-
-
 @compiled
 def values_and_slopes(plant: Plant, form: tuple, z: Array):
     """The costs (B,) and equations (B, r) of the parts z (B, d), and the derivatives of both."""
 
     def twice(z: Array):
-        found = _function(plant, form)(z)
+        found = _split(form, z).equations(plant)
         return found, found
 
     slopes, values = jax.vmap(jax.jacfwd(twice, has_aux=True))(z)
@@ -194,11 +183,11 @@ def values_and_slopes(plant: Plant, form: tuple, z: Array):
 
 
 @compiled
-def curvatures(plant: Plant, form: tuple, z: Array, share: Array, multipliers: Array):
+def curvatures(plant: Plant, form: tuple, share: Array, z: Array, multipliers: Array):
     """The second derivatives of `share` times the costs plus the equations times `multipliers` (B, r)."""
 
     def lagrangian(z: Array, multipliers: Array):
-        cost, rows = _function(plant, form)(z)
+        cost, rows = _split(form, z).equations(plant)
         return share * cost + jnp.dot(multipliers, rows)
 
     return jax.vmap(jax.hessian(lagrangian))(z, multipliers)
@@ -216,29 +205,17 @@ class Block(NamedTuple):
     columns: np.ndarray
     rows: np.ndarray
 
-    def _together(self, function: Callable, *arguments):
-        size = TOGETHER if len(self.columns) > 1 else 1
-        found = []
-        for start in range(0, len(self.columns), size):
-            pieces = [_filled(x[start : start + size], size) for x in arguments]
-            found.append(jax.tree.map(np.asarray, function(self.plant, self.form, *pieces)))
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(self.columns)], *found)
-
     def values_and_slopes(self, x: np.ndarray):
         """Costs (B,) and rows (B, r), and their derivatives by what each part sees, (B, d) and (B, r, d)."""
-        return self._together(values_and_slopes, x[self.columns])
+        return self._found(partial(values_and_slopes, self.plant, self.form), x[self.columns])
 
     def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray):
         """The second derivatives (B, d, d) of `share` times the cost plus the rows times `multipliers`."""
+        function = partial(curvatures, self.plant, self.form, np.asarray(share))
+        return self._found(function, x[self.columns], multipliers[self.rows])
 
-        def function(plant: Plant, form: tuple, *pieces):
-            return curvatures(plant, form, pieces[0], np.asarray(share), pieces[1])
-
-        return self._together(function, x[self.columns], multipliers[self.rows])
-
-
-def _filled(x: np.ndarray, size: int):
-    return np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) if len(x) < size else x
+    def _found(self, function: Callable, *arguments):
+        return in_groups(function, TOGETHER if len(self.columns) > 1 else 1, *arguments)
 
 
 class Layout:

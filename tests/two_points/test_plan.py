@@ -5,6 +5,7 @@ import numpy as np
 
 from lagjax.two_points.steering import plan_of
 
+
 def test_a_plan_is_its_polynomials():
     """Between knots a cubic through its points, and the next one from each knot on."""
     knots, nodes = np.array([1.0, 1.5, 3.0]), np.array([0.1, 0.3, 0.6, 0.9])
