@@ -109,8 +109,8 @@ def between(
 
 def stacked(tree: PyTree[Float[Array, "T ..."]]) -> Float[Array, "T n"]:
     """All numbers of a tree at each time, in rows."""
-    xp, leaves = numpy_of(tree), jax.tree.leaves(tree)
-    return xp.concatenate([xp.reshape(x, (len(x), -1)) for x in leaves], axis=1)
+    xp: Any = numpy_of(tree)
+    return xp.concatenate([xp.reshape(x, (len(x), -1)) for x in jax.tree.leaves(tree)], axis=1)
 
 
 def in_groups(function: Callable, size: int, *arrays: np.ndarray) -> PyTree[np.ndarray]:

@@ -294,7 +294,7 @@ def _cost_to_go(y: np.ndarray) -> np.ndarray:
     return np.linalg.solve(x.mT, y.mT)
 
 
-def _states(trajectory: Trajectory, t: np.ndarray) -> list[np.ndarray]:
+def _states(trajectory: Trajectory, t: np.ndarray) -> list[Array]:
     now = trajectory.at(t)
     return [stacked(now.q), stacked(now.v)]
 
