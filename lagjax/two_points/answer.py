@@ -264,11 +264,11 @@ def _course(trajectory: Trajectory) -> tuple:
     return trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory
 
 
-def _by_motion(model: Model, ends: Ends, shot: shoot.Shot, well: Array, **measures) -> Connection:
-    """A motion, without a start velocity where it misses the end, or else is no answer."""
+def _by_motion(model: Model, ends: Ends, shot: shoot.Shot, well: Array, action: Array, **measures) -> Connection:
+    """A motion, without a start velocity and an action where it misses the end, or else is no answer."""
     converged = well & shoot.meets(shot.trajectory, shot.size)
-    aim = jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), shot.aim)
-    fields = dict(missed=shot.size, converged=converged, conjugate_times=None, **measures)
+    aim, action = jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), (shot.aim, action))
+    fields = dict(action=action, missed=shot.size, converged=converged, conjugate_times=None, **measures)
     return _connection(model, ends, aim, _course(shot.trajectory), **fields)
 
 
@@ -298,8 +298,8 @@ def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, r
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
     shot = shoot.Shot(found.aim, misses_of(model, ends, found.aim, trajectory), trajectory)
     unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
-    none = dict(action=unknown, index=jnp.asarray(-1), amplification=unknown, mesh_error=unknown)
-    return _by_motion(model, ends, shot, found.part >= 1, **none)
+    none = dict(index=jnp.asarray(-1), amplification=unknown, mesh_error=unknown)
+    return _by_motion(model, ends, shot, found.part >= 1, unknown, **none)
 
 
 def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
@@ -347,9 +347,8 @@ def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int,
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
     error = jnp.max(solved.errors)
-    well = (solved.part >= 1) & (error < COARSE) & shoot.meets(shot.trajectory, shot.size)
     return _by_motion(
-        model, ends, shot, well, action=jnp.where(well, _action(model, ends, solved.found), jnp.nan),
+        model, ends, shot, (solved.part >= 1) & (error < COARSE), _action(model, ends, solved.found),
         index=jnp.asarray(-1) if why_not_variational(model, ends) else solved.index[-1],
         amplification=solved.amplification, mesh_error=error, elements=count, tried=guess.name,
     )  # fmt: skip

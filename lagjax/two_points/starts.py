@@ -30,7 +30,6 @@ from lagjax.jaxtools import compiled, numpy_of
 from lagjax.system import Model, coordinates
 from lagjax.two_points import mesh
 from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.mesh import stacked
 from lagjax.two_points.path import FIXED, Ends, Path, PathEquations, equations, path_through
 
 # The degree of elements.
@@ -86,7 +85,7 @@ def waves_of(random: np.random.Generator, amplitude: float, sizes: np.ndarray) -
 
 def course_of(motion: Trajectory) -> Callable:
     """The positions of a motion as a function of time, between its outputs by their velocities."""
-    return CubicHermiteSpline(motion.t, stacked(motion.q), stacked(motion.v))
+    return CubicHermiteSpline(motion.t, mesh.stacked(motion.q), mesh.stacked(motion.v))
 
 
 def nodes_of(model: Model, ends: Ends, guess: PathGuess, count: int, degree: int):
