@@ -90,7 +90,7 @@ def located(parts: Float[Array, " K+1"], at: Float[Array, " T"]) -> tuple[Array,
     """By place: the element, its length, and which part of it that is; the first and last go on beyond the mesh."""
     xp: Any = numpy_of((parts, at))
     i = xp.clip(xp.searchsorted(parts, at, side="right") - 1, 0, len(parts) - 2)
-    length = parts[i + 1] - parts[i]
+    length = xp.diff(parts)[i]
     return i, length, (at - parts[i]) / length
 
 
