@@ -1,6 +1,6 @@
 """The answer of `connect` from one start: a motion between two ends, and what kind of stationary path it is.
 
-It is found as a path, whose kind is known (`path_mesh.py`), and then as a motion (`shoot.py`). With velocity
+It is found as a path, whose kind is known (`second_variation.py`), and then as a motion (`shoot.py`). With velocity
 constraints, and forces that depend on multipliers, there is no path, and the motion is found alone (`shoot.py`).
 """
 
@@ -14,12 +14,24 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from lagjax.integrate import Trajectory, ended_well, in_turn
+from lagjax.integrate import Trajectory, in_turn
 from lagjax.jaxtools import compiled, stop_gradient
-from lagjax.system import Model, constraints
-from lagjax.two_points import elements, path_mesh, shoot
-from lagjax.two_points.elements import rule_of_degree
-from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, FoundPath, extent
+from lagjax.system import Model
+from lagjax.two_points import shoot
+from lagjax.two_points.path import (
+    COMPLETE,
+    FINE,
+    FIXED,
+    NATURAL,
+    Ends,
+    FoundPath,
+    extent,
+    found_path,
+    halved,
+    path_through,
+    states,
+)
+from lagjax.two_points.second_variation import conjugate_times, index_at_nodes
 from lagjax.two_points.shoot import FoundVelocity, found_by_shooting, misses_of, shoots_alone
 from lagjax.two_points.starts import DEGREE, PathGuess, nodes_of
 
@@ -143,10 +155,9 @@ class SolvedPath(NamedTuple):
 
 @compiled
 def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"]) -> SolvedPath:
-    start = path_mesh.path_through(model, ends, x, parts)
-    last = path_mesh.found_path(model, ends, start)
+    last = found_path(model, ends, path_through(model, ends, x, parts))
     found = last.found
-    at_nodes = path_mesh.index_at_nodes(model, found, ends.kind == NATURAL)
+    at_nodes = index_at_nodes(model, found, ends.kind == NATURAL)
     response = shoot.response_of(model, ends, found)
     scale = extent(ends, found.path)
     sizes = jnp.abs(response[: model.n, : model.n]) * scale[None] / scale[:, None] * found.path.duration(ends)
@@ -160,20 +171,9 @@ def _solved(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Arr
 def _action(model: Model, ends: Ends, found: FoundPath) -> Float[Array, ""]:
     """S of the path, whose inner nodes are held: the path is stationary, so S has its right first derivatives."""
     still = lax.stop_gradient(found.path)
-    n, rule = model.n, rule_of_degree(still.y.shape[1])
     if ends.kind == FIXED:
-        still = still._replace(y=still.y.at[-1, -1, :n].set(ends.x_b))
-    nodes, (t, h) = still.nodes(ends), still.times(ends)
-
-    def of_element(t: Array, h: Array, nodes: Array) -> Array:
-        s = elements.discrete_action(model, rule, t, h, nodes[:, :n])
-        if nodes.shape[1] == n:
-            return s
-        times = t + h * rule.nodes.astype(nodes.dtype)
-        g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times, nodes[:, :n])
-        return s + h * jnp.sum(rule.node_weights.astype(nodes.dtype)[:, None] * g * nodes[:, n:])
-
-    return jnp.sum(jax.vmap(of_element)(t, h, nodes))
+        still = still._replace(y=still.y.at[-1, -1, : model.n].set(ends.x_b))
+    return still.action(model, ends)
 
 
 def why_not_variational(model: Model, ends: Ends) -> str:
@@ -198,7 +198,7 @@ def answer_from(
         if not bool(answer.converged):
             return shot, None, f"the motion misses the end by {float(answer.missed):.1g} of its extent"
         return shot, answer, "found"
-    fine = path_mesh.FINE.get(np.dtype(x.dtype), 1e-3)
+    fine = FINE.get(np.dtype(x.dtype), 1e-3)
     solved, error = _refined(model, ends, x, parts, fine)
     reach = np.max(np.abs(np.asarray(x) - np.asarray(ends.x_a)), axis=(0, 1))
     if 0 < np.max(np.asarray(solved.course.sizes)[reach > 0] / reach[reach > 0], initial=0.0) < AT_REST:
@@ -215,7 +215,7 @@ def answer_from(
     # A motion that amplifies errors needs a start that is as good as the path can be.
     for i in range(1 + FINER if isinstance(shot, str) and shot != shoot.SINGULAR else 0):
         if i:
-            x, parts = path_mesh.halved(ends, solved.found.path)
+            x, parts = halved(ends, solved.found.path)
             finer = _solved(model, ends, x, parts)
             if 2 * len(x) > MOST_ELEMENTS or not float(finer.part) >= 1 or not float(finer.course.error) < error:
                 break
@@ -227,7 +227,7 @@ def answer_from(
     resolved = error <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
     if isinstance(shot, str) and shot != shoot.SINGULAR and not resolved:
         return solved, None, f"neither {len(solved.errors)} elements nor a motion follow the path"
-    answer = _connection(model, ends, solved, shot, outputs)
+    answer = _by_path(model, ends, solved, shot, outputs)
     return solved, answer, "found" if bool(answer.converged) else f"a path alone, {answer.alone}"
 
 
@@ -241,53 +241,65 @@ def _refined(model: Model, ends: Ends, x: Array, parts: Array, fine: float) -> t
         if part < 1 or error <= fine or 2 * len(x) > MOST_ELEMENTS or error > before / 2:
             return solved, error if part >= 1 else np.inf
         before = error
-        x, parts = path_mesh.halved(ends, solved.found.path)
+        x, parts = halved(ends, solved.found.path)
 
 
 @compiled
 def _states(model: Model, ends: Ends, found: FoundPath, t: Float[Array, " T"]):
     """Positions, velocities and multipliers of a path."""
-    y, u = path_mesh.states(ends, found.path, t)
+    y, u = states(ends, found.path, t)
     split = jax.vmap(model.split)(y[:, model.n :]) if model.m else {}
     return model.tree(y[:, : model.n]), model.tree(u), split
 
 
-def _connection(
-    model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | str, outputs: int, words: str = ""
-) -> Connection:
-    """The motion where it meets the end; else the path alone, and why."""
-    aim, trajectory, missed = solved.aim, None, np.asarray(np.nan, solved.aim.u.dtype)
-    followed, resolved = not isinstance(shot, str), np.max(solved.errors) <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
-    if not isinstance(shot, str):
-        aim, missed, trajectory = shot
-        t, q, v, multipliers = (getattr(trajectory, name) for name in ("t", "q", "v", "multipliers"))
-    else:
-        t = shoot.times(ends, aim, outputs)
-        q, v, multipliers = _states(model, ends, solved.found, t)
-    why = why_not_variational(model, ends)
-    at_nodes = np.asarray(solved.index)
-    times = None if why or ends.kind == COMPLETE else path_mesh.conjugate_times(model, ends, solved.found, at_nodes)
-    last = jax.tree.map(lambda x: x[-1], v)
+def _connection(model: Model, ends: Ends, aim: shoot.Aim, course: tuple, **others) -> Connection:
+    """An answer; `course`: t, q, v and multipliers at the outputs, and the motion if there is one."""
     return Connection(
-        t, q, v, multipliers, trajectory, model.tree(aim.u), last, shoot.duration(ends, aim), solved.action,
-        np.asarray(-1 if why else at_nodes[-1]), solved.amplification, missed, np.max(solved.errors),
-        np.asarray(followed or shot == shoot.SINGULAR and resolved), times, (), words, len(solved.found.path.y), why,
-        "" if followed else shot,
+        *course, start_velocity=model.tree(aim.u), end_velocity=jax.tree.map(lambda x: x[-1], course[2]),
+        duration=shoot.duration(ends, aim), why_not_variational=why_not_variational(model, ends), **others,
     )  # fmt: skip
+
+
+def _course(trajectory: Trajectory) -> tuple:
+    return trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory
+
+
+def _by_motion(model: Model, ends: Ends, shot: shoot.Shot, well: Array, action: Array, **measures) -> Connection:
+    """A motion, without a start velocity and an action where it misses the end, or else is no answer."""
+    converged = well & shoot.meets(shot.trajectory, shot.size)
+    aim, action = jax.tree.map(lambda x: jnp.where(converged, x, jnp.nan), (shot.aim, action))
+    fields = dict(action=action, missed=shot.size, converged=converged, conjugate_times=None, **measures)
+    return _connection(model, ends, aim, _course(shot.trajectory), **fields)
+
+
+def _by_path(model: Model, ends: Ends, solved: SolvedPath, shot: shoot.Shot | str, outputs: int) -> Connection:
+    """The motion where it meets the end; else the path alone, and why."""
+    error, at_nodes = np.max(solved.errors), np.asarray(solved.index)
+    why, times = why_not_variational(model, ends), None
+    if not why and ends.kind != COMPLETE:
+        times = conjugate_times(model, ends, solved.found, at_nodes)
+    measures = dict(
+        action=solved.action, index=np.asarray(-1 if why else at_nodes[-1]), amplification=solved.amplification,
+        mesh_error=error, elements=len(solved.found.path.y), conjugate_times=times,
+    )  # fmt: skip
+    if not isinstance(shot, str):
+        found = dict(missed=shot.size, converged=np.asarray(True))
+        return _connection(model, ends, shot.aim, _course(shot.trajectory), **found, **measures)
+    t = shoot.times(ends, solved.aim, outputs)
+    resolved = error <= UNRESOLVED[np.dtype(ends.x_a.dtype)]
+    found = dict(missed=np.asarray(np.nan, t.dtype), converged=np.asarray(shot == shoot.SINGULAR and resolved))
+    return _connection(
+        model, ends, solved.aim, (t, *_states(model, ends, solved.found, t), None), **found, **measures, alone=shot
+    )
 
 
 def _by_shooting(model: Model, ends: Ends, found: FoundVelocity, outputs: int, rtol=None, **options) -> Connection:
     """The motion from a start that was found without a path, or that comes nearest."""
-    unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
     trajectory = shoot.motion(model, ends, found.aim, outputs, rtol, **options)
-    missed = misses_of(model, ends, found, trajectory)
-    there = (found.part >= 1) & ended_well(trajectory.result) & (missed < shoot.MET.get(np.dtype(missed.dtype), 1e-3))
-    aim = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan), found.aim)
-    return Connection(
-        trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
-        jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim), unknown, jnp.asarray(-1), unknown,
-        missed, unknown, there, None, (), "", 0, why_not_variational(model, ends),
-    )  # fmt: skip
+    shot = shoot.Shot(found.aim, misses_of(model, ends, found.aim, trajectory), trajectory)
+    unknown = jnp.full((), jnp.nan, found.aim.u.dtype)
+    none = dict(index=jnp.asarray(-1), amplification=unknown, mesh_error=unknown)
+    return _by_motion(model, ends, shot, found.part >= 1, unknown, **none)
 
 
 def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outputs: int, words: str) -> Connection:
@@ -295,7 +307,7 @@ def not_found(model: Model, ends: Ends, solved: SolvedPath | FoundVelocity, outp
     if isinstance(solved, FoundVelocity):
         nearest = _by_shooting(model, ends, solved, outputs, throw=False, estimate_error=False)
     else:
-        nearest = _connection(model, ends, solved, "", outputs)
+        nearest = _by_path(model, ends, solved, "", outputs)
     nothing = np.asarray(np.nan, nearest.t.dtype)
     velocities = jax.tree.map(lambda x: np.full(np.shape(x), nothing), (nearest.start_velocity, nearest.end_velocity))
     return replace(
@@ -334,15 +346,11 @@ def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int,
         found = found_by_shooting(model, ends, *start, 2, rtol)
         return _by_shooting(model, ends, found, outputs, rtol, throw=False, estimate_error=False)
     solved, shot = _search((model, ends), start, jnp.asarray(rtol, ends.x_a.dtype), outputs=outputs)
-    met = shot.size < shoot.MET.get(np.dtype(ends.x_a.dtype), 1e-3)
-    good = (solved.part >= 1) & (jnp.max(solved.errors) < COARSE) & met & ended_well(shot.trajectory.result)
-    aim = jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), shot.aim)
-    why, trajectory = why_not_variational(model, ends), shot.trajectory
-    return Connection(
-        trajectory.t, trajectory.q, trajectory.v, trajectory.multipliers, trajectory, model.tree(aim.u),
-        jax.tree.map(lambda x: x[-1], trajectory.v), shoot.duration(ends, aim),
-        jnp.where(good, _action(model, ends, solved.found), jnp.nan), jnp.asarray(-1) if why else solved.index[-1],
-        solved.amplification, shot.size, jnp.max(solved.errors), good, None, (), guess.name, count, why,
+    error = jnp.max(solved.errors)
+    return _by_motion(
+        model, ends, shot, (solved.part >= 1) & (error < COARSE), _action(model, ends, solved.found),
+        index=jnp.asarray(-1) if why_not_variational(model, ends) else solved.index[-1],
+        amplification=solved.amplification, mesh_error=error, elements=count, tried=guess.name,
     )  # fmt: skip
 
 
@@ -364,7 +372,7 @@ def _search_jvp(primals: tuple, tangents: tuple, *, outputs: int):
     solved, shot = _search(problem, start, rtol, outputs=outputs)
 
     def at_answer(problem: tuple[Model, Ends]) -> tuple[shoot.Aim, Trajectory]:
-        aim = shoot.implicit(*problem, shot.aim, solved.response, rtol)
+        aim = shoot.implicit(*problem, shot.aim, solved.response, 2, rtol)
         return aim, shoot.motion(*problem, aim, outputs, rtol, throw=False, estimate_error=False)
 
     _, (aim, trajectory) = eqx.filter_jvp(at_answer, (problem,), (tangents[0],))

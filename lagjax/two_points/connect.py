@@ -30,10 +30,9 @@ from lagjax.system import (
     model_of,
     traced_call,
 )
-from lagjax.two_points import path_mesh
 from lagjax.two_points import starts as descent
 from lagjax.two_points.answer import Connection, answer_from, inside, is_same, not_found, why_not_variational
-from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends
+from lagjax.two_points.path import COMPLETE, FIXED, NATURAL, Ends, onto_constraints
 from lagjax.two_points.shoot import launches_of, shoots_alone
 from lagjax.two_points.starts import DEGREE, Nodes, PathGuess, Starts, guesses_of, nodes_of, sizes_of
 
@@ -110,7 +109,7 @@ def connect(
     too many or too few conditions. Warns (`ConnectWarning`) where no motion was found, or a path that no motion
     follows to its end; under `jit` and `vmap` `converged` says so, and the start velocity and the action are NaN.
 
-    Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`, `path_mesh.py`.
+    Source: Milnor, *Morse Theory*, §15; Marsden & West, *Acta Numerica* 10 (2001) 357. See `path.py`.
     """
     goes_down = isinstance(starts, int | np.integer) and starts > 1
     return connected(
@@ -304,9 +303,7 @@ def _too_many(model: Model, free_time: bool) -> str:
     )
 
 
-@compiled
-def _onto_constraints(model: Model, t: Array, x: Array) -> Array:
-    return path_mesh.onto_constraints(model, t, x)
+_onto_constraints = compiled(onto_constraints)
 
 
 def _on_constraints(model: Model, t: Array, x: Array, name: str) -> Array:

@@ -16,7 +16,7 @@ Source: Marsden & West, *Acta Numerica* 10 (2001) 357, §2.2.6; Jay, *SIAM J. Nu
 Ober-Blöbaum & Saake, *Adv. Comput. Math.* 41 (2015) 955 (order).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
-from lagjax.jaxtools import once
+from lagjax.jaxtools import numpy_of, once
 from lagjax.mechanics import applied_force
+from lagjax.numerics import dense
 from lagjax.system import Model, constraints
 
 
@@ -67,20 +68,31 @@ def rule_of_degree(s: int) -> Rule:
     points, weights = legendre.leggauss(s)
     node_weights = 2 / (s * (s + 1) * legendre.legval(x, last) ** 2)
     nodes, points = (x + 1) / 2, (points + 1) / 2
-    at_points = lagrange(nodes, points)
-    return Rule(nodes, node_weights / 2, points, weights / 2, *at_points, lagrange(nodes, nodes)[1])
+    to_points, to_nodes = derivatives(nodes, points), derivatives(nodes, nodes)
+    return Rule(nodes, node_weights / 2, points, weights / 2, basis(nodes, points), to_points, to_nodes)
 
 
-def lagrange(nodes: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (k, m) from values at `nodes` (m,) to values and derivatives of their polynomial at `at` (k,)."""
-    values, slopes = np.empty((len(at), len(nodes))), np.zeros((len(at), len(nodes)))
+def basis(nodes: np.ndarray, at: Float[Array, "..."]) -> Float[Array, "... m"]:
+    """The polynomials that are one at one of the nodes (m,) and zero at the others, at any places.
+
+    >>> print(basis(np.array([0.0, 1.0]), np.array(0.25)))
+    [0.75 0.25]
+    """
+    xp: Any = numpy_of(at)
+    own = np.eye(len(nodes), dtype=bool)
+    factors = (xp.reshape(at, (-1, 1, 1)) - nodes[None, None]) / (nodes[:, None] - nodes + own)[None]
+    return xp.prod(xp.where(own[None], 1.0, factors), axis=2).astype(at.dtype).reshape(*at.shape, len(nodes))
+
+
+def derivatives(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Matrix (k, m) from values at `nodes` (m,) to derivatives of their polynomial at `at` (k,)."""
+    found = np.zeros((len(at), len(nodes)))
     for j, node in enumerate(nodes):
         others = np.delete(nodes, j)
         factors = (at[:, None] - others[None]) / (node - others)[None]
-        values[:, j] = factors.prod(axis=1)
         for k, other in enumerate(others):
-            slopes[:, j] += np.delete(factors, k, axis=1).prod(axis=1) / (node - other)
-    return values, slopes
+            found[:, j] += np.delete(factors, k, axis=1).prod(axis=1) / (node - other)
+    return found
 
 
 def integrals(points: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -93,8 +105,29 @@ def integrals(points: np.ndarray, start: np.ndarray) -> np.ndarray:
     x, weights = legendre.leggauss(len(points))
     lengths = points - start
     at = start[:, None] + lengths[:, None] * (x + 1) / 2
-    values = lagrange(points, at.ravel())[0].reshape(len(points), len(points), -1)
-    return np.einsum("i,k,ikj->ij", lengths, weights / 2, values)
+    return np.einsum("i,k,ikj->ij", lengths, weights / 2, basis(points, at))
+
+
+def linear_motion(
+    rule: Rule, h: Array | float, matrices: Float[Array, "s m m"], known: Float[Array, "m c"], backward: bool = False
+) -> tuple[Float[Array, "s m c"], Float[Array, "m c"]]:
+    """The solutions of ẏ = M y by Gauss's collocation: at the points of an element, and at its end.
+
+    From what is known at the start, with M at the points; `backward` from the end to the start.
+
+    >>> _, end = linear_motion(rule_of_degree(4), 1.0, np.ones((4, 1, 1)), np.ones((1, 1)))
+    >>> print(end.round(6))
+    [[2.718282]]
+    """
+    xp: Any = numpy_of((h, matrices, known))
+    size = matrices.shape[0] * matrices.shape[1]
+    # y_i = y_0 + h Σ_j (∫_0^{c_i} l_j) ẏ_j, and ẏ_j = M_j y_j; from the end on, 1 stands in the place of 0.
+    reach = integrals(rule.points, np.full(rule.degree, float(backward))).astype(known.dtype)
+    system = np.eye(size, dtype=known.dtype) - h * xp.einsum("ij,jab->iajb", reach, matrices).reshape(size, size)
+    inverse: Any = np.linalg.inv if xp is np else dense.inverse
+    inside = (inverse(system) @ xp.tile(known, (rule.degree, 1))).reshape(rule.degree, *known.shape)
+    change = h * xp.einsum("j,jab,jbc->ac", rule.weights.astype(known.dtype), matrices, inside)
+    return inside, known - change if backward else known + change
 
 
 class PointStates(NamedTuple):
@@ -113,12 +146,12 @@ def at_points(rule: Rule, t: Array, h: Array, nodes: Float[Array, "s+1 n"]) -> P
 
 
 def force_and_momentum(
-    model: Model, t: Array, x: Array, u: Array, multipliers: Float[Array, " mv"] | None = None
+    model: Model, t: Array, x: Array, u: Array, multipliers: Float[Array, " mv"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """f = ∂L/∂q + Q - ∂R/∂v + Aᵀ μ and p = ∂L/∂v at one state; μ of the velocity constraints alone, stacked."""
     gradient, p = jax.grad(model.lagrangian, argnums=(1, 2))(t, x, u)
     f = gradient + applied_force(model, t, x, u)
-    if multipliers is not None and multipliers.size:
+    if multipliers.size:
         f = f + jax.vjp(lambda u: velocity_constraints(model, t, x, u), u)[1](multipliers)[0]
     return f, p
 
@@ -130,17 +163,28 @@ def virtual_work(rule: Rule, h: Array, force: Float[Array, "s n"], momentum: Flo
     return h * (rule.interpolation.T.astype(dtype) @ (w * force)) + rule.derivative.T.astype(dtype) @ (w * momentum)
 
 
-def constraint_impulse(
-    model: Model, rule: Rule, t: Array, h: Array, nodes: Float[Array, "s+1 n"], multipliers: Float[Array, "s+1 mh"]
-) -> Float[Array, "s+1 n"]:
-    """h b_j Gᵀ λ_j at the nodes of an element."""
+class Defects(NamedTuple):
+    """By how much an element misses its equations: R, and the holonomic constraints g, at its nodes."""
 
-    def at(t: Array, x: Array, multipliers: Array) -> Array:
-        return jax.vjp(lambda x: constraints.position_residual(model, t, x), x)[1](multipliers)[0]
+    work: Float[Array, "s+1 n"]
+    g: Float[Array, "s+1 m"]
 
-    dtype = nodes.dtype
-    times = t + h * rule.nodes.astype(dtype)
-    return h * rule.node_weights.astype(dtype)[:, None] * jax.vmap(at)(times, nodes, multipliers)
+
+def of_constraints(model: Model, t: Array, node: Float[Array, " N"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """Gᵀ λ and g at a node (x, λ)."""
+    g, back = jax.vjp(lambda x: constraints.position_residual(model, t, x), node[: model.n])
+    return back(node[model.n :])[0], g
+
+
+def defects(
+    model: Model, rule: Rule, t: Array, h: Array, nodes: Float[Array, "s+1 N"], force: Array, momentum: Array
+) -> Defects:
+    """R and g of an element with nodes (x, λ), from f and p (s, n) at its points."""
+    work, dtype = virtual_work(rule, h, force, momentum), nodes.dtype
+    if nodes.shape[1] == model.n:
+        return Defects(work, jnp.zeros((len(nodes), 0), dtype))
+    impulse, g = jax.vmap(lambda t, node: of_constraints(model, t, node))(t + h * rule.nodes.astype(dtype), nodes)
+    return Defects(work + h * rule.node_weights.astype(dtype)[:, None] * impulse, g)
 
 
 def residual(
@@ -148,25 +192,25 @@ def residual(
     rule: Rule,
     t: Array,
     h: Array,
-    nodes: Float[Array, "s+1 n"],
-    node_multipliers: Float[Array, "s+1 mh"] | None = None,
+    nodes: Float[Array, "s+1 N"],
     point_multipliers: Float[Array, "s mv"] | None = None,
-) -> Float[Array, "s+1 n"]:
-    """R of an element."""
-    states = at_points(rule, t, h, nodes)
-    if point_multipliers is None:
-        f, p = jax.vmap(lambda t, x, u: force_and_momentum(model, t, x, u))(*states)
-    else:
-        f, p = jax.vmap(lambda *state: force_and_momentum(model, *state))(*states, point_multipliers)
-    work = virtual_work(rule, h, f, p)
-    if node_multipliers is None or node_multipliers.shape[1] == 0:
-        return work
-    return work + constraint_impulse(model, rule, t, h, nodes, node_multipliers)
+) -> Defects:
+    """R and g of an element with nodes (x, λ)."""
+    states = at_points(rule, t, h, nodes[:, : model.n])
+    multipliers = jnp.zeros((rule.degree, 0), nodes.dtype) if point_multipliers is None else point_multipliers
+    f, p = jax.vmap(lambda *state: force_and_momentum(model, *state))(*states, multipliers)
+    return defects(model, rule, t, h, nodes, f, p)
 
 
-def discrete_action(model: Model, rule: Rule, t: Array, h: Array, nodes: Float[Array, "s+1 n"]) -> Float[Array, ""]:
-    """The integral of L over an element by Gauss's rule."""
-    return h * rule.weights.astype(nodes.dtype) @ jax.vmap(model.lagrangian)(*at_points(rule, t, h, nodes))
+def discrete_action(model: Model, rule: Rule, t: Array, h: Array, nodes: Float[Array, "s+1 N"]) -> Float[Array, ""]:
+    """The integral of L over an element by Gauss's rule, and h Σ b_j g·λ_j: without Q, R and μ its derivative by (x, λ)
+    is R and h b_j g."""
+    dtype, (x, multipliers) = nodes.dtype, jnp.split(nodes, [model.n], axis=1)
+    action = h * rule.weights.astype(dtype) @ jax.vmap(model.lagrangian)(*at_points(rule, t, h, x))
+    if not multipliers.size:
+        return action
+    g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(t + h * rule.nodes.astype(dtype), x)
+    return action + h * jnp.sum(rule.node_weights.astype(dtype)[:, None] * g * multipliers)
 
 
 def velocity_constraints(model: Model, t: Array, x: Array, u: Array) -> Float[Array, " mv"]:

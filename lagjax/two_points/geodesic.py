@@ -33,11 +33,11 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import accelerations_at, listed
-from lagjax.numerics import dense
 from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare
 from lagjax.two_points.answer import Connection, is_same
 from lagjax.two_points.connect import ELEMENTS, connected
-from lagjax.two_points.elements import integrals, rule_of_degree
+from lagjax.two_points.elements import linear_motion, rule_of_degree
+from lagjax.two_points.mesh import even, places
 from lagjax.two_points.starts import Starts, guesses_of
 
 TURN = 2 * np.pi
@@ -350,8 +350,7 @@ def parallel_transport(
         start = path(t_a)
     model, s = prepare(system, t_a, start, w, params)
     dtype, rule = s.t.dtype, rule_of_degree(POINTS)
-    h = (t_b - t_a) / elements
-    t = (t_a + h * (np.arange(elements)[:, None] + rule.points).ravel()).astype(dtype)
+    t = (t_a + (t_b - t_a) * places(even(elements), rule.points)).astype(dtype)
     if isinstance(path, Geodesic):
         # The first output is the start.
         ts = np.concatenate([t_a[None], t])
@@ -364,7 +363,7 @@ def parallel_transport(
 
         x, u = jax.vmap(at)(t)
     w, x_a = model.vector(s.v), model.vector(s.q)
-    carried = _carried(model, t, x, u, jnp.asarray(h, dtype), w)
+    carried = _carried(model, t, x, u, jnp.asarray((t_b - t_a) / elements, dtype), w)
     if not model.m:
         return model.tree(carried)
     bound = OFF.get(np.dtype(dtype), 1e-4)
@@ -419,8 +418,6 @@ def _carried(
 ) -> Float[Array, " n"]:
     """w from element to element, from states at Gauss's points."""
     rule, n = rule_of_degree(POINTS), model.n
-    size, weights = POINTS * n, jnp.asarray(rule.weights, w.dtype)
-    reach = jnp.asarray(integrals(rule.points, np.zeros(POINTS)), w.dtype)
 
     def turning(t: Array, x: Array, u: Array) -> Array:
         """½ ∂a/∂v."""
@@ -429,10 +426,6 @@ def _carried(
         return a(u) / 2
 
     def across(w: Array, matrices: Array):
-        # The rates k_i = M_i (w + h Σ_j a_ij k_j).
-        known = jnp.einsum("iab,b->ia", matrices, w).reshape(size)
-        system = jnp.eye(size, dtype=w.dtype) - h * jnp.einsum("ij,iab->iajb", reach, matrices).reshape(size, size)
-        rates = (dense.inverse(system) @ known).reshape(POINTS, n)
-        return w + h * weights @ rates, None
+        return linear_motion(rule, h, matrices, w[:, None])[1][:, 0], None
 
     return lax.scan(across, w, jax.vmap(turning)(t, x, u).reshape(-1, POINTS, n, n))[0]

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
-from scipy.interpolate import CubicHermiteSpline
 
 from lagjax.mechanics import listed
 from lagjax.system import System, coordinates
 from lagjax.two_points.control_problem import Question, asked
+from lagjax.two_points.mesh import Jump, Mesh, even, jumps_of, places
 from lagjax.two_points.nonlinear_program import NonlinearProgram, SolverAnswer, import_casadi
 from lagjax.two_points.path import FIXED, Ends
-from lagjax.two_points.starts import WAVES, Sizes, sizes_of
+from lagjax.two_points.starts import WAVES, Sizes, course_of, sizes_of, waves_of
 from lagjax.two_points.steering import (
     STATUS,
     Accuracy,
@@ -35,7 +35,7 @@ from lagjax.two_points.steering import (
     is_found,
     steering_of,
 )
-from lagjax.two_points.transcription import Layout, Mesh, jumps_of, moved
+from lagjax.two_points.transcription import Layout, moved
 
 # The waves on the path, in units of its sizes, and on controls, in units of half their bounds; and the parts of the
 # time that a start waits for, in turn.
@@ -138,9 +138,8 @@ def _as_before(guess: Steering, share: float) -> float:
 
 
 def _path_of(guess: Steering) -> Callable:
-    motion, flat = guess.trajectory, jax.vmap(lambda tree: coordinates.flatten(tree)[0])
-    spline = CubicHermiteSpline(motion.t, np.asarray(flat(motion.q)), np.asarray(flat(motion.v)))
-    return lambda shares: spline([_as_before(guess, share) for share in shares])
+    course = course_of(guess.trajectory)
+    return lambda shares: course([_as_before(guess, share) for share in shares])
 
 
 def _moved_to_ends(question: Question, path: Callable) -> Callable:
@@ -165,10 +164,9 @@ def random_plans(question: Question, first: FirstPlan, count: int, known: np.nda
     largest = np.maximum(np.max(np.abs(known), axis=0), np.abs(question.controls))
     with np.errstate(invalid="ignore"):
         of_controls = np.where(np.isfinite(high - low), (high - low) / 2, largest)
-    falling = 1 / np.arange(1, WAVES + 1)[:, None]
     for i in range(count):
-        on_path = ON_PATH[i % len(ON_PATH)] * falling * random.normal(size=(WAVES, sizes.size)) * sizes
-        on_controls = ON_CONTROLS * falling * random.normal(size=(WAVES, of_controls.size)) * of_controls
+        on_path = waves_of(random, ON_PATH[i % len(ON_PATH)], sizes)
+        on_controls = waves_of(random, ON_CONTROLS, of_controls)
         plans.append(_waved(first, on_path, on_controls, WAITS[i % len(WAITS)], f"random start {i + 1}"))
     return plans
 
@@ -204,15 +202,11 @@ def unknowns(question: Question, layout: Layout, mesh: Mesh, plan: FirstPlan) ->
     """The unknowns of a start."""
     plant, at, x = question.plant, layout.places, np.zeros(layout.size)
     x[at["end"]], x[at["parts"]] = plan.t_b, mesh.parts
-    width = np.diff(mesh.parts)[:, None]
-    shares = np.append((mesh.parts[:-1, None] + width * plant.rule.nodes[:-1]).ravel(), 1.0)
+    shares, of_controls = (places(mesh.parts, nodes) for nodes in (plant.rule.nodes, plant.control_nodes))
     path = np.asarray(plan.path(shares))
     x[at["q"]] = np.clip(path, *question.limits["q"])
     slopes = (path[1] - path[0]) / shares[1], (path[-1] - path[-2]) / (1 - shares[-2])
     x[at["v"]] = np.stack(slopes) / (plan.t_b - question.t_a)
-    of_controls = mesh.parts
-    if plant.interpolation != "linear":
-        of_controls = (mesh.parts[:-1, None] + width * plant.control_nodes).ravel()
     x[at["controls"]] = np.clip(np.asarray(plan.controls(of_controls)), *question.limits["controls"])
     return x
 
@@ -334,7 +328,7 @@ def _searched(
     question: Question, elements: int, plan: FirstPlan, starts: int, most: int, tol: float
 ) -> tuple[Layout, SolverAnswer, Accuracy, int, str]:
     """The solution on the last mesh, how much its cost changed there, all iterations, and what was tried."""
-    mesh = Mesh.even(elements)
+    mesh = Mesh(even(elements), {})
     layout = Layout(question.plant, mesh.count)
     solved = _solve(question, layout, mesh, unknowns(question, layout, mesh, plan), {})
     found, plans = [(plan, solved)], []
@@ -347,15 +341,12 @@ def _searched(
     tried = "; ".join(f"{plan.name}: {_in_words(answer)}" for plan, answer in found)
     # The least one on few elements need not be one on many: the next ones follow.
     ordered = sorted((x for _, x in found if is_found(x)), key=lambda x: x.cost) or [solved]
-    layout, fine, accuracy, more = _refined(question, mesh, layout, ordered[0], most, tol)
-    iterations += more
-    for coarse in ordered[1:]:
-        if is_found(fine):
-            break
+    while True:
         layout = Layout(question.plant, mesh.count)
-        layout, fine, accuracy, more = _refined(question, mesh, layout, coarse, most, tol)
+        layout, fine, accuracy, more = _refined(question, mesh, layout, ordered.pop(0), most, tol)
         iterations += more
-    return layout, fine, accuracy, iterations, tried
+        if is_found(fine) or not ordered:
+            return layout, fine, accuracy, iterations, tried
 
 
 def _in_words(answer: SolverAnswer) -> str:
@@ -369,11 +360,11 @@ def _refined(
     iterations, change = 0, np.inf
     while is_found(solved):
         # Where a control jumps is looked for once: afterwards the bound of two elements is there.
-        jumps = [] if mesh.jumps else jumps_of(layout, solved.x, *question.limits["controls"])[:CUTS]
+        jumps = [] if mesh.jumps else _jumps(question, layout, solved.x)[:CUTS]
         if not jumps and 2 * mesh.count > most:
             break
-        mesh = mesh.at(solved.x[layout.places["parts"]])
-        mesh = mesh.cut(jumps) if jumps else mesh.halved()
+        mesh = mesh._replace(parts=solved.x[layout.places["parts"]])
+        mesh = mesh.cut_at(jumps) if jumps else mesh.halved()
         coarse, (layout, x) = solved, moved(layout, solved.x, mesh)
         solved = _solve(question, layout, mesh, x, WARM)
         if not is_found(solved):
@@ -382,6 +373,13 @@ def _refined(
         if not jumps and change <= _allowed(solved, tol):
             break
     return layout, solved, Accuracy(change, bool(change <= _allowed(solved, tol)), tol), iterations
+
+
+def _jumps(question: Question, layout: Layout, x: np.ndarray) -> list[Jump]:
+    """Where controls jump; those that are linear between knots do not."""
+    plant, at = layout.plant, layout.places
+    weights = {"smooth": plant.rule.weights, "constant": np.ones(1)}.get(plant.interpolation)
+    return [] if weights is None else jumps_of(x[at["parts"]], weights, x[at["controls"]], *question.limits["controls"])
 
 
 def _allowed(solved: SolverAnswer, tol: float) -> float:
@@ -395,8 +393,8 @@ def _limits_of(question: Question, layout: Layout, mesh: Mesh) -> tuple[np.ndarr
     low, high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
     (low[at["end"]], high[at["end"]]), parts = question.t_b, mesh.limits()
     low[at["parts"]], high[at["parts"]] = parts
-    for name, places in (("q", at["q"]), ("controls", at["controls"]), ("v", at["v"])):
-        low[places], high[places] = limits[name]
+    for name in ("q", "controls", "v"):
+        low[at[name]], high[at[name]] = limits[name]
     for i, jumps in mesh.jumps.items():
         for jump in jumps:
             before, after = (at["controls"][layout.of_controls[k], jump.control] for k in (i - 1, i))
@@ -404,9 +402,9 @@ def _limits_of(question: Question, layout: Layout, mesh: Mesh) -> tuple[np.ndarr
                 before, after = after, before
             high[before], low[after] = low[before], high[after]
     for i, end in ((0, question.ends[0]), (-1, question.ends[1])):
-        for places, asked_for in ((at["q"][i], end.q), (at["v"][i], end.v)):
+        for kind, asked_for in zip("qv", end):
             fixed = np.isfinite(asked_for)
-            low[places[fixed]] = high[places[fixed]] = asked_for[fixed]
+            low[at[kind][i][fixed]] = high[at[kind][i][fixed]] = asked_for[fixed]
     return low, high
 
 
@@ -421,9 +419,9 @@ def _limits_of_rows(question: Question, layout: Layout) -> tuple[np.ndarray, np.
         (start_q, rows["start"][:g]), (start_v, rows["start"][g:]),
         (stop_q, rows["positions"][-1, -1]), (stop_v, rows["stop"]),
     ]  # fmt: skip
-    for is_known, places in left_out:
+    for is_known, left in left_out:
         if is_known:
-            low[places], high[places] = -np.inf, np.inf
+            low[left], high[left] = -np.inf, np.inf
     return low, high
 
 

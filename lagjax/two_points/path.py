@@ -1,4 +1,4 @@
-"""A path between two ends: the equations of its nodes, their elimination, and Newton's method for them.
+"""A path between two ends: the equations of its nodes, their elimination, Newton's method, and the way to a solution.
 
 The unknowns are positions and multipliers y = (x, λ) at the nodes of K elements (`elements.py`), group by group: inner
 nodes and last node of an element. A group is coupled to the next by its last node alone, so the matrix is
@@ -20,6 +20,9 @@ those of positions.
 
 Source: Deuflhard, *Newton Methods for Nonlinear Problems* (2011), §3.3 (the test, with the new matrix in place of the
 old).
+
+**The way to a solution.** The shorter a motion is, the straighter it is: where Newton's method fails, a path is
+followed from a short time to the whole one. Then it is solved for on elements laid anew (`mesh.py`).
 """
 
 from collections.abc import Callable
@@ -32,10 +35,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from lagjax.jaxtools import compiled, numpy_of
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
-from lagjax.two_points import elements
-from lagjax.two_points.elements import Rule, rule_of_degree
+from lagjax.two_points import elements, mesh
+from lagjax.two_points.elements import Defects, Rule, basis, rule_of_degree
 
 FIXED, NATURAL, COMPLETE = "fixed", "natural", "complete"
 
@@ -81,14 +85,37 @@ class Path(NamedTuple):
 
     def nodes(self, ends: Ends) -> Float[Array, "K s+1 N"]:
         """All nodes of each element, the first one included."""
-        first = jnp.concatenate([ends.x_a, jnp.zeros(self.y.shape[2] - ends.x_a.size, self.y.dtype)])
-        before = jnp.concatenate([first[None], self.y[:-1, -1]])
-        return jnp.concatenate([before[:, None], self.y], axis=1)
+        xp: Any = numpy_of((self, ends))
+        y, none = xp.asarray(self.y), np.zeros(self.y.shape[2] - ends.x_a.size, self.y.dtype)
+        first = xp.concatenate([xp.asarray(ends.x_a), none])
+        before = xp.concatenate([first[None], y[:-1, -1]])
+        return xp.concatenate([before[:, None], y], axis=1)
 
     def times(self, ends: Ends) -> tuple[Float[Array, " K"], Float[Array, " K"]]:
         """The start and the length of each element."""
         duration = self.duration(ends)
         return ends.t_a + duration * self.parts[:-1], duration * jnp.diff(self.parts)
+
+    def rule(self) -> Rule:
+        """The elements, which have one degree."""
+        return rule_of_degree(self.y.shape[1])
+
+    def at(self, ends: Ends, t: Float[Array, " T"]) -> Float[Array, "T n"]:
+        """The positions at any times."""
+        xp = numpy_of((self, ends, t))
+        t_a, duration, parts = (xp.asarray(x) for x in (ends.t_a, self.duration(ends), self.parts))
+        x = self.nodes(ends)[..., : ends.x_a.size]
+        return mesh.between(parts, self.rule().nodes, x, (xp.asarray(t) - t_a) / duration)
+
+    def action(self, model: Model, ends: Ends) -> Float[Array, ""]:
+        """The sum of the discrete actions of the elements."""
+        of_element = lambda t, h, nodes: elements.discrete_action(model, self.rule(), t, h, nodes)
+        return jnp.sum(jax.vmap(of_element)(*self.times(ends), self.nodes(ends)))
+
+    def errors(self, ends: Ends) -> Float[Array, " K"]:
+        """The highest coefficient on each element, in units of the path's extent."""
+        c = mesh.highest(self.nodes(ends)[..., : ends.x_a.size])
+        return jnp.max(jnp.abs(c) / extent(ends, self)[None], axis=1)
 
 
 class PathEquations(NamedTuple):
@@ -104,24 +131,26 @@ class PathEquations(NamedTuple):
     corner: Float[Array, "b b"]
 
 
-def momentum_matrix(model: Model, rule: Rule, t: Array, h: Array, nodes: Array):
-    """R and the constraints of an element, (s + 1, N), and the derivative by its nodes, (s + 1, N, s + 1, N).
+def _weighted(rule: Rule, h: Array, found: Defects) -> Float[Array, "s+1 N"]:
+    """R, and g multiplied by h b_j: so the derivative is symmetric where there is an action."""
+    weights = h * rule.node_weights.astype(found.work.dtype)
+    return jnp.concatenate([found.work, weights[:, None] * found.g], axis=1)
 
-    Constraints are multiplied by h b_j: so the matrix is symmetric where there is an action.
-    """
-    n, dtype = model.n, nodes.dtype
-    x, multipliers = nodes[:, :n], nodes[:, n:]
-    t_i, x_i, u_i = elements.at_points(rule, t, h, x)
+
+def momentum_matrix(model: Model, rule: Rule, t: Array, h: Array, nodes: Array):
+    """R and the constraints of an element, (s + 1, N), and the derivative by its nodes, (s + 1, N, s + 1, N)."""
+    n, dtype, none = model.n, nodes.dtype, jnp.zeros(0, nodes.dtype)
+    t_i, x_i, u_i = elements.at_points(rule, t, h, nodes[:, :n])
 
     def at_point(t: Array, state: Array) -> Array:
-        return jnp.concatenate(elements.force_and_momentum(model, t, state[:n], state[n:]))
+        return jnp.concatenate(elements.force_and_momentum(model, t, state[:n], state[n:], none))
 
     def with_jacobian(t: Array, state: Array):
         value, push = jax.linearize(lambda state: at_point(t, state), state)
         return value, jax.vmap(push, out_axes=1)(jnp.eye(2 * n, dtype=dtype))
 
     values, slopes = jax.vmap(with_jacobian)(t_i, jnp.concatenate([x_i, u_i], axis=1))
-    total = elements.virtual_work(rule, h, values[:, :n], values[:, n:])
+    found = elements.defects(model, rule, t, h, nodes, values[:, :n], values[:, n:])
     # Values at the points by the nodes: rows h P and D for f and p, columns P and D/h for x and u.
     p_i, d_i, w = (a.astype(dtype) for a in (rule.interpolation, rule.derivative, rule.weights))
     tests, trials = jnp.stack([h * p_i, d_i]), jnp.stack([p_i, d_i / h])
@@ -129,19 +158,16 @@ def momentum_matrix(model: Model, rule: Rule, t: Array, h: Array, nodes: Array):
     matrix = jnp.einsum("aij,iaxby,bik->jxky", tests, slopes, trials)
     m = nodes.shape[1] - n
     if not m:
-        return total, matrix
+        return found.work, matrix
+
+    def at_node(t: Array, weight: Array, node: Array) -> Array:
+        return weight * jnp.concatenate(elements.of_constraints(model, t, node))
+
     times, weights = t + h * rule.nodes.astype(dtype), h * rule.node_weights.astype(dtype)
-
-    def at_node(t: Array, weight: Array, y: Array) -> Array:
-        g, back = jax.vjp(lambda x: constraints.position_residual(model, t, x), y[:n])
-        return weight * jnp.concatenate([back(y[n:])[0], g])
-
-    of_nodes = jax.vmap(at_node)(times, weights, nodes)
     by_node = jax.vmap(jax.jacfwd(at_node, argnums=2))(times, weights, nodes)
     places = np.arange(rule.degree + 1)
     whole = jnp.zeros((len(places), n + m, len(places), n + m), dtype).at[:, :n, :, :n].set(matrix)
-    whole = whole.at[places, :, places, :].add(by_node)
-    return jnp.concatenate([total, jnp.zeros_like(multipliers)], axis=1) + of_nodes, whole
+    return _weighted(rule, h, found), whole.at[places, :, places, :].add(by_node)
 
 
 def end_rows(model: Model, ends: Ends, t_b: Array, x: Array, u: Array, multipliers: Array, p: Array, nu: Array):
@@ -187,7 +213,8 @@ def equations(model: Model, ends: Ends, path: Path) -> PathEquations:
 
         def of_duration(duration: Array) -> Array:
             t, h = path._replace(border=duration[None]).times(ends)
-            return jax.vmap(lambda t, h, nodes: _residual(model, rule, t, h, nodes))(t, h, nodes)
+            missed = jax.vmap(lambda t, h, nodes: elements.residual(model, rule, t, h, nodes))(t, h, nodes)
+            return jax.vmap(lambda h, missed: _weighted(rule, h, missed))(h, missed)
 
         by_duration = jax.jvp(of_duration, (path.border[-1],), (jnp.ones_like(path.border[-1]),))[1]
         columns = columns.at[..., -1].set(_assembled(by_duration))
@@ -206,17 +233,6 @@ def equations(model: Model, ends: Ends, path: Path) -> PathEquations:
         before.reshape(count - 1, flat, size), after.reshape(count - 1, size, flat),
         columns.reshape(count, flat, path.border.size), by_nodes[size:], by_border[size:],
     )  # fmt: skip
-
-
-def _residual(model: Model, rule: Rule, t: Array, h: Array, nodes: Array) -> Array:
-    """R and the constraints of an element, without derivatives."""
-    n = model.n
-    work = elements.residual(model, rule, t, h, nodes[:, :n], nodes[:, n:])
-    if nodes.shape[1] == n:
-        return work
-    times = t + h * rule.nodes.astype(nodes.dtype)
-    g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(times, nodes[:, :n])
-    return jnp.concatenate([work, h * rule.node_weights.astype(nodes.dtype)[:, None] * g], axis=1)
 
 
 def _assembled(r: Float[Array, "K s+1 N"]) -> Float[Array, "K s N"]:
@@ -288,6 +304,7 @@ def solve(found: PathEquations, inverses: Float[Array, "K sN sN"], r: Float[Arra
     return Solved(own - columns @ border, border)
 
 
+# Newton's steps at most.
 MOST = 30
 # A step of this size, in units of the path's extent, ends the search; one below the second that is no longer reduced.
 SMALL, SETTLED = 1e-13, 1e-9
@@ -414,3 +431,129 @@ def unfound(start: Path) -> FoundPath:
     response = Solved(jnp.zeros((count, s * size, size + b), dtype), jnp.zeros((b, size + b), dtype))
     deltas = jnp.zeros((count, s * size, s * size), dtype)
     return FoundPath(start, infinite, 0 * infinite + CONVERGED, jnp.zeros((), int), deltas, response)
+
+
+def states(ends: Ends, path: Path, t: Float[Array, " T"]) -> tuple[Float[Array, "T N"], Float[Array, "T n"]]:
+    """Positions with multipliers, and velocities, at any times on the path."""
+    rule, nodes = path.rule(), _with_end_multipliers(ends, path)
+    slopes = jnp.einsum("kj,ejn->ekn", jnp.asarray(rule.node_derivative, nodes.dtype), nodes[..., : ends.x_a.size])
+    i, length, inside = mesh.located(path.parts, (t - ends.t_a) / path.duration(ends))
+    y, slope = (jnp.einsum("tj,tjn->tn", basis(rule.nodes, inside), values[i]) for values in (nodes, slopes))
+    return y, slope / (length * path.duration(ends))[:, None]
+
+
+def _with_end_multipliers(ends: Ends, path: Path) -> Float[Array, "K s+1 N"]:
+    """All nodes; multipliers at given ends, which nothing determines, continued from the other nodes."""
+    nodes, n = path.nodes(ends), ends.x_a.size
+    if nodes.shape[2] == n:
+        return nodes
+    inner = path.rule().nodes[1:]
+    weights = jnp.asarray(basis(inner, np.zeros(())), nodes.dtype)
+    nodes = nodes.at[0, 0, n:].set(weights @ nodes[0, 1:, n:])
+    if ends.kind == NATURAL:
+        return nodes
+    return nodes.at[-1, -1, n:].set(weights[::-1] @ nodes[-1, :-1, n:])
+
+
+# Newton's steps onto the constraints for the nodes of a straight start.
+ONTO = 60
+# How often a path is solved for, the elements laid anew in between; how many parts of the way are tried at most, and
+# the shortest. A path that is lost on other elements ends the search as well, after some tries: it is good enough.
+ROUNDS, ATTEMPTS, SHORTEST_PART = 3, 24, 1e-2
+# A path is followed where the highest coefficients on its elements are below this.
+FINE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
+# Elements of the same number are laid anew for this part of it: a conjugate point is as good as the path.
+LAID = 0.01
+# A start ends elsewhere that misses the end by more than this part of its extent.
+ELSEWHERE = 1e-6
+# On the way, steps of this size are small enough.
+ON_THE_WAY = 1e-4
+
+
+def onto_constraints(model: Model, t: Array, x: Array) -> Array:
+    """The point near x that satisfies the holonomic constraints, by Gauss and Newton's shortest steps."""
+
+    def step(x: Array, _):
+        g = constraints.position_residual(model, t, x)
+        slope = jax.jacfwd(lambda x: constraints.position_residual(model, t, x))(x)
+        return x - slope.T @ (dense.inverse(slope @ slope.T) @ g), None
+
+    if not model.holonomic.any():
+        return x
+    near = lax.scan(step, x, None, ONTO)[0]
+    return jnp.where(jnp.all(jnp.isfinite(near)), near, x)
+
+
+def path_through(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"]) -> Path:
+    """The path through given nodes, moved onto the constraints."""
+    m = int(model.holonomic.sum())
+    nu = jnp.zeros(ends.border - ends.free_time, x.dtype)
+    border = jnp.concatenate([nu, ends.duration[None]]) if ends.free_time else nu
+    empty = Path(parts, x, border)
+    t = ends.t_a + empty.duration(ends) * mesh.after_first(parts, x.shape[1])
+    onto = jax.vmap(lambda t, x: onto_constraints(model, t, x))
+    x = onto(t.ravel(), x.reshape(-1, x.shape[2])).reshape(x.shape)
+    return empty._replace(y=jnp.concatenate([x, jnp.zeros((*x.shape[:2], m), x.dtype)], axis=2))
+
+
+class Attempt(NamedTuple):
+    """The last path that converged, for a part of the ends' distance and time, the errors of its elements; and the next
+    part to try."""
+
+    found: FoundPath
+    errors: Float[Array, " K"]
+    part: Float[Array, ""]
+    step: Float[Array, ""]
+    rounds: Int[Array, ""]
+    attempts: Int[Array, ""]
+
+
+def found_path(model: Model, ends: Ends, start: Path) -> Attempt:
+    """Newton's method at once; where it fails, along the start from a short time to the whole one, since the shorter a
+    motion is, the straighter it is; for a start with another end, such as a motion, over the whole time from its own
+    end to the given one. Then on elements laid anew, where they do not follow the path."""
+    n, fine = model.n, FINE.get(np.dtype(start.y.dtype), 1e-3)
+    off = ends.x_b - start.y[-1, -1, :n] if ends.kind == FIXED else jnp.zeros_like(ends.x_b)
+    elsewhere = jnp.any(jnp.abs(off) > ELSEWHERE * extent(ends, start))
+
+    def attempt(last: Attempt) -> Attempt:
+        there, path = last.part >= 1.0, last.found.path
+        part = jnp.minimum(1.0, last.part + last.step)
+        # Once there: the path itself on other elements. On the way: the start up to this part of its time.
+        source = jax.tree.map(lambda a, b: jnp.where(there, a, b), path, start)
+        parts = jnp.where(there, mesh.laid_anew(path.parts, path.errors(ends), path.y.shape[1]), path.parts)
+        shares = mesh.after_first(parts, path.y.shape[1])
+        reached = jnp.where(elsewhere, 1.0, part)
+        known, _ = states(ends, source, ends.t_a + reached * source.duration(ends) * shares.ravel())
+        known = known.reshape(path.y.shape)
+        x_b = jnp.where(part >= 1.0, ends.x_b, known[-1, -1, :n] + part * off)
+        aim = eqx.tree_at(lambda ends: (ends.x_b, ends.duration), ends, (x_b, reached * ends.duration))
+        stretched = path.y[..., :n] + shares[..., None] * (x_b - path.y[-1, -1, :n])[None, None]
+        x = jnp.where(there | (last.part == 0), known[..., :n], stretched)
+        trial = path_through(model, aim, x, parts)
+        y = trial.y.at[..., n:].set(jnp.where(there, known, path.y)[..., n:])
+        trial = Path(parts, y, jnp.where(last.part > 0, path.border, trial.border))
+        found = newton(model, aim, trial, jnp.where(part < 1.0, ON_THE_WAY, 0.0))
+        well = found.converged
+        kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), found, last.found)
+        step = jnp.where(well, 1.5 * last.step, last.step / 3)
+        return Attempt(
+            kept, kept.path.errors(ends), jnp.where(well, part, last.part), step,
+            last.rounds + (well & (part >= 1.0)), last.attempts + 1,
+        )  # fmt: skip
+
+    def unfinished(last: Attempt):
+        coarse = (last.rounds == 0) | (jnp.max(last.errors) > LAID * fine)
+        return coarse & (last.rounds < ROUNDS) & (last.attempts < ATTEMPTS) & (last.step > SHORTEST_PART)
+
+    zero, none = jnp.zeros_like(ends.duration), jnp.zeros((), int)
+    first = Attempt(unfound(start), jnp.zeros_like(start.parts[1:]), zero, zero + 1, none, none)
+    return lax.while_loop(unfinished, attempt, first)
+
+
+@compiled
+def halved(ends: Ends, path: Path) -> tuple[Float[Array, "K2 s n"], Float[Array, " K2+1"]]:
+    """The nodes on elements of half the length, and where these meet."""
+    parts = mesh.cut(path.parts)
+    t = ends.t_a + path.duration(ends) * mesh.after_first(parts, path.y.shape[1])
+    return path.at(ends, t.ravel()).reshape(*t.shape, -1), parts

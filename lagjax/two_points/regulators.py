@@ -48,6 +48,7 @@ Source: Nocedal & Wright, *Numerical Optimization*, §12.5 (the second-order con
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -55,7 +56,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, PyTree
-from scipy.linalg import solve_continuous_are
+from scipy.linalg import block_diag, solve_continuous_are
 
 from lagjax.integrate import ENDED_WELL, Trajectory, is_among
 from lagjax.jaxtools import compiled, to_jax
@@ -74,7 +75,8 @@ from lagjax.system import (
     unchecked,
 )
 from lagjax.two_points.control_problem import Controlled, check_number, checked_cost, controlled, velocity_name
-from lagjax.two_points.elements import Rule, integrals, rule_of_degree
+from lagjax.two_points.elements import linear_motion, rule_of_degree
+from lagjax.two_points.mesh import cut, in_groups, places, stacked
 from lagjax.two_points.steering import Plan, plan_of
 
 # Rows of constraints with smaller singular values, relative, say nothing that others do not.
@@ -136,15 +138,50 @@ def bent(given: Controlled, x: Array, u: Array, w: Array, slope: Array) -> Float
     return jax.hessian(of_deviation)(jnp.zeros_like(slope))
 
 
-def check_weights(weights: np.ndarray, names: list[str]):
-    """Raise for a control that costs nothing."""
-    values, vectors = np.linalg.eigh(weights)
-    if values[0] <= 1e-12 * max(values[-1], 0.0):
-        name = names[int(np.argmax(np.abs(vectors[:, 0])))]
-        raise ValueError(
-            f"the control '{name}' costs nothing, and the least cost would take it without limit.\n"
-            f'Fix: + 1e-3 * u["{name}"] ** 2 in the cost.'
-        )
+class Deviations(NamedTuple):
+    """δẋ = A δx + B δu, and the weights Q, N, R of their cost; of one state, or (..., m, m) of several."""
+
+    a: np.ndarray
+    b: np.ndarray
+    q: np.ndarray
+    cross: np.ndarray
+    r: np.ndarray
+
+    def gain(self, s: np.ndarray) -> np.ndarray:
+        """K = R⁻¹ (Bᵀ S + Nᵀ)."""
+        return np.linalg.solve(self.r, self.b.mT @ s + self.cross.mT)
+
+
+def deviations(slopes: tuple, curvature: Array, controls: list[str]) -> Deviations:
+    """From the derivatives of accelerations by q, v and u, and second derivatives of the cost, of one or more states.
+
+    Raises for a control that costs nothing.
+    """
+    by_q, by_v, by_w = (np.asarray(x) for x in slopes)
+    n, weights = by_q.shape[-1], np.asarray(curvature) / 2
+    a = np.block([[np.zeros_like(by_q), np.zeros_like(by_q) + np.eye(n)], [by_q, by_v]])
+    q, cross, r = weights[..., : 2 * n, : 2 * n], weights[..., : 2 * n, 2 * n :], weights[..., 2 * n :, 2 * n :]
+    for matrix in r.reshape(-1, *r.shape[-2:]):
+        values, vectors = np.linalg.eigh(matrix)
+        if values[0] <= 1e-12 * max(values[-1], 0.0):
+            name = controls[int(np.argmax(np.abs(vectors[:, 0])))]
+            raise ValueError(
+                f"the control '{name}' costs nothing, and the least cost would take it without limit.\n"
+                f'Fix: + 1e-3 * u["{name}"] ** 2 in the cost.'
+            )
+    return Deviations(a, np.block([[np.zeros_like(by_w)], [by_w]]), q, cross, r)
+
+
+def _names_of_state(given: Controlled) -> tuple[str, ...]:
+    names = coordinates.names(given.state.q)
+    return (*names, *(velocity_name(name) for name in names))
+
+
+def _controls(held: PyTree, gain: Array, state: Array, q: PyTree, v: PyTree) -> PyTree:
+    """u₀ - K (x - x₀), in the structure of u₀."""
+    held, back = ravel_pytree(jax.tree.map(jnp.asarray, held))
+    x = jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
+    return back(held - gain @ (x - state))
 
 
 # Points on an element; elements at first and at most; and the change of S by which halving them ends, relative.
@@ -188,9 +225,8 @@ class TrackingLQR(eqx.Module):
     def control(self, t: ArrayLike, q: PyTree, v: PyTree) -> PyTree:
         """The controls at a time and a state, in the structure of those that are given."""
         t = self._within(t)
-        along, (held, back) = self.pieces(t), ravel_pytree(jax.tree.map(jnp.asarray, self.controls(t)))
-        x = jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
-        return back(held - along["gain"] @ (x - along["state"]))
+        along = self.pieces(t)
+        return _controls(self.controls(t), along["gain"], along["state"], q, v)
 
     def _within(self, t: ArrayLike) -> Array:
         return jnp.clip(jnp.asarray(t, self.pieces.starts.dtype), self.knots[0], self.knots[-1])
@@ -206,12 +242,10 @@ def about_trajectory(
     given: Controlled, controls: Callable, trajectory: Trajectory, cost: Callable, end_cost: Callable | None
 ) -> TrackingLQR:
     """The regulator about a motion, on elements halved until S at its start no longer changes."""
-    names = coordinates.names(given.state.q)
-    names = (*names, *(velocity_name(name) for name in names))
     end = _end_weights(given, controls, trajectory, end_cost)
     first, last = float(trajectory.t[0]), float(trajectory.end.t)
     knots = np.unique(np.clip([first, *np.asarray(getattr(controls, "knots", ())), last], first, last))
-    knots = _divided(knots, max(1, -(-FIRST // (len(knots) - 1))))
+    knots = cut(knots, max(1, -(-FIRST // (len(knots) - 1))))
     before, change = None, np.inf
     while True:
         pieces, s = _regulated(given, controls, trajectory, cost, knots, end)
@@ -224,78 +258,45 @@ def about_trajectory(
                 "Fix: squares of q, v and u; the gradient of the cost along the motion does not matter."
             )
         if change < SETTLED or 2 * (len(knots) - 1) > MOST:
-            return TrackingLQR(pieces, controls, jnp.asarray(s), change, names)
-        before, knots = s, _divided(knots, 2)
-
-
-def _divided(knots: np.ndarray, parts: int) -> np.ndarray:
-    inner = knots[:-1, None] + np.diff(knots)[:, None] * np.arange(parts) / parts
-    return np.append(inner.ravel(), knots[-1])
+            return TrackingLQR(pieces, controls, jnp.asarray(s), change, _names_of_state(given))
+        before, knots = s, cut(knots)
 
 
 def _regulated(given: Controlled, controls: Callable, trajectory: Trajectory, cost: Callable, knots: np.ndarray, end):
     """K and x₀ on elements between knots, and S at the start."""
-    rule, h = rule_of_degree(POINTS), np.diff(knots)
-    t = knots[:-1, None] + h[:, None] * rule.points
-    x, u = _together(partial(_states, trajectory), t.ravel())
-    w = np.stack([coordinates.vector(controls(t)) for t in t.ravel()])
-    a, b, weights = _along(given, cost, t.ravel(), x, u, w)
-    k, m = w.shape[1], 2 * x.shape[1]
-    q, cross, r = weights[:, :m, :m], weights[:, :m, m:], weights[:, m:, m:]
-    for matrix in r:
-        check_weights(matrix, coordinates.names(given.controls))
-    left = np.linalg.solve(r, np.concatenate([cross.transpose(0, 2, 1), b.transpose(0, 2, 1)], axis=2))
-    by_cross, by_b = left[..., :m], left[..., m:]
-    a_less = a - b @ by_cross
-    hamiltonian = np.block([[a_less, -b @ by_b], [-(q - cross @ by_cross), -a_less.transpose(0, 2, 1)]])
-    hamiltonian = hamiltonian.reshape(len(h), POINTS, 2 * m, 2 * m)
-    gains, s = np.empty((len(h), POINTS, k, m)), end
-    for e in reversed(range(len(h))):
-        at_points, start = _back(rule, h[e], hamiltonian[e], np.concatenate([np.eye(m), s]))
-        inside = np.linalg.solve(at_points[:, :m].transpose(0, 2, 1), at_points[:, m:].transpose(0, 2, 1))
-        gains[e] = by_b.reshape(len(h), POINTS, k, m)[e] @ inside + by_cross.reshape(len(h), POINTS, k, m)[e]
-        s = np.linalg.solve(start[:m].T, start[m:].T)
-        s = (s + s.T) / 2
-    example = {"gain": np.zeros((k, m)), "state": np.zeros(m)}
-    rows = np.concatenate([gains.reshape(len(h), POINTS, -1), np.concatenate([x, u], 1).reshape(len(h), POINTS, -1)], 2)
-    limits = np.full((2, rows.shape[2]), np.inf) * np.array([[-1.0], [1.0]])
-    return plan_of(knots, rows, limits, example, rule.points, len(h)), s
-
-
-def _back(rule: Rule, h: float, matrices: np.ndarray, end: np.ndarray):
-    """The solution of ẏ = H y at Gauss's points and at the start, from the end of an element."""
-    size = end.shape[0]
-    # y_i = y_b - h Σ_j (∫_{c_i}^{1} l_j) ẏ_j, and ẏ_j = H_j y_j.
-    reach = -integrals(rule.points, np.ones(POINTS))
-    system = np.eye(len(reach) * size) + h * np.einsum("ij,jab->iajb", reach, matrices).reshape(
-        (len(reach) * size,) * 2
+    rule, t = rule_of_degree(POINTS), places(knots, rule_of_degree(POINTS).points)
+    x, u = in_groups(partial(_states, trajectory), TOGETHER, t)
+    w = np.stack([coordinates.vector(controls(t)) for t in t])
+    about = deviations(
+        *in_groups(partial(_derivatives, given, cost), TOGETHER, t, x, u, w), coordinates.names(given.controls)
     )
-    inside = np.linalg.solve(system, np.tile(end, (len(reach), 1))).reshape(len(reach), size, -1)
-    return inside, end - h * np.einsum("j,jab,jbc->ac", rule.weights, matrices, inside)
+    a, b, q, cross, r = about
+    m, by_cross, by_b = a.shape[1], np.linalg.solve(r, cross.mT), np.linalg.solve(r, b.mT)
+    a_less = a - b @ by_cross
+    hamiltonian = np.block([[a_less, -b @ by_b], [-(q - cross @ by_cross), -a_less.mT]])
+    costs, s = np.empty_like(a), end
+    for e in reversed(range(len(knots) - 1)):
+        at = slice(e * POINTS, (e + 1) * POINTS)
+        y = np.concatenate([np.eye(m), s])
+        inside, start = linear_motion(rule, knots[e + 1] - knots[e], hamiltonian[at], y, backward=True)
+        costs[at], s = _cost_to_go(inside), _cost_to_go(start)
+        s = (s + s.T) / 2
+    gains, count = about.gain(costs), len(knots) - 1
+    example = {"gain": np.zeros(gains.shape[1:]), "state": np.zeros(m)}
+    rows = np.concatenate([gains.reshape(len(t), -1), x, u], axis=1).reshape(count, POINTS, -1)
+    limits = np.full((2, rows.shape[2]), np.inf) * np.array([[-1.0], [1.0]])
+    return plan_of(knots, rows, limits, example, rule.points, count), s
 
 
-def _together(function: Callable, *arrays: np.ndarray):
-    """A function of many points, some at a time: one program serves any number of them."""
-    count, found = len(arrays[0]), []
-    for i in range(0, count, TOGETHER):
-        more = max(0, i + TOGETHER - count)
-        part = (np.concatenate([x[i : i + TOGETHER], np.repeat(x[-1:], more, axis=0)]) for x in arrays)
-        found.append(jax.tree.map(np.asarray, function(*part)))
-    return jax.tree.map(lambda *x: np.concatenate(x)[:count], *found)
+def _cost_to_go(y: np.ndarray) -> np.ndarray:
+    """S = Y X⁻¹, by its transpose."""
+    x, y = np.split(y, 2, axis=-2)
+    return np.linalg.solve(x.mT, y.mT)
 
 
-def _states(trajectory: Trajectory, t: np.ndarray) -> list[np.ndarray]:
+def _states(trajectory: Trajectory, t: np.ndarray) -> list[Array]:
     now = trajectory.at(t)
-    return [np.concatenate([np.reshape(y, (len(t), -1)) for y in jax.tree.leaves(x)], axis=1) for x in (now.q, now.v)]
-
-
-def _along(given: Controlled, cost: Callable, *states: np.ndarray):
-    """A (T, 2n, 2n), B (T, 2n, k) and the halves of the cost's second derivatives at times (T,) and states."""
-    (by_q, by_v, by_w), weights = _together(partial(_derivatives, given, cost), *states)
-    count, n = by_q.shape[:2]
-    upper = np.broadcast_to(np.concatenate([np.zeros((n, n)), np.eye(n)], axis=1), (count, n, 2 * n))
-    a = np.concatenate([upper, np.concatenate([by_q, by_v], axis=2)], axis=1)
-    return a, np.concatenate([np.zeros_like(by_w), by_w], axis=1), weights / 2
+    return [stacked(now.q), stacked(now.v)]
 
 
 @compiled
@@ -361,9 +362,7 @@ class LQR(eqx.Module):
 
     def control(self, q: PyTree, v: PyTree) -> PyTree:
         """The controls at a state, in the structure of the controls at the equilibrium."""
-        held, back = ravel_pytree(jax.tree.map(jnp.asarray, self.controls))
-        x = jnp.concatenate([coordinates.flatten(q)[0], coordinates.flatten(v)[0]])
-        return back(held - self.gain @ (x - self.state))
+        return _controls(self.controls, self.gain, self.state, q, v)
 
     def __repr__(self):
         slowest = max(self.eigenvalues, key=lambda x: x.real)
@@ -431,14 +430,12 @@ def lqr(
     given = controlled(system, controls, coordinates.prepared(t, q, v, params), with_control)
     cost = checked_cost(cost, given)
     x, u, w = (coordinates.vector(y) for y in (given.state.q, given.state.v, given.controls))
-    n, names = x.size, coordinates.names(given.state.q)
-    names = (*names, *(velocity_name(name) for name in names))
-    tangent = np.eye(n)
+    names, tangent = _names_of_state(given), np.eye(x.size)
     if given.form.m:
         model = unchecked(given.system, given.merge(given.state.params, given.controls), given.form)
         tangent = null_space(np.asarray(compiled(constraints.jacobian)(model, given.state.t, x, u)))
-    still, (by_q, by_v, by_w), slope, weights = jax.tree.map(np.asarray, linear(given, cost, x, u, w))
-    size = max(1.0, float(np.max(np.abs(by_q))))
+    still, slopes, slope, curvature = jax.tree.map(np.asarray, linear(given, cost, x, u, w))
+    size = max(1.0, float(np.max(np.abs(slopes[0]))))
     worst = int(np.argmax(np.abs(still)))
     if not abs(still[worst]) <= STEADY_BELOW * size or np.any(u):
         raise ValueError(
@@ -447,25 +444,22 @@ def lqr(
             "Usual cause: controls of zero where a force has to hold the system.\n"
             'Fix: controls={"torque": ...} that balance the forces; lj.equilibria finds the state for given controls.'
         )
-    z = np.zeros_like(tangent)
-    both = np.block([[tangent, z], [z, tangent]])
-    lift = np.block([[both, np.zeros((2 * n, w.size))], [np.zeros((w.size, both.shape[1])), np.eye(w.size)]])
-    if np.max(np.abs(lift.T @ slope)) > STEADY_BELOW * max(1.0, float(np.max(np.abs(weights)))):
+    both = block_diag(tangent, tangent)
+    lift = block_diag(both, np.eye(w.size))
+    if np.max(np.abs(lift.T @ slope)) > STEADY_BELOW * max(1.0, float(np.max(np.abs(curvature)))):
         raise ValueError(
             "the cost is not least at the equilibrium: its derivatives there are not zero.\n"
             "Usual cause: u**2 where the control that holds the system is not zero, or a target elsewhere.\n"
             'Fix: squares of differences from the equilibrium, (q["angle"] - jnp.pi) ** 2.'
         )
-    a, b = _first_order(tangent, by_q, by_v, by_w)
-    weights = lift.T @ weights @ lift / 2
-    k = a.shape[0]
-    q_weight, cross, r_weight = weights[:k, :k], weights[:k, k:], weights[k:, k:]
-    check_weights(r_weight, coordinates.names(given.controls))
+    slopes = (tangent.T @ slopes[0] @ tangent, tangent.T @ slopes[1] @ tangent, tangent.T @ slopes[2])
+    about = deviations(slopes, lift.T @ curvature @ lift, coordinates.names(given.controls))
+    a, b = about.a, about.b
     try:
-        s = solve_continuous_are(a, b, q_weight, r_weight, s=cross)
+        s = solve_continuous_are(a, b, about.q, about.r, s=about.cross)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError(_unreached(a, b, both, names)) from error
-    gain = np.linalg.solve(r_weight, b.T @ s + cross.T)
+    gain = about.gain(s)
     values = np.linalg.eigvals(a - b @ gain)
     if not np.max(values.real) < 0:
         raise ValueError(_unreached(a, b, both, names))
@@ -488,12 +482,6 @@ def _along_trajectory(system, controls, trajectory, cost, params, end_cost, with
     t, q, v = trajectory.t[0], *jax.tree.map(lambda x: x[0], (trajectory.q, trajectory.v))
     given = controlled(system, controls(t), coordinates.prepared(t, q, v, params), with_control)
     return about_trajectory(given, controls, trajectory, checked_cost(cost, given), end_cost)
-
-
-def _first_order(tangent: np.ndarray, by_q: Array, by_v: Array, by_w: Array) -> tuple[np.ndarray, np.ndarray]:
-    f, t = tangent.shape[1], tangent
-    a = np.block([[np.zeros((f, f)), np.eye(f)], [t.T @ by_q @ t, t.T @ by_v @ t]])
-    return a, np.concatenate([np.zeros((f, by_w.shape[1])), t.T @ by_w])
 
 
 def _unreached(a: np.ndarray, b: np.ndarray, both: np.ndarray, names: tuple[str, ...]) -> str:

@@ -6,7 +6,7 @@ Newton's method leaves behind, says how the start velocity v_a, a free time T an
     z = (v_a, ν, T),    z <- z - W ρ(z),    W = dz/dρ of the discrete path
 
 W is as good as the path, so few corrections reach round-off; two of them, with a constant W, give z its derivatives
-by the implicit function theorem.
+by the implicit function theorem. Shooting alone ends in the same two, with its own ρ and W.
 
 **Shooting alone**, where the ends do not complete the equations of a path.
 
@@ -40,10 +40,9 @@ from lagjax.integrate import ENDED_WELL, Trajectory, ended_well, integrate, is_a
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.numerics import dense
 from lagjax.system import Model, constraints
-from lagjax.two_points import path_mesh
-from lagjax.two_points.elements import residual, rule_of_degree
-from lagjax.two_points.path import FIXED, NATURAL, Ends, FoundPath, Path, end_rows, unfound
-from lagjax.two_points.path_mesh import positions
+from lagjax.two_points.elements import residual
+from lagjax.two_points.mesh import stacked
+from lagjax.two_points.path import FIXED, NATURAL, Ends, FoundPath, Path, end_rows, path_through, unfound
 from lagjax.two_points.starts import PathGuess, sizes_of
 
 # Corrections at most, and how much each has to shrink; and corrections of the motion that is handed out.
@@ -83,8 +82,7 @@ def tangent(model: Model, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
 
 def start_of(model: Model, ends: Ends, found: FoundPath) -> Aim:
     """The unknowns as the path has them."""
-    n, s = model.n, found.path.y.shape[1]
-    row = jnp.asarray(rule_of_degree(s).node_derivative[0], ends.x_a.dtype)
+    n, row = model.n, jnp.asarray(found.path.rule().node_derivative[0], ends.x_a.dtype)
     _, h = found.path.times(ends)
     u = row @ found.path.nodes(ends)[0, :, :n] / h[0]
     return Aim(tangent(model, ends.t_a, ends.x_a, u), found.path.border)
@@ -97,9 +95,9 @@ def start_by_momentum(model: Model, ends: Ends, found: FoundPath) -> Aim:
     R is of order 2s, as the action is, and the polynomial's derivative there of order s alone. Where ∂L/∂v does not
     say what the velocity is, this one stays.
     """
-    aim, n, s = start_of(model, ends, found), model.n, found.path.y.shape[1]
-    (t, h), nodes, x = found.path.times(ends), found.path.nodes(ends)[0], ends.x_a
-    momentum = -residual(model, rule_of_degree(s), t[0], h[0], nodes[:, :n], nodes[:, n:])[0]
+    aim, n, x = start_of(model, ends, found), model.n, ends.x_a
+    (t, h), nodes = found.path.times(ends), found.path.nodes(ends)[0]
+    momentum = -residual(model, found.path.rule(), t[0], h[0], nodes).work[0]
     of_u, u = jax.grad(model.lagrangian, argnums=2), aim.u
     mass, rows = jax.jacfwd(of_u, argnums=2)(ends.t_a, x, u), constraints.jacobian(model, ends.t_a, x, u)
     # What constraints do at the start has no part in the velocity: it is along their rows.
@@ -119,7 +117,7 @@ def start_by_momentum(model: Model, ends: Ends, found: FoundPath) -> Aim:
 def response_of(model: Model, ends: Ends, found: FoundPath) -> Float[Array, "n+b N+b"]:
     """W: what a unit of each equation of the end changes in (v_a, ν, T)."""
     s, size = found.path.y.shape[1:]
-    row = jnp.asarray(rule_of_degree(s).node_derivative[0, 1:], ends.x_a.dtype)
+    row = jnp.asarray(found.path.rule().node_derivative[0, 1:], ends.x_a.dtype)
     _, h = found.path.times(ends)
     first = found.response.y[0].reshape(s, size, -1)[:, : model.n]
     of_start = jnp.einsum("j,jnc->nc", row, first) / h[0]
@@ -130,10 +128,19 @@ def response_of(model: Model, ends: Ends, found: FoundPath) -> Float[Array, "n+b
     return jnp.concatenate([of_start, border])
 
 
+def shoots_alone(model: Model, switching: Any) -> bool:
+    """Whether the ends do not complete the equations of a path, or the motion has switches (`Ends.switching`)."""
+    return switching is not None or model.reacts or not bool(model.holonomic.all())
+
+
 @compiled
-def missed(model: Model, ends: Ends, aim: Aim, q, v) -> Float[Array, " N+b"]:
-    """ρ: by how much a motion that ends at (q, v) misses the equations of the end."""
+def missed(model: Model, ends: Ends, aim: Aim, q, v) -> Float[Array, " r"]:
+    """ρ: by how much a motion that ends at (q, v) misses the equations of the end; alone, conditions on the end, and in
+    the last m rows what v_a misses of the constraints."""
     (x, u), t_b = model.vectors(q, v), ends.t_a + duration(ends, aim)
+    if shoots_alone(model, ends.switching):
+        at_end = x - ends.x_b if ends.condition is None else ends.condition(t_b, x, u)
+        return jnp.concatenate([at_end, constraints.velocity_residual(model, ends.t_a, ends.x_a, aim.u)])
     p = jax.grad(model.lagrangian, argnums=2)(t_b, x, u)
     nu = aim.border[: aim.border.size - ends.free_time]
     rows = end_rows(model, ends, t_b, x, u, jnp.zeros(int(model.holonomic.sum()), x.dtype), p, nu)
@@ -195,9 +202,8 @@ class ShotCourse(NamedTuple):
 
     def strays(self, ends: Ends, trajectory: Trajectory) -> Float[Array, ""]:
         """How far a motion is from the path at its outputs, in units of the path's sizes."""
-        xp, count = numpy_of((trajectory.t, self, ends)), len(trajectory.t)
-        x = [xp.reshape(xp.asarray(q), (count, -1)) for q in jax.tree.leaves(trajectory.q)]
-        off = xp.concatenate(x, axis=1) - positions(ends, self.path, trajectory.t)
+        xp = numpy_of((trajectory.t, self, ends))
+        off = stacked(trajectory.q) - self.path.at(ends, trajectory.t)
         return xp.max(xp.abs(off) / xp.asarray(self.sizes)[None])
 
     def allows(self) -> Float[Array, ""]:
@@ -277,6 +283,11 @@ def last_well(trajectory: Trajectory):
     return last_of(trajectory) if is_among(trajectory.result, ENDED_WELL) else None
 
 
+def meets(trajectory: Trajectory, missed: Array | np.ndarray) -> Bool[Array, ""]:
+    """Whether a motion reached its end, and misses by little what is asked there."""
+    return ended_well(trajectory.result) & (missed < MET.get(np.dtype(missed.dtype), 1e-3))
+
+
 def relative_miss(model: Model, ends: Ends, aim: Aim, sizes: Array, rho: Array, q, v) -> Float[Array, ""]:
     """The largest of ρ, each in units of what it changes by along the motion: positions by their extent."""
     n, xp = model.n, numpy_of((aim, rho, sizes))
@@ -286,15 +297,15 @@ def relative_miss(model: Model, ends: Ends, aim: Aim, sizes: Array, rho: Array, 
 
 
 @compiled
-def _row_sizes(model: Model, ends: Ends, aim: Aim, sizes: Array, q, v) -> Float[Array, " N+b"]:
+def _row_sizes(model: Model, ends: Ends, aim: Aim, sizes: Array, q, v) -> Float[Array, " r"]:
     x, u = model.vectors(q, v)
     speeds = jnp.maximum(jnp.maximum(jnp.abs(u), jnp.abs(aim.u)), sizes / duration(ends, aim))
 
-    def rows(x: Array, u: Array) -> Array:
-        return missed(model, ends, aim, model.tree(x), model.tree(u))
+    def rows(x: Array, u: Array, start: Array) -> Array:
+        return missed(model, ends, aim._replace(u=start), model.tree(x), model.tree(u))
 
-    by_x, by_u = jax.jacfwd(rows, argnums=(0, 1))(x, u)
-    found = jnp.abs(by_x) @ sizes + jnp.abs(by_u) @ speeds
+    by_x, by_u, by_start = jax.jacfwd(rows, argnums=(0, 1, 2))(x, u, aim.u)
+    found = jnp.abs(by_x) @ sizes + (jnp.abs(by_u) + jnp.abs(by_start)) @ speeds
     return jnp.where(found > 0, found, 1.0)
 
 
@@ -352,13 +363,24 @@ def shot_inside(
     return Shot(best.aim, jnp.where(along, best.size, jnp.inf), trajectory)
 
 
-def implicit(model: Model, ends: Ends, aim: Aim, response: Array, rtol: Array) -> Aim:
+def missed_from(model: Model, ends: Ends, aim: Aim, outputs: int, rtol) -> Float[Array, " r"]:
+    """ρ of the motion from the start."""
+    launched = _on_tangent(model, ends, aim) if shoots_alone(model, ends.switching) else aim
+    trajectory = motion(model, ends, launched, outputs, rtol, throw=False, estimate_error=False)
+    return missed(model, ends, aim, *last_of(trajectory))
+
+
+def implicit(model: Model, ends: Ends, aim: Aim, response: Array, outputs: int, rtol) -> Aim:
     """The unknowns of an answer, as the equations of the end define them: with derivatives by everything."""
-    # W is that of the path: one correction has derivatives as good as the path, the second one squares their error.
+    # One correction has derivatives as good as W, of the path or by differences; the second one squares their error.
     for _ in range(2):
-        trajectory = motion(model, ends, aim, 2, rtol, throw=False, estimate_error=False)
-        aim = corrected(ends, aim, response, missed(model, ends, aim, *last_of(trajectory)))
+        aim = corrected(ends, aim, response, missed_from(model, ends, aim, outputs, rtol))
     return aim
+
+
+@compiled
+def _on_tangent(model: Model, ends: Ends, aim: Aim) -> Aim:
+    return aim._replace(u=tangent(model, ends.t_a, ends.x_a, aim.u))
 
 
 # A step of this size, relative, ends the search, the second one a part of the way; one below the third that no longer
@@ -371,18 +393,12 @@ STEPS, STEP_SHRINKS, SHORTEST, MOST = 8, 0.5, 1e-3, 120
 DIFFERENCE = {np.dtype("float64"): 1e-5, np.dtype("float32"): 3e-3}
 
 
-def shoots_alone(model: Model, switching: Any) -> bool:
-    """Whether the ends do not complete the equations of a path, or the motion has switches (`Ends.switching`)."""
-    return switching is not None or model.reacts or not bool(model.holonomic.all())
-
-
 class Place(NamedTuple):
-    """The last z found, for a part ε of the way, with the Jacobian and the size of the last step, relative."""
+    """The last z found, for a part ε of the way, with its W."""
 
     z: Float[Array, " z"]
-    jacobian: Float[Array, "r z"]
+    response: Float[Array, "z r"]
     part: Float[Array, ""]
-    size: Float[Array, ""]
 
 
 class _VelocitySearch(NamedTuple):
@@ -399,82 +415,43 @@ class _VelocitySearch(NamedTuple):
 
 
 class FoundVelocity(NamedTuple):
-    """The start velocity and the time, for a part of the way: all of it, where they were found; the last step."""
+    """The start velocity and the time, for a part of the way: all of it, where they were found."""
 
     aim: Aim
     part: Float[Array, ""]
-    size: Float[Array, ""]
 
 
 @compiled
 def _start(model: Model, ends: Ends, x: Float[Array, "K s n"], parts: Float[Array, " K+1"]) -> Float[Array, " z"]:
     """z of the path through given nodes."""
-    path = path_mesh.path_through(model, ends, x, parts)
-    return jnp.concatenate(start_of(model, ends, unfound(path)))
+    return jnp.concatenate(start_of(model, ends, unfound(path_through(model, ends, x, parts))))
 
 
-@compiled
-def _aim(model: Model, ends: Ends, z: Float[Array, " z"]) -> Aim:
-    return Aim(tangent(model, ends.t_a, ends.x_a, z[: model.n]), z[model.n :])
-
-
-@compiled
-def _misses(model: Model, ends: Ends, z: Float[Array, " z"], q, v) -> Float[Array, " r"]:
-    """ρ, where the motion from z ends at (q, v)."""
-    (x_b, u_b), u = model.vectors(q, v), z[: model.n]
-    t_b = ends.t_a + duration(ends, Aim(u, z[model.n :]))
-    at_end = x_b - ends.x_b if ends.condition is None else ends.condition(t_b, x_b, u_b)
-    return jnp.concatenate([at_end, constraints.velocity_residual(model, ends.t_a, ends.x_a, u)])
-
-
-def missed_from(model: Model, ends: Ends, outputs: int, rtol, z: Float[Array, " z"]) -> Float[Array, " r"]:
-    """ρ; the last m rows are what v_a misses of the constraints."""
-    launch = motion(model, ends, _aim(model, ends, z), outputs, rtol, throw=False, estimate_error=False)
-    return _misses(model, ends, z, *last_of(launch))
-
-
-@compiled
-def _sizes_of_rows(model: Model, ends: Ends, z: Float[Array, " z"], sizes: Array, speeds: Array, q, v):
-    """What each row of ρ changes by along a motion of these sizes and speeds."""
-
-    def rows(x: Array, u: Array, u_a: Array) -> Array:
-        return _misses(model, ends, jnp.concatenate([u_a, z[model.n :]]), model.tree(x), model.tree(u))
-
-    x, u = model.vectors(q, v)
-    by_x, by_u, by_start = jax.jacfwd(rows, argnums=(0, 1, 2))(x, u, z[: model.n])
-    found = jnp.abs(by_x) @ sizes + (jnp.abs(by_u) + jnp.abs(by_start)) @ speeds
-    return jnp.where(found > 0, found, 1.0)
-
-
-def misses_of(model: Model, ends: Ends, found: "FoundVelocity", trajectory: Trajectory) -> Float[Array, ""]:
+def misses_of(model: Model, ends: Ends, aim: Aim, trajectory: Trajectory) -> Float[Array, ""]:
     """By how much a motion misses what is asked, in units of what that changes by along it; without derivatives."""
-    model, ends, found, trajectory = stop_gradient((model, ends, found, trajectory))
-    x, u = (
-        jnp.concatenate([jnp.reshape(y, (len(trajectory.t), -1)) for y in jax.tree.leaves(tree)], axis=1)
-        for tree in (trajectory.q, trajectory.v)
-    )
-    z, last = jnp.concatenate(found.aim), last_of(trajectory)
-    time = duration(ends, found.aim)
-    moved = jnp.maximum(jnp.max(jnp.abs(x - x[:1]), axis=0), jnp.max(jnp.abs(u), axis=0) * time)
+    model, ends, aim, trajectory = stop_gradient((model, ends, aim, trajectory))
+    x, u = stacked(trajectory.q), stacked(trajectory.v)
+    moved = jnp.maximum(jnp.max(jnp.abs(x - x[:1]), axis=0), jnp.max(jnp.abs(u), axis=0) * duration(ends, aim))
     still = jnp.max(moved) <= 0
     moved = jnp.where(still, 1.0, jnp.maximum(moved, 1e-3 * jnp.max(moved)))
-    sizes = _sizes_of_rows(model, ends, z, moved, moved / time, *last)
-    return jnp.max(jnp.abs(_misses(model, ends, z, *last)) / sizes)
+    last = last_of(trajectory)
+    return relative_miss(model, ends, aim, moved, missed(model, ends, aim, *last), *last)
 
 
-def _step(jacobian: Float[Array, "r z"], rho: Float[Array, " r"]) -> Float[Array, " z"]:
-    """Newton's step by least squares: an end on constraints says some things twice."""
+def _pseudoinverse(jacobian: Float[Array, "r z"]) -> Float[Array, "z r"]:
+    """W by least squares: an end on constraints says some things twice."""
     unit = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
     unit = jnp.where(unit > 0, unit, 1.0)
     scaled = jacobian / unit[None]
-    return dense.inverse(scaled.T @ scaled) @ (scaled.T @ rho) / unit
+    return dense.inverse(scaled.T @ scaled) @ scaled.T / unit[:, None]
 
 
 @compiled
-def _around(z: Float[Array, " z"], units: Float[Array, " z"]) -> Float[Array, "2z+1 z"]:
-    """z, and what differs from it by a little in one number."""
+def _around(z: Float[Array, " z"], units: Float[Array, " z"], n: int) -> Aim:
+    """z (2z + 1 of them), and what differs from it by a little in one number."""
     little = jnp.diag(DIFFERENCE[z.dtype] * units)
-    return jnp.concatenate([z[None], z[None] + little, z[None] - little])
+    trials = jnp.concatenate([z[None], z[None] + little, z[None] - little])
+    return Aim(trials[:, :n], trials[:, n:])
 
 
 @compiled
@@ -487,13 +464,14 @@ def _next(
     rho = rho[0]
     defect = jnp.where(first, rho.at[len(rho) - model.m :].set(0.0), search.defect)
     part = jnp.minimum(1.0, before.part + search.more)
-    step = _step(jacobian, rho - (1 - part) * defect)
+    response = _pseudoinverse(jacobian)
+    step = response @ (rho - (1 - part) * defect)
     size = jnp.max(jnp.abs(step) / units)
     fine = jnp.isfinite(size) & jnp.all((search.z - step)[model.n :] > 0)
     at_round_off = (search.size < SETTLED) & (size > STEP_SHRINKS / 2 * search.size)
     there = fine & ((size < jnp.where(part < 1.0, SMALL_PART, SMALL)) | at_round_off)
     lost = ~there & ~(fine & (size < STEP_SHRINKS * search.size) & (search.steps < STEPS))
-    place = jax.tree.map(lambda new, old: jnp.where(there, new, old), Place(search.z, jacobian, part, size), before)
+    place = jax.tree.map(lambda new, old: jnp.where(there, new, old), Place(search.z, response, part), before)
     z = jnp.where(lost | there, place.z, search.z - step)
     more = jnp.where(lost, search.more / 3, jnp.where(there, 1.5 * search.more, search.more))
     again, motions = lost | there, search.motions + 1
@@ -514,27 +492,26 @@ def found_by_shooting(
     units = jnp.concatenate([jnp.full(n, jnp.where(speed > 0, speed, 1.0)), 0 * start[n:] + ends.duration])
     units = stop_gradient(units)
     zero, none = jnp.zeros((), start.dtype), jnp.zeros((), int)
-    place = Place(start, jnp.zeros((rows, count), start.dtype), zero, zero + jnp.inf)
+    place = Place(start, jnp.zeros((count, rows), start.dtype), zero)
     search = _VelocitySearch(
         place, start, jnp.zeros(rows, start.dtype), zero + 1, zero + jnp.inf, none, none, jnp.asarray(True)
     )
 
-    def at(z: Array) -> Array:
-        return missed_from(still, fixed, outputs, rtol, z)
+    def at(aim: Aim) -> Array:
+        return missed_from(still, fixed, aim, outputs, rtol)
 
     def iterate(search: _VelocitySearch) -> _VelocitySearch:
-        trials = _around(search.z, units)
-        rho = jnp.stack([at(z) for z in trials]) if eager else lax.map(at, trials)
+        trials = _around(search.z, units, n)
+        rho = jnp.stack([at(Aim(*aim)) for aim in zip(*trials)]) if eager else lax.map(at, trials)
         return _next(still, units, search, rho)
 
     if eager:
         while search.going:
             search = iterate(search)
-        return FoundVelocity(_aim(model, ends, search.place.z), search.place.part, search.place.size)
+        place, z = search.place, np.asarray(search.place.z)
+        return FoundVelocity(_on_tangent(model, ends, Aim(z[:n], z[n:])), place.part)
     place = stop_gradient(lax.while_loop(lambda search: search.going, iterate, search).place)
-    z = place.z
-    # Two more steps, as in `shot_inside`: the second squares the error that differences leave in the first one.
-    for _ in range(2):
-        moved = z - _step(place.jacobian, missed_from(model, ends, outputs, rtol, z))
-        z = jnp.where(place.part < 1.0, z, moved)
-    return FoundVelocity(_aim(model, ends, z), place.part, place.size)
+    last = Aim(place.z[:n], place.z[n:])
+    found = implicit(model, ends, last, place.response, outputs, rtol)
+    aim = jax.tree.map(lambda old, new: jnp.where(place.part < 1.0, old, new), last, found)
+    return FoundVelocity(_on_tangent(model, ends, aim), place.part)

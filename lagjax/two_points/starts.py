@@ -28,9 +28,9 @@ from scipy.linalg import eigh
 from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled, numpy_of
 from lagjax.system import Model, coordinates
-from lagjax.two_points.elements import discrete_action, rule_of_degree
-from lagjax.two_points.path import FIXED, Ends, Path, PathEquations, equations
-from lagjax.two_points.path_mesh import path_through, positions
+from lagjax.two_points import mesh
+from lagjax.two_points.elements import rule_of_degree
+from lagjax.two_points.path import FIXED, Ends, Path, PathEquations, equations, path_through
 
 # The degree of elements.
 DEGREE = 8
@@ -73,23 +73,29 @@ def guesses_of(model: Model, starts: Starts) -> list[PathGuess]:
     if starts < 1:
         raise ValueError(f"starts={starts}: there must be one at least.\nFix: starts=1, the straight line.")
     random = np.random.default_rng(0)
-    falling = 1 / np.arange(1, WAVES + 1)[:, None]
-    waves = [AMPLITUDES[i % 3] * falling * random.normal(size=(WAVES, model.n)) for i in range(starts - 1)]
+    waves = [waves_of(random, AMPLITUDES[i % 3], np.ones(model.n)) for i in range(starts - 1)]
     return [PathGuess("straight line"), *(PathGuess(f"random start {i + 1}", wave) for i, wave in enumerate(waves))]
+
+
+def waves_of(random: np.random.Generator, amplitude: float, sizes: np.ndarray) -> np.ndarray:
+    """Random amplitudes (w, n) of waves, the shorter the smaller, in units of these sizes."""
+    falling = 1 / np.arange(1, WAVES + 1)[:, None]
+    return amplitude * falling * random.normal(size=(WAVES, sizes.size)) * sizes
+
+
+def course_of(motion: Trajectory) -> Callable:
+    """The positions of a motion as a function of time, between its outputs by their velocities."""
+    return CubicHermiteSpline(motion.t, mesh.stacked(motion.q), mesh.stacked(motion.v))
 
 
 def nodes_of(model: Model, ends: Ends, guess: PathGuess, count: int, degree: int):
     """The nodes (K, s, n) of a start, and where its elements meet."""
     xp, dtype = numpy_of((ends.x_a, ends.x_b, ends.duration)), ends.x_a.dtype
-    parts = np.linspace(0.0, 1.0, count + 1)
-    at = parts[:-1, None] + np.diff(parts)[:, None] * rule_of_degree(degree).nodes[1:]
-    parts = parts.astype(dtype)
+    at, parts = mesh.after_first(mesh.even(count), degree), mesh.even(count).astype(dtype)
     if isinstance(guess.path, Nodes):
         return guess.path.x.astype(dtype), parts
     if isinstance(guess.path, Trajectory):
-        motion = guess.path
-        known = CubicHermiteSpline(motion.t, *(np.asarray(x) for x in jax.vmap(model.vectors)(motion.q, motion.v)))
-        return known(np.asarray(ends.t_a + ends.duration * at)).astype(dtype), parts
+        return course_of(guess.path)(np.asarray(ends.t_a + ends.duration * at)).astype(dtype), parts
     if callable(guess.path):
         t = ends.t_a + ends.duration * at.astype(dtype)
         return jax.vmap(jax.vmap(lambda t: model.vector(coordinates.as_floats(guess.path(t)))))(t), parts
@@ -179,10 +185,9 @@ def can_descend(model: Model, ends: Ends, count: int) -> bool:
 
 def ways_down(model: Model, ends: Ends, path: Path, sizes: Sizes, count: int) -> list[np.ndarray]:
     """The nodes (K, s, n) that lie below a saddle, on either side of it, on elements of equal length."""
-    parts = np.linspace(0.0, 1.0, count + 1)
-    at = parts[:-1, None] + np.diff(parts)[:, None] * rule_of_degree(DEGREE).nodes[1:]
-    t = np.asarray(ends.t_a) + np.asarray(ends.duration) * at.ravel()
-    x = positions(ends, path, t).reshape(count, DEGREE, model.n)
+    parts = mesh.even(count)
+    t = np.asarray(ends.t_a) + np.asarray(ends.duration) * mesh.after_first(parts, DEGREE).ravel()
+    x = path.at(ends, t).reshape(count, DEGREE, model.n)
     ground = _Ground(model, ends, parts, sizes)
     saddle = ground.at(x, None)
     if saddle is None:
@@ -218,8 +223,8 @@ class _Ground:
         self.model, self.ends, self.parts, self.sizes = model, ends, parts.astype(float), sizes
         s, duration = DEGREE, float(ends.duration)
         self.kinetic = _kinetic(self.parts * duration, s, sizes.mass)
-        shares = self.parts[:-1, None] + np.diff(self.parts)[:, None] * rule_of_degree(s).nodes[1:]
-        wave = (np.sin(np.pi * shares.ravel()[:-1])[:, None] * sizes.sizes[None]).ravel()
+        shares = mesh.after_first(self.parts, s).ravel()[:-1]
+        wave = (np.sin(np.pi * shares)[:, None] * sizes.sizes[None]).ravel()
         self.unit = float(np.sqrt(wave @ self.kinetic @ wave))
 
     def at(self, x: np.ndarray, multipliers: np.ndarray | None) -> _Nodes | None:
@@ -323,6 +328,4 @@ def _second_order(
     """The nodes on the constraints, the discrete action, its slope and its curvature."""
     path, n = path_through(model, ends, x, parts), model.n
     path = path._replace(y=path.y.at[..., n:].set(multipliers))
-    rule, nodes, (t, h) = rule_of_degree(x.shape[1]), path.nodes(ends), path.times(ends)
-    action = jax.vmap(lambda t, h, nodes: discrete_action(model, rule, t, h, nodes[:, :n]))(t, h, nodes)
-    return path.y[..., :n], jnp.sum(action), equations(model, ends, path)
+    return path.y[..., :n], path.action(model, ends), equations(model, ends, path)

@@ -8,7 +8,7 @@ system like any other, which can be integrated, differentiated and swept.
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Thread
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,8 +22,10 @@ from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import has_jumps
 from lagjax.system import System, Traced, coordinates, takes_of
 from lagjax.two_points.control_problem import Question
+from lagjax.two_points.elements import basis
+from lagjax.two_points.mesh import stacked
 from lagjax.two_points.nonlinear_program import SolverAnswer
-from lagjax.two_points.transcription import Layout, through
+from lagjax.two_points.transcription import Layout
 
 
 class Plan(eqx.Module):
@@ -52,18 +54,18 @@ class Plan(eqx.Module):
         return np.append(starts[: last + 1], starts[last] + np.asarray(self.widths)[last])
 
     def __call__(self, t: ArrayLike) -> PyTree:
-        t = jnp.asarray(t, self.starts.dtype)
-        place = jnp.searchsorted(self.starts[1:], t, side="right")
-        u = lagrange(self.nodes, (t - self.starts[place]) / self.widths[place]) @ self.rows[place]
-        return coordinates.like(self.example, jnp.clip(u, self.low, self.high) if self.cut_off else u)
+        return coordinates.like(self.example, self._vectors(jnp.asarray(t, self.starts.dtype), jnp))
 
     def at(self, t: ArrayLike) -> np.ndarray:
         """The controls at times (T,), as vectors (T, n)."""
-        t, starts = np.asarray(t), np.asarray(self.starts)
-        place = np.searchsorted(starts[1:], t, side="right")
-        part = (t - starts[place]) / np.asarray(self.widths)[place]
-        u = np.einsum("tr,trn->tn", through(np.array(self.nodes), part), np.asarray(self.rows)[place])
-        return np.clip(u, self.low, self.high) if self.cut_off else u
+        return self._vectors(np.asarray(t), np)
+
+    def _vectors(self, t: ArrayLike, xp: Any) -> Any:
+        starts, widths, rows = (xp.asarray(x) for x in (self.starts, self.widths, self.rows))
+        place = xp.searchsorted(starts[1:], t, side="right")
+        values = basis(np.array(self.nodes), (t - starts[place]) / widths[place])
+        u = xp.einsum("...r,...rn->...n", values, rows[place])
+        return xp.clip(u, self.low, self.high) if self.cut_off else u
 
 
 def plan_of(knots: np.ndarray, rows: np.ndarray, limits: np.ndarray, example: PyTree, nodes: np.ndarray, room: int):
@@ -74,19 +76,6 @@ def plan_of(knots: np.ndarray, rows: np.ndarray, limits: np.ndarray, example: Py
     # What is linear or constant between its bounds stays there.
     cut_off = len(nodes) > 2 and bool(np.any(np.isfinite(limits)))
     return Plan(*map(jnp.asarray, (starts, widths, rows, *limits)), example, tuple(nodes.tolist()), cut_off)
-
-
-def lagrange(nodes: tuple[float, ...], x: Array) -> Float[Array, " r"]:
-    """The values at x of the polynomials that are one at one of the nodes and zero at the others.
-
-    >>> lagrange((0.0, 1.0), jnp.asarray(0.25))
-    Array([0.75, 0.25], dtype=float64)
-    """
-    values = []
-    for i, node in enumerate(nodes):
-        others = [(x - other) / (node - other) for j, other in enumerate(nodes) if j != i]
-        values.append(jnp.prod(jnp.stack(others)) if others else jnp.ones_like(x))
-    return jnp.stack(values)
 
 
 class Planned(eqx.Module):
@@ -340,7 +329,7 @@ def _defects(question: Question, trajectory: Trajectory) -> dict[str, float]:
 
 def _columns(tree: PyTree) -> dict[str, np.ndarray]:
     names = coordinates.names(jtu.tree_map(lambda x: np.asarray(x)[0], tree))
-    return dict(zip(names, np.concatenate([np.reshape(x, (len(x), -1)).T for x in jtu.tree_leaves(tree)])))
+    return dict(zip(names, stacked(tree).T))
 
 
 def is_found(solved: SolverAnswer) -> bool:

@@ -11,19 +11,10 @@ together.
 
 Source: Ober-Blöbaum, Junge & Marsden, *ESAIM: COCV* 17 (2011) 322 (discrete mechanics and optimal control);
 Leyendecker, Ober-Blöbaum, Marsden & Ortiz, *Optim. Control Appl. Meth.* 31 (2010) 505 (constraints).
-
-**How elements are made finer**, where a control jumps, and the same motion on other elements.
-
-Two rules. All elements are halved until the cost no longer changes. And where a control goes from one of its bounds to
-the other within an element, this is cut in two at a time that the program then finds, and the control stays at the
-one bound before the cut and at the other after it.
-
-Without the second half of that rule the cut would not be where the control jumps: a polynomial is held to its bounds at
-Gauss's points alone, and one that is beyond them in between costs less.
 """
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -37,13 +28,13 @@ from lagjax.system import Form, Model, System, constraints, coordinates, uncheck
 from lagjax.two_points.elements import (
     Rule,
     at_points,
-    constraint_impulse,
+    basis,
+    defects,
     force_and_momentum,
-    lagrange,
     rule_of_degree,
     velocity_constraints,
-    virtual_work,
 )
+from lagjax.two_points.mesh import Mesh, between, in_groups, places, rows_of
 
 INTERPOLATIONS = "smooth", "linear", "constant"
 
@@ -105,11 +96,6 @@ class Plant(eqx.Module):
         return unchecked(self.system, self.merge(self.params, self.control(u)), self.form)
 
 
-def through(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """From values at `nodes` (m,) to those of their polynomial at `at` (k,), (k, m)."""
-    return lagrange(nodes, at)[0]
-
-
 class Element(NamedTuple):
     """What one element sees: times, and rows of positions, controls, λ and μ."""
 
@@ -119,6 +105,29 @@ class Element(NamedTuple):
     controls: Array
     node_multipliers: Array
     point_multipliers: Array
+
+    def equations(self, plant: Plant) -> tuple[Array, Array]:
+        """The cost of an element, and its part of the equations: virtual work, g, phi, and bounded velocities."""
+        rule = plant.rule
+        total = self.end[0] - plant.t_a
+        t, h = plant.t_a + total * self.parts[0], total * (self.parts[1] - self.parts[0])
+        states = at_points(rule, t, h, self.q)
+        u = basis(plant.control_nodes, rule.points) @ self.controls
+
+        def at_point(t: Array, x: Array, v: Array, u: Array, multipliers: Array):
+            model = plant.model(u)
+            force, p = force_and_momentum(model, t, x, v, multipliers)
+            cost = 0.0
+            if plant.cost is not None:
+                cost = plant.cost(t, model.tree(x), model.tree(v), plant.control(u), plant.params)
+            return force, p, velocity_constraints(model, t, x, v), jnp.asarray(cost, x.dtype)
+
+        force, p, phi, cost = jax.vmap(at_point)(*states, u, self.point_multipliers)
+        # Constraints are to hold whatever the controls are: these are taken where the element begins.
+        nodes = jnp.concatenate([self.q, self.node_multipliers], axis=1)
+        missed = defects(plant.model(u[0]), rule, t, h, nodes, force, p)
+        rows = missed.work, missed.g[1:], phi, states.u[:, list(plant.bounded)]
+        return h * jnp.sum(rule.weights * cost), jnp.concatenate([jnp.ravel(x) for x in rows])
 
 
 class PlanEnds(NamedTuple):
@@ -133,54 +142,26 @@ class PlanEnds(NamedTuple):
     controls: Array
     impulse: Array
 
+    def equations(self, plant: Plant) -> tuple[Array, Array]:
+        """The cost of the end, and the equations there: momenta, constraints at both ends, conditions."""
+        ts, at = (plant.t_a, self.end[0]), basis(plant.control_nodes, np.array([0.0, 1.0]))
+        rows, of_constraints = [], []
+        for i, sign in ((0, 1.0), (1, -1.0)):
+            model = plant.model(at[i] @ self.controls[i])
 
-def of_element(plant: Plant, z: Element) -> tuple[Array, Array]:
-    """The cost of an element, and its part of the equations: virtual work, g, phi, and bounded velocities."""
-    rule = plant.rule
-    total = z.end[0] - plant.t_a
-    t, h = plant.t_a + total * z.parts[0], total * (z.parts[1] - z.parts[0])
-    states = at_points(rule, t, h, z.q)
-    u = through(plant.control_nodes, rule.points) @ z.controls
+            def g(t: Array, x: Array, model: Model = model):
+                return constraints.position_residual(model, t, x)
 
-    def at_point(t: Array, x: Array, v: Array, u: Array, multipliers: Array):
-        model = plant.model(u)
-        force, p = force_and_momentum(model, t, x, v, multipliers)
-        cost = 0.0
-        if plant.cost is not None:
-            cost = plant.cost(t, model.tree(x), model.tree(v), plant.control(u), plant.params)
-        return force, p, velocity_constraints(model, t, x, v), jnp.asarray(cost, x.dtype)
-
-    force, p, phi, cost = jax.vmap(at_point)(*states, u, z.point_multipliers)
-    work, g = virtual_work(rule, h, force, p), jnp.zeros((0,), z.q.dtype)
-    if plant.of_positions:
-        # Constraints are to hold whatever the controls are: these are taken where the element begins.
-        model = plant.model(u[0])
-        work = work + constraint_impulse(model, rule, t, h, z.q, z.node_multipliers)
-        g = jax.vmap(lambda t, x: constraints.position_residual(model, t, x))(t + h * rule.nodes[1:], z.q[1:])
-    rows = work, g, phi, states.u[:, list(plant.bounded)]
-    return h * jnp.sum(rule.weights * cost), jnp.concatenate([jnp.ravel(x) for x in rows])
-
-
-def of_ends(plant: Plant, z: PlanEnds) -> tuple[Array, Array]:
-    """The cost of the end, and the equations there: momenta, constraints at the start and at the end, conditions."""
-    ts, at = (plant.t_a, z.end[0]), through(plant.control_nodes, np.array([0.0, 1.0]))
-    rows, of_constraints = [], []
-    for i, sign in ((0, 1.0), (1, -1.0)):
-        model = plant.model(at[i] @ z.controls[i])
-
-        def g(t: Array, x: Array, model: Model = model):
-            return constraints.position_residual(model, t, x)
-
-        p = jax.grad(model.lagrangian, argnums=2)(ts[i], z.q[i], z.v[i])
-        phi, back = jax.vjp(lambda v: velocity_constraints(model, ts[i], z.q[i], v), z.v[i])
-        # Velocity constraints hold at points inside, and what the last step misses them by is returned at the end.
-        rows.append(sign * p + (back(z.impulse)[0] if i else 0.0))
-        value, rate = jax.jvp(g, (ts[i], z.q[i]), (jnp.ones_like(ts[i]), z.v[i]))
-        of_constraints += [rate, phi] if i else [value, rate, phi]
-    last = ts[1], plant.form.tree(z.q[1]), plant.form.tree(z.v[1]), plant.params
-    conditions = [] if plant.end is None else [coordinates.flatten(plant.end(*last))[0]]
-    cost = 0.0 if plant.end_cost is None else plant.end_cost(*last)
-    return jnp.asarray(cost, z.q.dtype), jnp.concatenate([*rows, *of_constraints, *conditions])
+            p = jax.grad(model.lagrangian, argnums=2)(ts[i], self.q[i], self.v[i])
+            phi, back = jax.vjp(lambda v: velocity_constraints(model, ts[i], self.q[i], v), self.v[i])
+            # Velocity constraints hold at points inside, and what the last step misses them by is returned at the end.
+            rows.append(sign * p + (back(self.impulse)[0] if i else 0.0))
+            value, rate = jax.jvp(g, (ts[i], self.q[i]), (jnp.ones_like(ts[i]), self.v[i]))
+            of_constraints += [rate, phi] if i else [value, rate, phi]
+        last = ts[1], plant.form.tree(self.q[1]), plant.form.tree(self.v[1]), plant.params
+        conditions = [] if plant.end is None else [coordinates.flatten(plant.end(*last))[0]]
+        cost = 0.0 if plant.end_cost is None else plant.end_cost(*last)
+        return jnp.asarray(cost, self.q.dtype), jnp.concatenate([*rows, *of_constraints, *conditions])
 
 
 def _split(form: tuple, z: Array):
@@ -189,21 +170,12 @@ def _split(form: tuple, z: Array):
     return kind(*(z[a:b].reshape(shape) for a, b, shape in zip(ends, ends[1:], shapes)))
 
 
-def _function(plant: Plant, form: tuple):
-    of = of_element if form[0] is Element else of_ends
-
-    def function(z: Array):
-        return of(plant, _split(form, z))
-
-    return function
-
-
 @compiled
 def values_and_slopes(plant: Plant, form: tuple, z: Array):
     """The costs (B,) and equations (B, r) of the parts z (B, d), and the derivatives of both."""
 
     def twice(z: Array):
-        found = _function(plant, form)(z)
+        found = _split(form, z).equations(plant)
         return found, found
 
     slopes, values = jax.vmap(jax.jacfwd(twice, has_aux=True))(z)
@@ -211,11 +183,11 @@ def values_and_slopes(plant: Plant, form: tuple, z: Array):
 
 
 @compiled
-def curvatures(plant: Plant, form: tuple, z: Array, share: Array, multipliers: Array):
+def curvatures(plant: Plant, form: tuple, share: Array, z: Array, multipliers: Array):
     """The second derivatives of `share` times the costs plus the equations times `multipliers` (B, r)."""
 
     def lagrangian(z: Array, multipliers: Array):
-        cost, rows = _function(plant, form)(z)
+        cost, rows = _split(form, z).equations(plant)
         return share * cost + jnp.dot(multipliers, rows)
 
     return jax.vmap(jax.hessian(lagrangian))(z, multipliers)
@@ -233,29 +205,17 @@ class Block(NamedTuple):
     columns: np.ndarray
     rows: np.ndarray
 
-    def _together(self, function: Callable, *arguments):
-        size = TOGETHER if len(self.columns) > 1 else 1
-        found = []
-        for start in range(0, len(self.columns), size):
-            pieces = [_filled(x[start : start + size], size) for x in arguments]
-            found.append(jax.tree.map(np.asarray, function(self.plant, self.form, *pieces)))
-        return jax.tree.map(lambda *x: np.concatenate(x)[: len(self.columns)], *found)
-
     def values_and_slopes(self, x: np.ndarray):
         """Costs (B,) and rows (B, r), and their derivatives by what each part sees, (B, d) and (B, r, d)."""
-        return self._together(values_and_slopes, x[self.columns])
+        return self._found(partial(values_and_slopes, self.plant, self.form), x[self.columns])
 
     def curvatures(self, x: np.ndarray, share: float, multipliers: np.ndarray):
         """The second derivatives (B, d, d) of `share` times the cost plus the rows times `multipliers`."""
+        function = partial(curvatures, self.plant, self.form, np.asarray(share))
+        return self._found(function, x[self.columns], multipliers[self.rows])
 
-        def function(plant: Plant, form: tuple, *pieces):
-            return curvatures(plant, form, pieces[0], np.asarray(share), pieces[1])
-
-        return self._together(function, x[self.columns], multipliers[self.rows])
-
-
-def _filled(x: np.ndarray, size: int):
-    return np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)]) if len(x) < size else x
+    def _found(self, function: Callable, *arguments):
+        return in_groups(function, TOGETHER if len(self.columns) > 1 else 1, *arguments)
 
 
 class Layout:
@@ -267,7 +227,7 @@ class Layout:
     def __init__(self, plant: Plant, count: int):
         self.plant, self.count = plant, count
         n, s, k = plant.form.n, plant.degree, count
-        controls = {"smooth": k * s, "linear": k + 1, "constant": k}[plant.interpolation]
+        controls = self.of_controls[-1, -1] + 1
         self.size, self.places = _numbered({
             "end": (1,), "parts": (k + 1,), "q": (s * k + 1, n), "v": (2, n), "controls": (controls, plant.n_controls),
             "node_multipliers": (s * k + 1, plant.of_positions), "point_multipliers": (s * k, plant.of_velocities),
@@ -283,19 +243,17 @@ class Layout:
     @cached_property
     def of_nodes(self) -> np.ndarray:
         """Which nodes each element has, (K, s + 1)."""
-        s = self.plant.degree
-        return s * np.arange(self.count)[:, None] + np.arange(s + 1)
+        return rows_of(self.count, self.plant.rule.nodes)
 
     @cached_property
     def of_points(self) -> np.ndarray:
         """Which points each element has, (K, s)."""
-        return self.of_nodes[:, :-1]
+        return rows_of(self.count, self.plant.rule.points)
 
     @cached_property
     def of_controls(self) -> np.ndarray:
         """Which rows of controls each element has, (K, r)."""
-        each = np.arange(self.count)[:, None]
-        return {"smooth": self.of_points, "linear": each + np.arange(2), "constant": each}[self.plant.interpolation]
+        return rows_of(self.count, self.plant.control_nodes)
 
     def blocks(self) -> tuple[Block, Block]:
         """The elements and the ends."""
@@ -335,122 +293,18 @@ def _flat(parts: tuple, count: int):
     return np.concatenate([x.reshape(count, -1) for x in parts], axis=1)
 
 
-# A control this near to a bound, in parts of the distance between both, is at it.
-AT_BOUND = 0.02
-# How near to a neighbour a bound of elements may move, in parts of their distance.
-APART = 0.02
-
-
-class Jump(NamedTuple):
-    """Where a control jumps, as a part of the whole time; which one, and whether it is at its upper bound before."""
-
-    at: float
-    control: int
-    falls: bool
-
-
-class Mesh(NamedTuple):
-    """The bounds of K elements (K + 1,) as parts of the whole time, and the jumps at which they may move, by number."""
-
-    parts: np.ndarray
-    jumps: dict[int, list[Jump]]
-
-    @property
-    def moves(self) -> np.ndarray:
-        """Which of the bounds may move, (K + 1,)."""
-        return np.isin(np.arange(len(self.parts)), list(self.jumps))
-
-    @classmethod
-    def even(cls, count: int) -> "Mesh":
-        """Elements of one length."""
-        return cls(np.linspace(0.0, 1.0, count + 1), {})
-
-    @property
-    def count(self) -> int:
-        """The number of elements."""
-        return len(self.parts) - 1
-
-    def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Between which values each bound of elements may move."""
-        low, high, moves = self.parts.copy(), self.parts.copy(), self.moves
-        for i in self.jumps:
-            before, after = self.parts[i] - self.parts[i - 1], self.parts[i + 1] - self.parts[i]
-            # Two neighbours that both move each have half of what lies between them.
-            low[i] -= before * ((0.5 if moves[i - 1] else 1.0) - APART)
-            high[i] += after * ((0.5 if moves[i + 1] else 1.0) - APART)
-        return low, high
-
-    def at(self, parts: np.ndarray) -> "Mesh":
-        """The same mesh after its bounds have moved."""
-        return Mesh(parts, self.jumps)
-
-    def halved(self) -> "Mesh":
-        """Each element cut in two."""
-        middle = (self.parts[:-1] + self.parts[1:]) / 2
-        parts = np.append(np.stack([self.parts[:-1], middle], axis=1).ravel(), self.parts[-1])
-        return Mesh(parts, {2 * i: jumps for i, jumps in self.jumps.items()})
-
-    def cut(self, jumps: list[Jump]) -> "Mesh":
-        """With a bound of elements at each jump; one that is nearby is moved there."""
-        parts = list(self.parts)
-        for jump in jumps:
-            i = int(np.clip(np.searchsorted(parts, jump.at), 1, len(parts) - 1))
-            share = (jump.at - parts[i - 1]) / (parts[i] - parts[i - 1])
-            near = i - 1 if share < 0.1 else i if share > 0.9 else None
-            if near is not None and 0 < near < len(parts) - 1:
-                parts[near] = jump.at
-            elif near is None:
-                parts.insert(i, jump.at)
-        found = {}
-        for jump in jumps:
-            found.setdefault(int(np.argmin(np.abs(np.array(parts) - jump.at))), []).append(jump)
-        return Mesh(np.array(parts), {i: found[i] for i in sorted(found) if 0 < i < len(parts) - 1})
-
-
-def jumps_of(layout: Layout, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> list[Jump]:
-    """Where a control goes from one bound to the other within an element, in their order."""
-    plant, at = layout.plant, layout.places
-    if plant.interpolation == "linear":
-        return []
-    parts, smooth = x[at["parts"]], plant.interpolation == "smooth"
-    nodes, weights = (plant.rule.points, plant.rule.weights) if smooth else (np.array([0.5]), np.array([1.0]))
-    width = np.diff(parts)[:, None]
-    # To each value the time that it counts for.
-    ends = (parts[:-1, None] + width * np.cumsum(weights)).ravel()
-    widths, found = (width * weights).ravel(), []
-    for control, (u, a, b) in enumerate(zip(x[at["controls"]].T, low, high)):
-        if not np.isfinite(b - a):
-            continue
-        share = (u - a) / (b - a)
-        side = np.where(share < AT_BOUND, -1, np.where(share > 1 - AT_BOUND, 1, 0))
-        (places,) = np.nonzero(side)
-        for i, j in zip(places, places[1:]):
-            if side[i] != side[j] and j - i <= len(nodes) + 1:
-                # The time of a jump that has the same integral as what lies between.
-                as_before = share[i + 1 : j] if side[i] > 0 else 1 - share[i + 1 : j]
-                place = float(ends[i] + np.sum(as_before * widths[i + 1 : j]))
-                found.append(Jump(place, control, bool(side[i] > 0)))
-    return sorted(found)
-
-
 def moved(layout: Layout, x: np.ndarray, mesh: Mesh) -> tuple[Layout, np.ndarray]:
     """The same motion on other elements: the new layout and its unknowns."""
-    plant, old, k = layout.plant, layout.places, layout.count
+    plant, old, parts = layout.plant, layout.places, x[layout.places["parts"]]
     new = Layout(plant, mesh.count)
-    rule, parts, at, y = plant.rule, x[old["parts"]], new.places, np.zeros(new.size)
+    at, y, rule = new.places, np.zeros(new.size), plant.rule
+    y[at["parts"]] = mesh.parts
     for name in ("end", "v", "impulse"):
         y[at[name]] = x[old[name]]
-    y[at["parts"]] = mesh.parts
-
-    def resample(name: str, of_elements: np.ndarray, nodes: np.ndarray, last: bool):
-        where = mesh.parts[:-1, None] + np.diff(mesh.parts)[:, None] * (nodes[:-1] if last else nodes)
-        where = np.append(where.ravel(), 1.0) if last else where.ravel()
-        place = np.clip(np.searchsorted(parts, where, side="right") - 1, 0, k - 1)
-        inside = (where - parts[place]) / (parts[place + 1] - parts[place])
-        y[at[name]] = np.einsum("mr,mrn->mn", through(nodes, inside), x[old[name]][of_elements][place])
-
-    resample("q", layout.of_nodes, rule.nodes, True)
-    resample("node_multipliers", layout.of_nodes, rule.nodes, True)
-    resample("point_multipliers", layout.of_points, rule.points, False)
-    resample("controls", layout.of_controls, plant.control_nodes, plant.interpolation == "linear")
+    for name, nodes in (
+        ("q", rule.nodes), ("node_multipliers", rule.nodes), ("point_multipliers", rule.points),
+        ("controls", plant.control_nodes),
+    ):  # fmt: skip
+        rows = x[old[name]][rows_of(layout.count, nodes)]
+        y[at[name]] = between(parts, nodes, rows, places(mesh.parts, nodes))
     return new, y

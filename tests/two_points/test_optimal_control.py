@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.two_points import optimal_control, transcription
+from lagjax.two_points import optimal_control
+from lagjax.two_points.control_problem import End
+from lagjax.two_points.mesh import Jump, Mesh
 from lagjax.two_points.optimal_control import split_controls
 from lagjax.two_points.steering import Accuracy
 
@@ -239,27 +241,16 @@ def test_what_is_said_of_a_tolerance(accuracy, words):
     )
 
 
-def test_meshes():
-    """Elements are cut at a jump, near a bound of theirs are moved there, and keep it as they are halved."""
-    even = transcription.Mesh.even(4)
-    cut = even.cut([transcription.Jump(0.6, 0, True), transcription.Jump(0.251, 1, False)])
-    np.testing.assert_allclose(cut.parts, [0.0, 0.251, 0.5, 0.6, 0.75, 1.0])
-    assert sorted(cut.jumps) == [1, 3] and sorted(cut.halved().jumps) == [2, 6] and cut.halved().count == 10
-    low, high = cut.limits()
-    assert np.all(low[[0, 2, 4, 5]] == high[[0, 2, 4, 5]]) and np.all(low[[1, 3]] < high[[1, 3]])
-    assert low[3] > cut.parts[2] and high[3] < cut.parts[4]
-
-
 @pytest.mark.parametrize("falls", [True, False])
 def test_controls_at_a_jump(falls):
     """Before a jump a control is at one of its limits, after it at the other; elsewhere, and the other control,
     anywhere between them."""
-    controls, none = np.arange(8).reshape(4, 2), SimpleNamespace(q=np.zeros(0), v=np.zeros(0))
+    controls, none = np.arange(8).reshape(4, 2), End(np.zeros(0), np.zeros(0))
     places = {"controls": controls, "end": [8], "parts": np.arange(9, 14), "q": np.zeros((2, 0), int)}
     layout = SimpleNamespace(places=places | {"v": places["q"]}, size=14, of_controls=np.arange(4)[:, None])
     limits = {"q": (-1.0, 1.0), "v": (-1.0, 1.0), "controls": (np.array([-2.0, -3.0]), np.array([2.0, 3.0]))}
     question = SimpleNamespace(limits=limits, t_b=(1.0, 1.0), ends=(none, none))
-    cut = transcription.Mesh(np.linspace(0.0, 1.0, 5), {2: [transcription.Jump(0.5, 1, falls)]})
+    cut = Mesh(np.linspace(0.0, 1.0, 5), {2: [Jump(0.5, 1, falls)]})
     low, high = optimal_control._limits_of(question, layout, cut)
     known = {1: 3.0 if falls else -3.0, 2: -3.0 if falls else 3.0}
     for k in range(4):

@@ -7,8 +7,9 @@ import scipy.sparse as sp
 
 import lagjax as lj
 from lagjax.two_points.control_problem import asked
+from lagjax.two_points.mesh import Mesh, even
 from lagjax.two_points.nonlinear_program import NonlinearProgram
-from lagjax.two_points.transcription import Layout, Mesh, moved
+from lagjax.two_points.transcription import Layout, moved
 
 # A skate whose path is also held on a cylinder, for constraints of both kinds.
 skate = lj.System(
@@ -74,9 +75,9 @@ def test_the_same_motion_on_other_elements(interpolation):
     layout, made = program(2, interpolation)
     generator = np.random.default_rng(2)
     x = generator.normal(size=layout.size)
-    even = Mesh.even(2)
-    x[layout.places["end"]], x[layout.places["parts"]] = 1.3, even.parts
-    finer, y = moved(layout, x, even.halved())
+    mesh = Mesh(even(2), {})
+    x[layout.places["end"]], x[layout.places["parts"]] = 1.3, mesh.parts
+    finer, y = moved(layout, x, mesh.halved())
     s = layout.plant.degree
     for old, new in ((1, 2), (0, 0)):
         nodes = x[layout.places["q"]][layout.of_nodes[old]], y[finer.places["q"]][finer.of_nodes[new]]
