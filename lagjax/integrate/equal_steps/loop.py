@@ -88,7 +88,7 @@ def stepped(
         found = states, reached, jnp.sum(counts), end, jnp.any(used_up)
         if follower is None:
             return *found, None, None
-        watching = last_state[-1]
+        watching: Any = last_state[-1]
         return *found, watching.ended, locate(follower, watching.watched)
 
     arguments = model, pace, q, v, ts, dt, follower, wanted
