@@ -11,6 +11,7 @@ from jax import lax
 
 import lagjax as lj
 from lagjax.integrate import in_turn
+from lagjax.integrate.solve import reports
 from lagjax.jaxtools.cache import PROGRAMS
 from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
 from lagjax.sweep import engine
