@@ -9,9 +9,9 @@ equations E(z) = 0 with the Jacobian `J = (E_y, E_μ)`. The next point is predic
 There may be more equations than unknowns, some of them redundant; they are then solved by least squares. Lengths are
 measured in the positions and the parameter.
 
-A `Problem` has the equations, the frame in which their points are read, and monitors: functions of the points, each of
-which changes where something happens in between, and knows how that point is refined. A `Follower` takes the steps,
-looks at the monitors after each, and decides where a branch ends and which others are followed.
+A `BranchProblem` has the equations, the frame in which their points are read, and monitors: functions of the points,
+each of which changes where something happens in between, and knows how that point is refined. A `BranchFollower` takes
+the steps, looks at the monitors after each, and decides where a branch ends and which others are followed.
 
 Source: Keller, in *Applications of Bifurcation Theory* (1977) 359; Allgower & Georg, *Introduction to Numerical
 Continuation Methods*, ch. 6 (steps).
@@ -174,7 +174,7 @@ def count_changes(before: int | None, after: int | None) -> bool:
     return before is not None and after is not None and before != after
 
 
-class Problem(abc.ABC):
+class BranchProblem(abc.ABC):
     """Equations E(z) = 0 that have branches of solutions, how a point is read, and what is watched along a branch.
 
     Abstract: `residual` has the equations, `described` reads a point in the `frame`, `monitors` find critical points.
@@ -361,7 +361,7 @@ def _at_zero(tried):
     return zs[0]
 
 
-def zero(kind: str, of: Callable[[BranchPoint], float], problem: Problem, a: BranchPoint, b: BranchPoint):
+def zero(kind: str, of: Callable[[BranchPoint], float], problem: BranchProblem, a: BranchPoint, b: BranchPoint):
     """The `CriticalPoint` between two points where a smooth function changes its sign; None if it does not."""
     found = problem.zero_between(a, b, of)
     if found is None:

@@ -17,7 +17,7 @@ from lagjax.analysis.balance import OK, VELOCITY, WORDS, Steady, side_by_side
 from lagjax.analysis.critical_points import Frame, SteadyProblem, along_named, full_jacobian, value_in, with_value
 from lagjax.analysis.degenerate import unknowns
 from lagjax.analysis.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
-from lagjax.analysis.following import BranchPath, Follower
+from lagjax.analysis.following import BranchFollower, BranchPath
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import are_angles, describe, is_autonomous
@@ -360,7 +360,7 @@ def continue_equilibria(
         begin = problem.begin(z, np.sign(last - first))
         if isinstance(begin, str):
             raise ValueError(f"the branch cannot begin at the start: {begin}.")
-        runs.append(Follower(problem, most_points, crossings))
+        runs.append(BranchFollower(problem, most_points, crossings))
         runs[-1].follow(begin)
         if "infinity" not in runs[-1].paths[0].status:
             return _result(runs[-1], first, last, s)
@@ -453,7 +453,7 @@ def _parts(steady, y, positions, units=None):
     return rows, columns, u, sizes, vt
 
 
-def _result(run: Follower, first: float, last: float, s: State) -> Branches:
+def _result(run: BranchFollower, first: float, last: float, s: State) -> Branches:
     """The result in the user's structure."""
     critical = [_critical(run, i) for i in range(len(run.found))]
     critical.sort(key=lambda c: abs(c.parameter - first))
@@ -464,7 +464,7 @@ def _result(run: Follower, first: float, last: float, s: State) -> Branches:
     )  # fmt: skip
 
 
-def _critical(run: Follower, i: int) -> Critical:
+def _critical(run: BranchFollower, i: int) -> Critical:
     found, unit = run.found[i], run.problem.unit
     if found.point is not None:
         outputs = found.point.outputs

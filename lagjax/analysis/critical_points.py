@@ -56,9 +56,9 @@ from lagjax.analysis.arclength import (
     NUMBER,
     Along,
     BranchPoint,
+    BranchProblem,
     CriticalPoint,
     Monitor,
-    Problem,
     count_changes,
     no_such_number,
     numbers_in,
@@ -513,7 +513,7 @@ MONITORS = (
 )
 
 
-class SteadyProblem(Problem):
+class SteadyProblem(BranchProblem):
     """Steady motions of a `Frame`. `fastest`: the size of the fastest root so far, the unit of the roots' round-off."""
 
     monitors, crossings = MONITORS, True

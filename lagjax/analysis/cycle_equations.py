@@ -46,9 +46,9 @@ from jaxtyping import Array, Bool, Float, Int
 from lagjax.analysis.arclength import (
     Along,
     BranchPoint,
+    BranchProblem,
     CriticalPoint,
     Monitor,
-    Problem,
     count_changes,
     sign_changes,
     zero,
@@ -399,7 +399,7 @@ MONITORS = (
 )
 
 
-class CycleProblem(Problem):
+class CycleProblem(BranchProblem):
     """Cycles of an `OrbitFrame`.
 
     `guide`: the last point of the branch. `isolated`: whether only trivial directions lead from a cycle to others at

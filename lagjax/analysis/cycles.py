@@ -34,7 +34,7 @@ from lagjax.analysis.cycle_equations import (
     sizes_at,
 )
 from lagjax.analysis.flow import any_flow
-from lagjax.analysis.following import AT_EDGE, Follower
+from lagjax.analysis.following import AT_EDGE, BranchFollower
 from lagjax.analysis.monodromy import OrbitProblem, any_problem_of, tolerance_of, user_system
 from lagjax.analysis.periodic_orbit import PeriodicOrbit
 from lagjax.analysis.shooting import Goal, OrbitRequest, guessed
@@ -351,7 +351,7 @@ def _frame(orbit, problem, place: Along, asked, rtol, to) -> tuple[OrbitFrame, n
     return frame, z
 
 
-def _followed(frame, z, low, high, towards, most) -> Follower:
+def _followed(frame, z, low, high, towards, most) -> BranchFollower:
     """Follow the branch from its start."""
     size = frame.scale.size
     guide = Guide(z[:size], np.zeros(size, z.dtype))
@@ -372,7 +372,7 @@ def _followed(frame, z, low, high, towards, most) -> Follower:
     begin = problem.begin(z, towards)
     if isinstance(begin, str):
         raise ValueError(f"a branch cannot begin at this orbit: {begin}.\nFix: find it again with a smaller rtol.")
-    run = Follower(problem, most)
+    run = BranchFollower(problem, most)
     run.follow(begin)
     return run
 
@@ -398,7 +398,7 @@ def _free_are_trivial(frame, count):
     return count <= known
 
 
-def _result(orbit, problem: OrbitProblem, run: Follower, first: float, last: float) -> OrbitBranch:
+def _result(orbit, problem: OrbitProblem, run: BranchFollower, first: float, last: float) -> OrbitBranch:
     """The result in the user's structure."""
     (path,), cast, n = run.paths, run.problem.cast, len(coordinates.names(orbit.q))
     outputs = [p.outputs for p in path.points]

@@ -1,4 +1,4 @@
-"""Following the branches of a `Problem`: steps, the critical points between them, crossing branches, and the ends.
+"""Following branches of a `BranchProblem`: steps, the critical points between them, crossing branches, and the ends.
 
 After each step the monitors of the problem are compared. What changed is refined to a critical point, which is put into
 the branch. Where branches cross, the others wait to be followed, each once and in both directions.
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax.analysis.arclength import BranchPoint, CriticalPoint, Monitor, Problem
+from lagjax.analysis.arclength import BranchPoint, BranchProblem, CriticalPoint, Monitor
 
 # Step lengths: the first, the longest (relative to the distance from the origin) and the smallest.
 FIRST, LONGEST, LEAST = 0.005, 0.03, 1e-7
@@ -50,13 +50,13 @@ class _Launch(NamedTuple):
     direction: np.ndarray
 
 
-class Follower:
+class BranchFollower:
     """The branches of a problem and their critical points found so far, and the branches still to be followed.
 
     `most`: the largest number of points of a branch. `crossings`: whether branches that cross are followed.
     """
 
-    def __init__(self, problem: Problem, most: int, crossings: bool = False):
+    def __init__(self, problem: BranchProblem, most: int, crossings: bool = False):
         self.problem, self.most, self.crossings = problem, most, crossings
         self.paths: list[BranchPath] = []
         self.found: list[CriticalPoint] = []
@@ -221,7 +221,7 @@ class Follower:
         return "closed" if closes(self.problem, path, step) else ""
 
 
-def closes(problem: Problem, path: BranchPath, step: float) -> bool:
+def closes(problem: BranchProblem, path: BranchPath, step: float) -> bool:
     """Whether a path has returned to its start."""
     if len(path.points) < 10:
         return False
@@ -238,7 +238,7 @@ def _joined(first: BranchPath, second: BranchPath) -> BranchPath:
     return BranchPath([*second.points[:0:-1], *first.points], status, first.through | second.through)
 
 
-def between(problem: Problem, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
+def between(problem: BranchProblem, a: BranchPoint, b: BranchPoint) -> list[CriticalPoint]:
     """All critical points between two neighbouring points of a branch."""
     if max(abs(b.z[-1] - a.z[-1]), abs(a.tangent[-1]), abs(b.tangent[-1])) < CONSTANT:
         # On a line of solutions at one value of the parameter only round-off changes.
@@ -251,7 +251,7 @@ def between(problem: Problem, a: BranchPoint, b: BranchPoint) -> list[CriticalPo
     return found
 
 
-def dips(problem: Problem, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[CriticalPoint | BranchPoint]:
+def dips(problem: BranchProblem, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> list[CriticalPoint | BranchPoint]:
     """The two edges of a narrow resonance tongue that lies within two steps, and a point in the tongue."""
     for monitor in problem.monitors:
         lowest = _beyond_zero(problem, a, b, c, monitor) if monitor.smooth else None
@@ -261,7 +261,7 @@ def dips(problem: Problem, a: BranchPoint, b: BranchPoint, c: BranchPoint) -> li
     return []
 
 
-def _beyond_zero(problem: Problem, a: BranchPoint, b: BranchPoint, c: BranchPoint, monitor: Monitor):
+def _beyond_zero(problem: BranchProblem, a: BranchPoint, b: BranchPoint, c: BranchPoint, monitor: Monitor):
     """A point between a and c where a function changes its sign, by parabolas; None if it only comes near zero."""
     left, middle, right = (monitor.value(p) for p in (a, b, c))
     if not (left * middle > 0 and middle * right > 0 and abs(middle) < DIPS * min(abs(left), abs(right))):

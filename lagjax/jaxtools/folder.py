@@ -30,7 +30,7 @@ FORGOTTEN = 3600.0
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
-class Place(NamedTuple):
+class Folder(NamedTuple):
     """Where programs are kept, or why they are not."""
 
     path: Path | None
@@ -45,24 +45,24 @@ def wanted() -> Path | None:
     return Path(named).expanduser().absolute() if named else Path(platformdirs.user_cache_dir("lagjax", False))
 
 
-def place() -> Place:
+def place() -> Folder:
     """The folder, made if there is none yet."""
     try:
         path = wanted()
     except (RuntimeError, OSError) as error:
-        return Place(None, f"there is no home folder: {error}")
+        return Folder(None, f"there is no home folder: {error}")
     if path is None:
-        return Place(None, f"LAGJAX_CACHE={os.environ['LAGJAX_CACHE']}")
+        return Folder(None, f"LAGJAX_CACHE={os.environ['LAGJAX_CACHE']}")
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = path.stat()
     except OSError as error:
-        return Place(None, f"{path}: {error.strerror or error}")
+        return Folder(None, f"{path}: {error.strerror or error}")
     if not _is_own(found):
-        return Place(None, f"{path} belongs to somebody else")
+        return Folder(None, f"{path} belongs to somebody else")
     if os.name == "posix" and found.st_mode & OTHERS:
-        return Place(None, f"{path} may be written by others (chmod 700 makes it yours)")
-    return Place(path)
+        return Folder(None, f"{path} may be written by others (chmod 700 makes it yours)")
+    return Folder(path)
 
 
 def _is_own(found: os.stat_result) -> bool:

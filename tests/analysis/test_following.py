@@ -5,14 +5,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lagjax.analysis.arclength import NUMBER, Along, BranchPoint, Monitor, Problem, sign_changes, zero
-from lagjax.analysis.following import Follower
+from lagjax.analysis.arclength import NUMBER, Along, BranchPoint, BranchProblem, Monitor, sign_changes, zero
+from lagjax.analysis.following import BranchFollower
 
 TURN = lambda point: point.tangent[-1]
 FOLDS = Monitor(TURN, sign_changes, partial(zero, "fold", TURN))
 
 
-class Curve(Problem):
+class Curve(BranchProblem):
     """The points (y, μ) where a function is zero; it returns its gradient too."""
 
     def __init__(self, function, low, high, monitors=(FOLDS,)):
@@ -31,7 +31,7 @@ class Curve(Problem):
 
 def followed(curve, start, towards, most=1000):
     """The branch from a start, and its critical points."""
-    run = Follower(curve, most)
+    run = BranchFollower(curve, most)
     run.follow(curve.begin(np.array(start), towards))
     return run.paths[0], run.found
 

@@ -21,7 +21,7 @@ from lagjax.integrate.equal_steps.gauss_step import GaussStep
 from lagjax.integrate.equal_steps.pace import Pace, PacedSteps
 from lagjax.integrate.equal_steps.rattle_step import RattleStep
 from lagjax.integrate.equal_steps.splitting_step import SplittingStep
-from lagjax.integrate.equal_steps.watched_step import Due, Place, WatchedSteps
+from lagjax.integrate.equal_steps.watched_step import Between, Due, WatchedSteps
 from lagjax.integrate.events.detect import Follower
 from lagjax.integrate.events.event_times import locate
 from lagjax.integrate.settings import Settings
@@ -244,11 +244,11 @@ class EquallyLong(NamedTuple):
         t = jnp.where(there.unsolved, jnp.minimum(span.start + k * span.h, span.end), span.end)
         return (way, there), (t, there.x, self.step.velocity(there, t), there.unsolved, k, used_up)
 
-    def place(self, t: Array, x: Array, u: Array) -> Place:
+    def place(self, t: Array, x: Array, u: Array) -> Between:
         """The start of a motion that is watched (`watched_step.py`)."""
-        return Place(self.step.first(t, x, u))
+        return Between(self.step.first(t, x, u))
 
-    def due(self, k: Array, place: Place, span: Span, last: Array) -> Due:
+    def due(self, k: Array, place: Between, span: Span, last: Array) -> Due:
         """Step k of an interval of a motion that ends at `last`."""
         total = span.count + ((span.left != 0) & ~span.used_up)
         whole, arrives, t0 = k < span.count, k + 1 >= total, span.start + k * span.h
@@ -258,9 +258,9 @@ class EquallyLong(NamedTuple):
             span.used_up & ~whole,
         )  # fmt: skip
 
-    def onward(self, place: Place, new: Any, due: Due) -> Place:
+    def onward(self, place: Between, new: Any, due: Due) -> Between:
         """The place after a step."""
-        return Place(new)
+        return Between(new)
 
     def is_still(self, span: Span) -> Array:
         """Whether nothing is to be done in an interval."""

@@ -40,7 +40,7 @@ class Due(NamedTuple):
     spent: Bool[Array, ""]
 
 
-class Place(NamedTuple):
+class Between(NamedTuple):
     """What is carried from step to step: the state between two of them."""
 
     way: Any
