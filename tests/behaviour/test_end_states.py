@@ -9,6 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.mechanisms import MECHANISMS, andrews, car_axis
+from lagjax.mechanisms.planar import ANDREWS_MULTIPLIERS, CAR_AXIS_MULTIPLIERS
 from tests.mechanisms import published
 from tests.mechanisms.test_mechanism import stacked
 from tests.tiers import exhaustive_but
@@ -75,15 +76,14 @@ def test_end_state(name):
 
 
 @pytest.mark.parametrize(
-    ("module", "sign", "names", "digits"),
+    ("mechanism", "theirs", "sign", "names", "digits"),
     [
-        pytest.param(andrews, -1.0, ("loops",), 1e-6, marks=pytest.mark.exhaustive),
-        (car_axis, 1.0, ("upright", "axle"), 1e-8),
+        pytest.param(andrews, ANDREWS_MULTIPLIERS[-1], -1.0, ("loops",), 1e-6, marks=pytest.mark.exhaustive),
+        (car_axis, CAR_AXIS_MULTIPLIERS, 1.0, ("upright", "axle"), 1e-8),
     ],
 )
-def test_multipliers_of_the_source(module, sign, names, digits):
+def test_multipliers_of_the_source(mechanism, theirs, sign, names, digits):
     """λ at the end is the source's: for Andrews (six digits) with the sign reversed, for the car axis unchanged."""
-    traj = run(module.MECHANISM, 1e-10)
+    traj = run(mechanism, 1e-10)
     ours = np.concatenate([np.ravel(traj.multipliers[name][-1]) for name in names])
-    theirs = np.array(module.SOURCE_MULTIPLIERS[-1] if module is andrews else module.SOURCE_MULTIPLIERS)
-    assert np.max(np.abs(ours - sign * theirs)) <= digits * np.max(np.abs(theirs))
+    assert np.max(np.abs(ours - sign * np.array(theirs))) <= digits * np.max(np.abs(theirs))
