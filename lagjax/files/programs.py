@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lagjax.display import by_line
+from lagjax.display import labelled
 from lagjax.jaxtools import LATER, TALLY, folder
 
 # So many reasons why programs were not kept are printed.
@@ -41,7 +41,7 @@ class Cache:
         rows.append(("this process", f"found {self.found}, wrote {self.written}"))
         most = sorted(self.not_kept.items(), key=lambda item: -item[1])
         rows += [("not kept", f"{count}: {why}") for why, count in most[:REASONS]]
-        return by_line("\n".join(["Compiled programs", *(f"  {label:<12}  {value}" for label, value in rows)]))
+        return labelled("Compiled programs", rows)
 
 
 def cache() -> Cache:

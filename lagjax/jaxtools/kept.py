@@ -101,14 +101,16 @@ class KeptProgram:
 
     def __call__(self, arrays: list) -> PyTree:
         signature = _signature(arrays)
-        call, structure = self._known.get(signature) or self._first(signature, arrays)
-        try:
-            found = call(arrays)
-        except (TypeError, ValueError):
-            # On another device: a program of `jax.jit` serves all.
-            if call is self._jit:
-                raise
-            found = self._jit(arrays)
+        known = self._known.get(signature)
+        call, structure, found = (*known, None) if known else self._first(signature, arrays)
+        if found is None:
+            try:
+                found = call(arrays)
+            except (TypeError, ValueError):
+                # On another device: a program of `jax.jit` serves all.
+                if call is self._jit:
+                    raise
+                found = self._jit(arrays)
         if structure is None:
             # That of `jax.jit` is known once it has traced.
             structure = self._structure
@@ -116,8 +118,11 @@ class KeptProgram:
         self.is_ready = True
         return jtu.tree_unflatten(structure, found)
 
-    def _first(self, signature: tuple, arrays: list) -> tuple[Callable, Any]:
-        """What runs with arrays of this kind, and the structure of its results: kept ones, or compiled here."""
+    def _first(self, signature: tuple, arrays: list) -> tuple[Callable, Any, list | None]:
+        """What runs with arrays of this kind, and the structure of its results: kept ones, or compiled here.
+
+        Of a kept program also its results, since it has run to see whether it does: a long motion runs once.
+        """
         where = folder.place()
         try:
             if where.path is None:
@@ -125,33 +130,33 @@ class KeptProgram:
             digest = digest_of([(_surely(arrays), False), *((part, own) for part, own in self._said.parts())])
         except NotKept as reason:
             TALLY.not_kept[str(reason)] += 1
-            return self._jit, None
+            return self._jit, None, None
         with folder.tried(where.path, digest) as entry:
             found = None if entry is None else self._loaded(*entry, arrays)
         if found is None:
             before = HAPPENED.copy()
             lowered = self._jit.lower(arrays)
-            found = lowered.compile(), self._structure
+            found = lowered.compile(), self._structure, None
             if HAPPENED != before:
                 TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
             else:
-                self._write(where.path, digest, *found, arrays)
-        self._known[signature] = found
+                self._write(where.path, digest, *found[:2], arrays)
+        self._known[signature] = found[:2]
         return found
 
-    def _loaded(self, header: dict[str, Any], program: memoryview, arrays: list) -> tuple[Callable, Any] | None:
+    def _loaded(self, header: dict[str, Any], program: memoryview, arrays: list) -> tuple[Callable, Any, list] | None:
         try:
             structure = jtu.tree_structure(self._said.tree(header["outline"], arrays))
             call = _call_of(header, bytes(program), arrays)
             if structure.num_leaves != len(header["outputs"]):
                 return None
             # What is wrong with it shows here, not in the middle of something else.
-            jax.block_until_ready(call(arrays))
+            results = jax.block_until_ready(call(arrays))
         except REFUSED as error:
             TALLY.not_kept[f"it could not be loaded: {type(error).__name__}: {str(error)[:200]}"] += 1
             return None
         TALLY.found["found"] += 1
-        return call, structure
+        return call, structure, results
 
     def _write(self, path: Path, digest: str, call: Any, structure: Any, arrays: list) -> None:
         """Write the program, in another thread."""
