@@ -62,7 +62,8 @@ from lagjax.jaxtools.jaxpr import (
     without_repeats,
     written,
 )
-from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said, compiled
+from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, NotKept, Said, Unusable, compiled
+from lagjax.jaxtools.named import NAMING, named, surroundings_for_names
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,

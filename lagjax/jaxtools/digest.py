@@ -68,13 +68,19 @@ class NotKept(Exception):
     """A program that cannot be kept; says why."""
 
 
-def digest_of(parts: Iterable[tuple[Any, bool]]) -> str:
+def digest_of(parts: Iterable[tuple[Any, bool]], around: bytes | None = None) -> str:
     """The digest of some things, each with whether it may hold numbers in classes of the user's own.
+
+    `around`: the digest of surroundings that was made outside of JAX's contexts, for something inside them.
 
     **Raises:** `NotKept`.
     """
     writer = _Writer()
-    writer.add(b"surroundings", surroundings())
+    if around is None:
+        writer.add(b"surroundings", surroundings())
+    else:
+        writer.add(b"around", around)
+        writer.all(b"context", [x for x in trace_context() if _can_be_written(x)])
     try:
         for part, of_user in parts:
             writer.of_user = of_user
@@ -320,7 +326,7 @@ def surroundings() -> bytes:
     # A new thread is in no context. Those of whoever made one come last, in the order of imports.
     with ThreadPoolExecutor(1) as thread:
         here, outside = trace_context(), thread.submit(trace_context).result()
-    written = [type(x) in WRITERS or isinstance(x, enum.Enum) for x in here]
+    written = [_can_be_written(x) for x in here]
     if len(here) != len(outside) or not all(x is y or known for x, y, known in zip(here, outside, written)):
         raise NotKept("it is in a context of JAX's")
     writer.all(b"context", [x for x, known in zip(here, written) if known])
@@ -332,6 +338,10 @@ def surroundings() -> bytes:
     writer.write((environment, [x for x in sys.argv if x.startswith("--xla")]))
     writer.write((is_plain(), versions(), source(), machine(), *devices()))
     return writer.hash.digest()
+
+
+def _can_be_written(x: Any) -> bool:
+    return type(x) in WRITERS or isinstance(x, enum.Enum)
 
 
 @functools.cache

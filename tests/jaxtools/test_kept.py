@@ -179,7 +179,7 @@ def program(function, traced=None):
         return [(Meaning((meaning_of(closed.jaxpr), tuple(np.asarray(x).tobytes() for x in closed.consts))), False)]
 
     outline = lambda tree: outlined(tree, {})
-    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})))
+    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})), None)
 
 
 def factor(x, y):
