@@ -39,6 +39,7 @@ from jax.extend.core import Primitive
 
 from lagjax.jaxtools.cache import HashablePart, once
 from lagjax.jaxtools.jaxpr import Meaning, content_of
+from lagjax.jaxtools.primitives import LapackCall
 from lagjax.jaxtools.tracing import is_plain
 
 try:
@@ -147,6 +148,10 @@ class _Writer:
             if not x.empty:
                 raise NotKept("it is for several devices")
             self.all(b"no mesh", (type(x),))
+        elif isinstance(x, jax.sharding.NamedSharding):
+            self.all(b"sharding", (x.mesh, tuple(x.spec), x.memory_kind))
+        elif isinstance(x, LapackCall):
+            self.all(b"call", (x.primitive, *sorted(x.params.items())))
         elif isinstance(x, Primitive):
             self.add(b"primitive", _name_of_primitive(x).encode())
         elif isinstance(x, enum.Enum):

@@ -1,32 +1,78 @@
-"""Calls that stand for programs: what is computed with a motion, said without tracing the motion.
+"""Programs that Python calls, compiled and kept; inside another program, parts of it, or names.
 
-A sweep is known by the jaxpr of its function. Where names are given, a motion in there is one equation with the digest
-of its problem; the kinds of its results are in the folder of programs. Such a jaxpr is never run: it is the key to a
-program. Derivatives and lanes of what has a name are further names.
+A sweep is known by the jaxpr of its function. Where names are given, what is `compiled` and a motion are one equation
+in there, with the digest of what they mean; the kinds of their results are in the folder of programs. Such a jaxpr is
+never run: it is the key to a program. Derivatives and lanes of what has a name are further names.
 """
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad
 from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
-from lagjax.jaxtools.cache import FACTS
+from lagjax.jaxtools.cache import FACTS, HashablePart, compiler_options, hashable_partition, program_of
 from lagjax.jaxtools.digest import NotKept, digest_of, surroundings
-from lagjax.jaxtools.kept import Said, as_data, kept_here, kind, kinds_in
-from lagjax.jaxtools.outline import NoOutline
-from lagjax.jaxtools.primitives import front, is_float, no_tangent, primitive
-from lagjax.jaxtools.tracing import HAPPENED
+from lagjax.jaxtools.kept import KeptProgram, Said, as_data, kept_here, kind, kinds_in
+from lagjax.jaxtools.outline import NoOutline, outlined, parts_of, rebuilt
+from lagjax.jaxtools.primitives import front, is_float, jitted, no_tangent, one_by_one, primitive
+from lagjax.jaxtools.tracing import HAPPENED, as_usual, is_eager, is_traced
 
 # Where names are given: the digest of what surrounds the whole program. A JAX context.
 NAMING = jax.make_user_context(default_value=None)
+
+
+def compiled(function: Callable, in_numpy: bool = False) -> Callable:
+    """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
+
+    Its programs are kept. With `in_numpy`, a call from Python returns NumPy arrays.
+    """
+    as_part = jitted(function)
+    finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
+
+    @wraps(function)
+    @as_usual
+    def program(*args):
+        arrays, static = hashable_partition(args)
+        if not is_eager() or is_traced(args):
+            found = named(partial(_of_arrays, function, static), _said(function, static), arrays)
+            return as_part(*args) if found is None else found
+        try:
+            return finish(program_of((function, static), lambda: _program(function, static))(arrays))
+        except jax.errors.JaxRuntimeError:
+            # Equinox's wrapper has a better message for the checks that equinox puts into a program.
+            return finish(as_part(*args))
+
+    return program
+
+
+def _program(function: Callable, static: HashablePart) -> KeptProgram:
+    return KeptProgram(partial(_of_arrays, function, static), _said(function, static), compiler_options())
+
+
+def _said(function: Callable, static: HashablePart) -> Said:
+    def outline(results: PyTree):
+        return outlined(results, parts_of(static.combine(range(len(static.leaves)))))
+
+    def tree(outline: Any, arrays: list):
+        return rebuilt(outline, parts_of(static.combine(arrays)))
+
+    def meant():
+        return [((function, compiler_options()), False), (static, False)]
+
+    return Said(meant, outline, tree)
+
+
+def _of_arrays(function: Callable, static: HashablePart, arrays: Sequence):
+    return one_by_one(function)(*static.combine(arrays))
 
 
 def surroundings_for_names() -> bytes | None:
@@ -40,8 +86,11 @@ def surroundings_for_names() -> bytes | None:
 
 def named(function: Callable[[list], PyTree], said: Said, arrays: list) -> PyTree | None:
     """Results that stand for `function(arrays)`; None where no names are given, or this has none."""
-    here, where = NAMING.value, folder.place()
-    if here is None or where.path is None:
+    here = NAMING.value
+    if here is None:
+        return None
+    where = folder.place()
+    if where.path is None:
         return None
     try:
         digest = digest_of([((kept_here(arrays), *map(kind, arrays), "named"), False), *said.parts()], here)
