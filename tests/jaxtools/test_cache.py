@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lagjax.jaxtools import cache
-from lagjax.jaxtools.cache import compiled
+from lagjax.jaxtools import compiled
 from tests.counting import compiles
 from tests.plain import not_plain
 
