@@ -4,7 +4,6 @@ from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import (
     FACTS,
     HashablePart,
-    compiled,
     compiler_options,
     filled_up,
     hashable_partition,
@@ -63,7 +62,7 @@ from lagjax.jaxtools.jaxpr import (
     without_repeats,
     written,
 )
-from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said
+from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said, compiled
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,

@@ -14,6 +14,7 @@ import dataclasses
 import enum
 import functools
 import hashlib
+import importlib
 import os
 import platform
 import struct
@@ -146,7 +147,10 @@ class _Writer:
             self.all(b"enum", (type(x), x.name))
         elif isinstance(x, functools.partial):
             self.all(b"partial", (x.func, x.args, x.keywords))
-        elif (name := _name_in_library(x)) is not None:
+        elif name_in_library(type(x)) == "jax._src.util:HashablePartial":
+            # In what `ravel_pytree` returns.
+            self.all(b"partial", (x.f, x.args, x.kwargs))
+        elif (name := name_in_library(x)) is not None:
             self.add(b"library", name.encode())
         elif isinstance(x, types.FunctionType):
             self._function(x)
@@ -186,11 +190,11 @@ class _Writer:
             self._structure(child)
 
     def _may_hold(self, cls: type) -> bool:
-        return self.of_user or _name_in_library(cls) is not None
+        return self.of_user or name_in_library(cls) is not None
 
     def _named(self, cls: type) -> tuple:
         """A class by its name, and by the names of its fields where it is the user's."""
-        name = _name_in_library(cls)
+        name = name_in_library(cls)
         if name is not None:
             return (name,)
         fields = [f.name for f in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else ()
@@ -251,7 +255,7 @@ def _of_meaning(x: Meaning) -> bytes:
     return x.digest
 
 
-def _name_in_library(x: Any) -> str | None:
+def name_in_library(x: Any) -> str | None:
     """The name under which a library has this very object, a class or a function; None if none has."""
     if x is types.NoneType:
         return "types:NoneType"
@@ -260,10 +264,29 @@ def _name_in_library(x: Any) -> str | None:
         module = getattr(x.__self__, "__name__", None)
     if not isinstance(module, str) or not isinstance(name, str) or module.partition(".")[0] not in LIBRARIES:
         return None
+    place = f"{module}:{name}"
+    found: Any = _at(place)
+    if found is x:
+        return place
+    # The function under its decorators.
+    return f"{place}:wrapped" if getattr(found, "__wrapped__", None) is x else None
+
+
+def named_in_library(name: str) -> Any:
+    """What a library has under this name, of those that `name_in_library` gives."""
+    module, _, _ = name.partition(":")
+    if module.partition(".")[0] not in LIBRARIES:
+        raise LookupError(name)
+    importlib.import_module(module)
+    return _at(name)
+
+
+def _at(name: str) -> Any:
+    module, path = name.split(":")[:2]
     found: Any = sys.modules.get(module)
-    for part in name.split("."):
+    for part in path.split("."):
         found = getattr(found, part, None)
-    return f"{module}:{name}" if found is x else None
+    return found
 
 
 def _is_bare(x: Any) -> bool:

@@ -24,6 +24,7 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,10 +37,11 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
-from lagjax.jaxtools.cache import compiler_options
+from lagjax.jaxtools.cache import HashablePart, compiler_options, hashable_partition, program_of
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
-from lagjax.jaxtools.outline import NoOutline
-from lagjax.jaxtools.tracing import HAPPENED
+from lagjax.jaxtools.outline import NoOutline, outlined, parts_of, rebuilt
+from lagjax.jaxtools.primitives import jitted, one_by_one
+from lagjax.jaxtools.tracing import HAPPENED, as_usual, is_eager, is_traced
 
 PRIVATE: Any = None
 try:
@@ -263,6 +265,46 @@ def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[
     )
     taken = (([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays],), {})
     return jax.stages.Compiled(parts.load(), [], taken, jtu.tree_structure([0 for _ in results]))
+
+
+def compiled(function: Callable, in_numpy: bool = False) -> Callable:
+    """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
+
+    Its programs are kept. With `in_numpy`, a call from Python returns NumPy arrays.
+    """
+    as_part = jitted(function)
+    finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
+
+    @wraps(function)
+    @as_usual
+    def program(*args):
+        if not is_eager() or is_traced(args):
+            return as_part(*args)
+        arrays, static = hashable_partition(args)
+        try:
+            return finish(program_of((function, static), lambda: _program(function, static))(arrays))
+        except jax.errors.JaxRuntimeError:
+            # Equinox's wrapper has a better message for the checks that equinox puts into a program.
+            return finish(as_part(*args))
+
+    return program
+
+
+def _program(function: Callable, static: HashablePart) -> KeptProgram:
+    def outline(results: PyTree):
+        return outlined(results, parts_of(static.combine(range(len(static.leaves)))))
+
+    def tree(outline: Any, arrays: list):
+        return rebuilt(outline, parts_of(static.combine(arrays)))
+
+    def meant():
+        return [((function, compiler_options()), False), (static, False)]
+
+    return KeptProgram(partial(_of_arrays, function, static), Said(meant, outline, tree))
+
+
+def _of_arrays(function: Callable, static: HashablePart, arrays: Sequence):
+    return one_by_one(function)(*static.combine(arrays))
 
 
 class Later:

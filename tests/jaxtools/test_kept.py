@@ -147,13 +147,12 @@ def test_the_surroundings_count(monkeypatch):
 def test_outlines():
     """A tree comes back from its outline, with 0 in place of leaves; twin: what is not known has none."""
     traj = lj.integrate(lj.System(lambda t, q, v, params: 0.5 * v**2), 0.0, 1.0, ts=[0.0, 1.0])
-    known = {"static": traj.static, "arrays": traj.arrays, "RESULTS": lj.RESULTS}
-    classes = {type(traj), type(traj.end), type(traj.error), type(traj.result)}
-    outline = outlined(traj, classes, known)
-    assert jax.tree.structure(rebuilt(outline, classes, known)) == jax.tree.structure(traj)
+    known = {"static": traj.static, "arrays": traj.arrays}
+    outline = outlined(traj, known)
+    assert jax.tree.structure(rebuilt(outline, known)) == jax.tree.structure(traj)
     for x in (traj, {1: 2.0}, {"a": Pair(0.0, 1.0)}):
         with pytest.raises(NoOutline):
-            outlined(x, [], {})
+            outlined(x, {})
 
 
 @pytest.fixture
@@ -179,8 +178,8 @@ def program(function, traced=None):
         closed = jax.make_jaxpr(function)(*(np.ones(3), np.ones(3)))
         return [(Meaning((meaning_of(closed.jaxpr), tuple(np.asarray(x).tobytes() for x in closed.consts))), False)]
 
-    outline = lambda tree: outlined(tree, [], {})
-    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, [], {})))
+    outline = lambda tree: outlined(tree, {})
+    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})))
 
 
 def factor(x, y):

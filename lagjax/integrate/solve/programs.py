@@ -24,17 +24,16 @@ from lagjax.display import waiting
 from lagjax.integrate.both_modes import solve_in_both_modes
 from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
-from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.jumps import Jumps, slidable, with_jumps_in_time
 from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
-from lagjax.integrate.results import RESULTS, Errors, Snapshot, SolveInfo, SolveOptions, pack
+from lagjax.integrate.results import SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.reports import report_settled, with_errors, with_errors_inside
 from lagjax.integrate.solve.segments import solved_in_phases
-from lagjax.integrate.trajectory import HybridTrajectory, Switches, Trajectory
+from lagjax.integrate.trajectory import HybridTrajectory, Trajectory
 from lagjax.jaxtools import (
     HashablePart,
     KeptProgram,
@@ -155,9 +154,6 @@ def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
 
 
 # The classes of what a motion gives, besides those of the user's states.
-CLASSES = Trajectory, HybridTrajectory, Snapshot, Crossings, Switches, Errors, type(RESULTS.successful)
-
-
 def _meant(static: HashablePart, robust: bool) -> list[tuple[Any, bool]]:
     """What a program computes, for its digest; with whether states and parameters may be in the user's classes.
 
@@ -181,16 +177,16 @@ def _meant(static: HashablePart, robust: bool) -> list[tuple[Any, bool]]:
 def _outline(results: tuple) -> dict[str, Any]:
     """The structure of what `_of_arrays` returns, as data."""
     found, *_ = results
-    given = {"q": found.end.q, "arrays": found.arrays, "static": found.static, "RESULTS": RESULTS}
-    return {"how": list(found.static.how), "results": outlined(results, CLASSES, given)}
+    given = {"q": found.end.q, "arrays": found.arrays, "static": found.static}
+    return {"how": list(found.static.how), "results": outlined(results, given)}
 
 
 def _said_tree(static: HashablePart, outline: dict[str, Any], arrays: list):
     """Results of this structure; what they say of themselves is that of this problem."""
     problem = Problem(*static.combine(arrays))
     of_problem, described = _described(problem, SolveInfo(*outline["how"]))
-    given = {"q": problem.q, "arrays": of_problem, "static": described, "RESULTS": RESULTS}
-    return rebuilt(outline["results"], CLASSES, given)
+    given = {"q": problem.q, "arrays": of_problem, "static": described}
+    return rebuilt(outline["results"], given)
 
 
 def _described(problem: Problem, how: SolveInfo):
