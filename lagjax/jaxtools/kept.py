@@ -21,9 +21,11 @@ import json
 import os
 import queue
 import re
+import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,6 +63,28 @@ REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, Runtime
 CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
 # How long the end of a process waits for programs that are being written, in seconds.
 AT_THE_END = 5.0
+
+
+# After so many seconds a first answer says why it takes long: after 120, XLA asks users for a bug report.
+SLOW = 100.0
+WHY_SLOW = """lagjax: a first answer has taken {:.0f} s so far, of JAX, XLA's compiler and its run, and goes on.
+If XLA then says "Very slow compile?" and asks for a bug report: it is none.
+Usual cause: a Lagrangian or constraints of many terms, written one by one; second derivatives of a motion.
+Fix: wait, since the next answer has no such wait; or jax.vmap over terms of one kind.
+lj.explain(system, t, q, v, params) says what a first answer costs, docs/waiting-for-the-compiler.md why.
+"""
+
+
+@contextmanager
+def explained_if_slow() -> Iterator[None]:
+    """Say on the error stream why it takes long what is done in here, if it does."""
+    timer = threading.Timer(SLOW, lambda: sys.stderr.write(WHY_SLOW.format(SLOW)))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class Tally(NamedTuple):
@@ -103,6 +127,12 @@ class KeptProgram:
 
     def __call__(self, arrays: list) -> PyTree:
         signature = _signature(arrays)
+        if signature in self._known:
+            return self._results(signature, arrays)
+        with explained_if_slow():
+            return self._results(signature, arrays)
+
+    def _results(self, signature: tuple, arrays: list) -> PyTree:
         known = self._known.get(signature)
         call, structure, found = (*known, None) if known else self._first(signature, arrays)
         if found is None:
