@@ -312,7 +312,8 @@ def test_exports():
         doc = inspect.getdoc(getattr(part, name))
         assert doc and len(doc.splitlines()) > 0, name
     parts = {">>>", "**Returns:**", "**Raises:**", "Source:"}
-    for name in "momentum mass_matrix accelerations jacobi_integral integrate consistent_state explain".split():
+    names = "momentum mass_matrix accelerations inverse_dynamics jacobi_integral integrate consistent_state explain"
+    for name in names.split():
         assert {part for part in parts if part not in (inspect.getdoc(getattr(lagjax, name)) or "")} == set(), name
 
 

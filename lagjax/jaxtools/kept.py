@@ -21,9 +21,11 @@ import json
 import os
 import queue
 import re
+import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -59,6 +61,28 @@ REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, Runtime
 CALLS, LAPACK = re.compile(r'custom_call_target="([^"]*)"'), re.compile(r"lapack_\w+_ffi")
 # How long the end of a process waits for programs that are being written, in seconds.
 AT_THE_END = 5.0
+
+
+# After so many seconds a first answer says why it takes long: after 120, XLA asks users for a bug report.
+SLOW = 100.0
+WHY_SLOW = """lagjax: a first answer has taken {:.0f} s so far, of JAX, XLA's compiler and its run, and goes on.
+If XLA then says "Very slow compile?" and asks for a bug report: it is none.
+Usual cause: a Lagrangian or constraints of many terms, written one by one; second derivatives of a motion.
+Fix: wait, since the next answer has no such wait; or jax.vmap over terms of one kind.
+lj.explain(system, t, q, v, params) says what a first answer costs, docs/waiting-for-the-compiler.md why.
+"""
+
+
+@contextmanager
+def explained_if_slow() -> Iterator[None]:
+    """Say on the error stream why it takes long what is done in here, if it does."""
+    timer = threading.Timer(SLOW, lambda: sys.stderr.write(WHY_SLOW.format(SLOW)))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class Tally(NamedTuple):
@@ -115,10 +139,15 @@ class KeptProgram:
         signature = _signature(arrays)
         ready = self._known.get(signature)
         if ready is None:
-            place = self._place(arrays)
-            # One of `jax.jit` serves all devices.
-            ready = Ready(self._jit) if place is None else self._ready_at(place, arrays)
-            self._known[signature] = ready
+            with explained_if_slow():
+                place = self._place(arrays)
+                # One of `jax.jit` serves all devices; it is compiled as it is called first.
+                ready = Ready(self._jit) if place is None else self._ready_at(place, arrays)
+                self._known[signature] = ready
+                return self._results(signature, ready, arrays)
+        return self._results(signature, ready, arrays)
+
+    def _results(self, signature: tuple, ready: Ready, arrays: list) -> PyTree:
         try:
             found = ready.call(arrays)
         except Unusable:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections import Counter
 from functools import partial
 from typing import NamedTuple
@@ -291,6 +292,23 @@ def test_the_cache_shows_itself(place):
     place.chmod(0o770)
     assert lj.cache().path is None and "others" in repr(lj.cache())
     place.chmod(0o700)
+
+
+def test_what_takes_long_is_explained(monkeypatch, capsys):
+    """A first answer that takes long says so before XLA does; twins: a quick one, and the next, do not."""
+    outline, tree = lambda x: None, lambda outline, arrays: 0
+
+    def noted(arrays):
+        time.sleep(0.3)
+        return arrays[0]
+
+    for slow, words in ((0.1, ["Very slow compile", "it is none"]), (100.0, [])):
+        monkeypatch.setattr(kept, "SLOW", slow)
+        program = KeptProgram(noted, Said(lambda: [], outline, tree), None)
+        for expected in (words, []):
+            assert float(program([np.asarray(2.0)])) == 2.0
+            told = capsys.readouterr().err
+            assert all(x in told for x in expected) and bool(told) == bool(expected)
 
 
 MOTION = """
