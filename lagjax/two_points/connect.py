@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled, depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
+from lagjax.refusals import must_be_like, must_return
 from lagjax.system import (
     OF_STATE,
     Call,
@@ -192,7 +193,8 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     switching = system if system.in_phases or system.elements is not None else None
     system, s = checked(system.first_phase, State(t_a, q_a, q_a, params))
     model = model_of(system, *s)
-    _check_alike(q_a, q_b)
+    fix = "give both ends all coordinates; a coordinate that is free at the end needs end=..., not a gap"
+    must_be_like(q_b, q_a, "q_b", "q_a", fix, "a coordinate left out of one end")
     other = coordinates.state(t_b, q_b, q_b, s.params)
     alone = shoots_alone(model, switching)
     if alone and end is None and (free_time or not model.holonomic.all()):
@@ -216,16 +218,6 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     elif switching is None:
         x_b = _onto_constraints(model, t_a + duration, x_b)
     return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count, switching)
-
-
-def _check_alike(q_a: PyTree, q_b: PyTree):
-    shapes = [jax.tree.map(jnp.shape, q) for q in (q_a, q_b)]
-    if jax.tree.structure(q_a) != jax.tree.structure(q_b) or shapes[0] != shapes[1]:
-        raise ValueError(
-            f"q_b must have the structure and shapes of q_a.\n  q_a: {shapes[0]}\n  q_b: {shapes[1]}\n"
-            "Usual cause: a coordinate left out of one end.\n"
-            "Fix: give both ends all coordinates; a coordinate that is free at the end needs end=..., not a gap."
-        )
 
 
 class EndCondition(NamedTuple):
@@ -265,12 +257,8 @@ def _depends_on_velocity(condition: Callable, t: Array, x: Array, u: Array) -> b
 
 def _check_condition(call: Call, value):
     shape = getattr(value, "shape", None)
-    if shape is None or len(shape) > 1 or 0 in shape:
-        raise ValueError(
-            f"{call} must return a scalar or a vector that vanishes at the end, and returned "
-            f"{'an array of shape ' + str(shape) if shape is not None else type(value).__name__}.\n"
-            "Fix: return jnp.stack([...]) of the conditions."
-        )
+    wanted, fix = "a scalar or a vector that vanishes at the end", "return jnp.stack([...]) of the conditions"
+    must_return(shape is not None and len(shape) <= 1 and 0 not in shape, call, wanted, value, fix)
 
 
 def _count(count: int, wanted: str, model: Model, what: str, free_time: bool = False) -> str:
