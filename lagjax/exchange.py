@@ -563,12 +563,15 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
     `lj.result_codes()` explains. A failing check (`equinox.error_if`) gives NaN.
 
     **Raises:** `TypeError` for arguments or results that are not numbers, arrays, dictionaries, lists and tuples;
-    `ValueError` for functions that call Python while they run.
+    `ValueError` for functions that call Python while they run; `ImportError` without the extra `export`, with which JAX
+    writes bytes.
 
     Source: https://docs.jax.dev/en/latest/export/export.html; `docs/taking-a-solve-elsewhere.md`.
     """
     fix = "lj.export(lambda params: lj.integrate(system, q0, v0, params, ts=ts), params)"
     must_be_function(run, "the first argument of lj.export", "its examples", fix)
+    # JAX itself asks for it in `serialize`, when all has been compiled.
+    installed("flatbuffers", "lj.export, whose programs JAX writes with it,", "export")
     given, places = jtu.tree_flatten(examples, is_leaf=lambda x: type(x) not in PLAIN)
     examples = jtu.tree_unflatten(places, map(_as_argument, given))
 

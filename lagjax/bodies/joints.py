@@ -369,5 +369,6 @@ def _check_number(role: str, whose: str, given: ArrayLike | Callable):
     number = np.asarray(given)
     well = not number.shape and np.isfinite(number) and number != 0
     fix = f"{role}=-60 / 20; a body that does not turn is held by lj.bodies.fixed or lj.bodies.prismatic"
-    cause = "numbers of teeth divided as whole numbers, 20 // 60"
-    must(well, f"the {role} of {whose} must be a number that is not 0", given, fix, cause)
+    divided = not number.shape and not np.isfinite(number)
+    cause = "a division by zero" if divided else "numbers of teeth divided as whole numbers, 20 // 60"
+    must(well, f"the {role} of {whose} must be a finite number that is not 0", given, fix, cause)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections import Counter
 from functools import partial
 from typing import NamedTuple
@@ -147,13 +148,12 @@ def test_the_surroundings_count(monkeypatch):
 def test_outlines():
     """A tree comes back from its outline, with 0 in place of leaves; twin: what is not known has none."""
     traj = lj.integrate(lj.System(lambda t, q, v, params: 0.5 * v**2), 0.0, 1.0, ts=[0.0, 1.0])
-    known = {"static": traj.static, "arrays": traj.arrays, "RESULTS": lj.RESULTS}
-    classes = {type(traj), type(traj.end), type(traj.error), type(traj.result)}
-    outline = outlined(traj, classes, known)
-    assert jax.tree.structure(rebuilt(outline, classes, known)) == jax.tree.structure(traj)
+    known = {"static": traj.static, "arrays": traj.arrays}
+    outline = outlined(traj, known)
+    assert jax.tree.structure(rebuilt(outline, known)) == jax.tree.structure(traj)
     for x in (traj, {1: 2.0}, {"a": Pair(0.0, 1.0)}):
         with pytest.raises(NoOutline):
-            outlined(x, [], {})
+            outlined(x, {})
 
 
 @pytest.fixture
@@ -179,8 +179,8 @@ def program(function, traced=None):
         closed = jax.make_jaxpr(function)(*(np.ones(3), np.ones(3)))
         return [(Meaning((meaning_of(closed.jaxpr), tuple(np.asarray(x).tobytes() for x in closed.consts))), False)]
 
-    outline = lambda tree: outlined(tree, [], {})
-    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, [], {})))
+    outline = lambda tree: outlined(tree, {})
+    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})), None)
 
 
 def factor(x, y):
@@ -292,6 +292,23 @@ def test_the_cache_shows_itself(place):
     place.chmod(0o770)
     assert lj.cache().path is None and "others" in repr(lj.cache())
     place.chmod(0o700)
+
+
+def test_what_takes_long_is_explained(monkeypatch, capsys):
+    """A first answer that takes long says so before XLA does; twins: a quick one, and the next, do not."""
+    outline, tree = lambda x: None, lambda outline, arrays: 0
+
+    def noted(arrays):
+        time.sleep(0.3)
+        return arrays[0]
+
+    for slow, words in ((0.1, ["Very slow compile", "it is none"]), (100.0, [])):
+        monkeypatch.setattr(kept, "SLOW", slow)
+        program = KeptProgram(noted, Said(lambda: [], outline, tree), None)
+        for expected in (words, []):
+            assert float(program([np.asarray(2.0)])) == 2.0
+            told = capsys.readouterr().err
+            assert all(x in told for x in expected) and bool(told) == bool(expected)
 
 
 MOTION = """
