@@ -75,13 +75,14 @@ def must_be_function(given: Any, role: str, takes: str, fix: str = "", cause: st
     must(holds, f"{role} must be a function of {takes}", given, fix, cause, TypeError)
 
 
-def must_be_among(options: Iterable, given: Any, role: str, fix: str = "", cause: str = "") -> None:
-    """Raise unless an option is one of a few words, or None where that is among them."""
+def must_be_among(options: Iterable, given: Any, role: str, fix: str = "", cause: str = "") -> Any:
+    """Return an option; raise unless it is one of a few words, or None where that is among them."""
     options = [*options]
     if not any(given is x or isinstance(given, type(x)) and given == x for x in options):
         *most, last = map(repr, options)
         near = [*difflib.get_close_matches(str(given), [x for x in options if isinstance(x, str)], 1), options[0]][0]
         must(False, f"{role} must be {', '.join(most)} or {last}", given, fix or f"{role}={near!r}", cause)
+    return given
 
 
 def must_be_whole(given: Any, role: str, least: int = 1, most: float = np.inf, fix: str = "") -> None:

@@ -75,7 +75,8 @@ def multibody(
     """
     bodies, loads = check_bodies("lj.bodies.multibody", bodies), check_loads("lj.bodies.multibody", loads)
     _check_joints(joints)
-    _check_keywords(others)
+    fix = "bodies, joints, loads, lagrangian, or one of lj.System's, as {}="
+    must_name(others, OTHERS, "lj.bodies.multibody was given", "argument of it", fix, error=TypeError)
     driven, bodies = Driven.among(bodies), tuple(body for body in bodies if body.motion is None)
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
@@ -164,11 +165,6 @@ def _check_joints(joints: Mapping | None):
             fix = "lj.bodies.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third argument"
             cause = "a load among the joints, or a function without its kind"
             must_be(Holonomic | Nonholonomic, part, claim, fix, cause)
-
-
-def _check_keywords(others: Mapping):
-    fix = "bodies, joints, loads, lagrangian, or one of lj.System's, as {}="
-    must_name(others, OTHERS, "lj.bodies.multibody was given", "argument of it", fix, error=TypeError)
 
 
 def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:

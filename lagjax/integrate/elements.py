@@ -251,10 +251,9 @@ def _check_name(name: str, plain: System):
 
 def _check_output(call: Call, value, like: Array):
     found = getattr(value, "shape", () if isinstance(value, float | int) else None)
-    cause = "several outputs of one controller, or a missing return"
     fix = "an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each"
     wanted = f"its output in the shape of its entry in q0, {like.shape}"
-    must_return(found == like.shape, call, wanted, value, fix, cause)
+    must_return(found == like.shape, call, wanted, value, fix, "several outputs of one controller, or a missing return")
 
 
 def _check(call: Call, value, shape: tuple | None):
