@@ -7,6 +7,7 @@ own is raised where it is found.
 
 import difflib
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -140,6 +141,12 @@ def must_name(
             fix = fix.replace("{}", str(near[0])) if names else "leave it out"
             there = f"there {'are' if len(names) != 1 else 'is'} {listed(names)}"
             raise error(words(f"{what} {name!r:.60}, which is no {kind}; {there}", fix, cause))
+
+
+def must_differ(names: Iterable[str], what: str, fix: str = "a name for each") -> None:
+    """Raise if a name occurs twice; `what`: whose they are, "two bodies", "an element and a constraint"."""
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise ValueError(words(f"{what} are called '{twice[0]}'", fix))
 
 
 def must_return(holds: Any, call: object, wanted: str, value: Any, fix: str, cause: str = "") -> None:

@@ -1,6 +1,5 @@
 """A system of bodies: the sum of their kinetic energies, and the constraints of their joints."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +25,7 @@ from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.display import CUBE, Anchor, Drawing, Shape
 from lagjax.jaxtools import numpy_of
-from lagjax.refusals import must_be, must_name
+from lagjax.refusals import must_be, must_differ, must_name
 from lagjax.shapes import line
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -81,10 +80,8 @@ def multibody(
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
     names = [body.name for body in (*bodies, *driven.bodies)]
-    twice = {name for name, count in Counter(names).items() if count > 1}
-    if twice or units.keys() & joints.keys():
-        name = sorted(twice or units.keys() & joints.keys())[0]
-        raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")
+    must_differ(names, "two bodies")
+    must_differ([*units, *joints], "two constraints")
     beside = Acting(*(driven.seen_by_all(others.pop(name, None)) for name in ("force", "dissipation")))
     acting = beside.with_loads(loads, driven.placed)
 

@@ -257,14 +257,19 @@ def _check_tolerance(value: Any, name: str, dtype: np.dtype):
             "stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01."
         )
     must(value >= 0, f"{name} must be a number >= 0", value, f"{name}=1e-9, or leave it out")
-    floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
-    if name == "rtol" and value < floor:
-        single = dtype == np.dtype("float32")
-        cause = "Usual cause: JAX works in float32 unless told otherwise.\n" if single else ""
+    if name == "rtol":
+        check_reach(value, name, dtype)
+
+
+def check_reach(value: float, name: str, dtype: np.dtype):
+    """Raise for a relative tolerance that a dtype cannot reach."""
+    floor, single = ROUND_OFFS * float(jnp.finfo(dtype).eps), dtype == np.dtype("float32")
+    if value < floor:
+        cause = "JAX works in float32 unless told otherwise" if single else "a wrong exponent"
         remedy = 'jax.config.update("jax_enable_x64", True) before the first array, or ' if single else ""
         raise ValueError(
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
-            f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
+            f"Usual cause: {cause}.\nFix: {remedy}{name}={10 * floor:.0e} or more."
         )
 
 
