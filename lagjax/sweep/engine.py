@@ -157,11 +157,12 @@ def compiled(
     layout: str,
     patience: int | None,
     robust: bool,
+    compiles: bool = True,
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices.
 
     Only the names, shapes and dtypes of the axes matter. Motions are given up after `patience` steps, if given. Unless
-    `robust`, motions are assumed to be regular.
+    `robust`, motions are assumed to be regular. Without `compiles` it says what it gives, and cannot be called.
     """
     point = point_of(run)
 
@@ -180,8 +181,8 @@ def compiled(
     with _explained(run, axes, patience, robust):
         traced = jax.jit(one_by_one(function)).trace(shaped)
     shapes, _, settled = traced.out_info
-    program = traced.lower().compile()
-    memory = program.memory_analysis()
+    program: Any = traced.lower().compile() if compiles else None
+    memory = program.memory_analysis() if compiles else None
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
 
     @as_usual
@@ -202,6 +203,7 @@ def program_for(
     patience: int | None = None,
     robust: bool = True,
     progress: bool | None = False,
+    compiles: bool = True,
 ) -> tuple[Program, float]:
     """The program, and the seconds it took to compile; 0 if it was in the cache."""
     seconds = 0.0
@@ -210,7 +212,7 @@ def program_for(
         nonlocal seconds
         started = time.perf_counter()
         with waiting(progress, "compiling"):
-            program = compiled(run, axes, chunk, devices, layout, patience, robust)
+            program = compiled(run, axes, chunk, devices, layout, patience, robust, compiles)
         seconds = time.perf_counter() - started
         return program
 
@@ -224,7 +226,7 @@ def program_for(
         )
     meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
-    key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings
+    key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, compiles, settings
     return program_of(key, make), seconds
 
 
@@ -294,6 +296,9 @@ class Engine:
     The first program assumes regular motions, which compiles in two thirds of the time; the robust program is compiled
     only when a point turns out to need it.
     """
+
+    # Blocks of a new store: at least so many for each process.
+    shares = CHUNKS_EACH
 
     def __init__(
         self,
