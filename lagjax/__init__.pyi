@@ -73,6 +73,9 @@ from .mechanics import (
     constraint_residual as constraint_residual,
 )
 from .mechanics import (
+    inverse_dynamics as inverse_dynamics,
+)
+from .mechanics import (
     jacobi_integral as jacobi_integral,
 )
 from .mechanics import (

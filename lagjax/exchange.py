@@ -31,6 +31,7 @@ from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import reduce
 from importlib import import_module
+from importlib.util import find_spec
 from itertools import count
 from typing import Any
 
@@ -572,7 +573,8 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
     `lj.result_codes()` explains. A failing check (`equinox.error_if`) gives NaN.
 
     **Raises:** `TypeError` for arguments or results that are not numbers, arrays, dictionaries, lists and tuples;
-    `ValueError` for functions that call Python while they run.
+    `ValueError` for functions that call Python while they run; `ImportError` without the extra `export`, with which JAX
+    writes bytes.
 
     Source: https://docs.jax.dev/en/latest/export/export.html; `docs/taking-a-solve-elsewhere.md`.
     """
@@ -580,6 +582,11 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
         raise TypeError(
             f"lj.export takes a function, not {type(run).__name__}.\n"
             "Fix: lj.export(lambda params: lj.integrate(system, q0, v0, params, ts=ts), params)."
+        )
+    # JAX itself asks for it in `serialize`, when all has been compiled.
+    if find_spec("flatbuffers") is None:
+        raise ImportError(
+            "lj.export needs flatbuffers, with which JAX writes programs.\nFix: pip install 'lagjax[export]'."
         )
     given, places = jtu.tree_flatten(examples, is_leaf=lambda x: type(x) not in PLAIN)
     examples = jtu.tree_unflatten(places, map(_as_argument, given))

@@ -9,6 +9,7 @@ A place is a body, a marker `body.at(point, axis)`, whose axis is the z axis of 
 a point of space. Lengths, sizes and points may be functions of params.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -48,8 +49,8 @@ def box(place: Place, size: Any, color: str | None = None) -> Shape:
     >>> lj.shapes.box(door, (1.0, 0.05, 2.0))
     Shape(a solid on 'door')
 
-    **Raises:** `TypeError` for a place that is none; `ValueError` for a color that is not "#rrggbb", and, when it is
-    drawn, for a size that is not three numbers, or negative.
+    **Raises:** `TypeError` for a place that is none; `ValueError` for a color that is not "#rrggbb", for lengths that
+    are negative or not finite, and, when it is drawn, for a size that is not three numbers, or negative.
     """
     return Shape("solid", (_anchor(place),), CUBE, size, color)
 
@@ -200,7 +201,15 @@ def _anchor(place: Any) -> Anchor:
 def _sizes(*lengths: Any) -> Any:
     """Three lengths; a function of params if one of them is."""
     if not any(map(callable, lengths)):
-        return tuple(map(float, lengths))
+        found = tuple(map(float, lengths))
+        if not all(0 <= x < math.inf for x in found):
+            raise ValueError(
+                f"a radius, length or half axis of a shape must be a finite number from zero on, and is "
+                f"{next(x for x in found if not 0 <= x < math.inf)}.\n"
+                "Usual cause: a division by zero where it was computed, or a difference the wrong way round.\n"
+                "Fix: lj.shapes.sphere(ball, 0.5), or a function of params."
+            )
+        return found
     return _of_params(lengths)
 
 

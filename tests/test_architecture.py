@@ -31,7 +31,7 @@ TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pandas", "sympy", "tqdm", "xarray"}
-OPTIONAL |= {"casadi", "fsspec", "mujoco", "zarr"}
+OPTIONAL |= {"casadi", "cloudpickle", "fsspec", "mujoco", "zarr"}
 LATE = ("scipy.", "matplotlib")
 
 
@@ -312,7 +312,8 @@ def test_exports():
         doc = inspect.getdoc(getattr(part, name))
         assert doc and len(doc.splitlines()) > 0, name
     parts = {">>>", "**Returns:**", "**Raises:**", "Source:"}
-    for name in "momentum mass_matrix accelerations jacobi_integral integrate consistent_state explain".split():
+    names = "momentum mass_matrix accelerations inverse_dynamics jacobi_integral integrate consistent_state explain"
+    for name in names.split():
         assert {part for part in parts if part not in (inspect.getdoc(getattr(lagjax, name)) or "")} == set(), name
 
 

@@ -370,6 +370,15 @@ def test_failures_are_codes():
     assert np.isnan(exported.call(3.0, PARAMS)[1])
 
 
+def test_without_its_extra(monkeypatch):
+    """Without flatbuffers, which JAX misses when all has been compiled, nothing is called."""
+    called = []
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(ImportError, match="pip install 'lagjax.export.'"):
+        lj.export(called.append, 1.0)
+    assert called == []
+
+
 def test_result_codes():
     """Each item of `lj.RESULTS` has a description."""
     codes = lj.result_codes()

@@ -315,7 +315,10 @@ def _passage(flow, t0, z, span, frame, scale, changes, volume, adjoint) -> Passa
 
     # The variable is the elapsed fraction of the span, so that the span is differentiated like a parameter.
     y0 = {"z": z / scale, "frame": frame, "growth": jnp.zeros_like(span)}
-    zero, one, first = (jnp.asarray(x, z.dtype) for x in (0.0, 1.0, FIRST))
+    zero, one, first = 0.0, 1.0, FIRST
+    # Of Python's numbers diffrax sees at once that they are in order; its check of others calls Python in the program.
+    if z.dtype != jnp.result_type(float):
+        zero, one, first = (jnp.asarray(x, z.dtype) for x in (zero, one, first))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         Dopri8(in_a_loop=flow.in_a_loop),

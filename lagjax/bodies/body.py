@@ -594,7 +594,13 @@ def check_markers(what: str, *given):
 def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
     """The bodies as a tuple; a `TypeError` that begins with `what`, unless they are a list of some."""
     bodies = tuple(given) if isinstance(given, Iterable) else ()
-    if not bodies or not all(isinstance(body, Body) for body in bodies):
+    if not bodies and isinstance(given, Iterable):
+        raise ValueError(
+            f"{what} was given no bodies.\n"
+            "Usual cause: a generator that was used up before, or a filter that nothing passes.\n"
+            f"Fix: {what}([crank, rod]); of a motion without bodies, lj.System with L by hand."
+        )
+    if not all(isinstance(body, Body) for body in bodies) or not bodies:
         listed = ", ".join(type(body).__name__ for body in bodies) or type(given).__name__
         raise TypeError(f"{what} takes a list of lj.bodies.Body, and was given {listed}.\nFix: {what}([crank, rod]).")
     return bodies

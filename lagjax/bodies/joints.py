@@ -371,8 +371,10 @@ def _check_number(role: str, whose: str, given: ArrayLike | Callable):
         return
     number = np.asarray(given)
     if number.shape or not np.isfinite(number) or number == 0:
+        divided = not number.shape and not np.isfinite(number)
+        cause = "a division by zero" if divided else "numbers of teeth divided as whole numbers, 20 // 60"
         raise ValueError(
-            f"the {role} of {whose} must be a number that is not 0, and is {given}.\n"
-            "Usual cause: numbers of teeth divided as whole numbers, 20 // 60.\n"
+            f"the {role} of {whose} must be a finite number that is not 0, and is {given}.\n"
+            f"Usual cause: {cause}.\n"
             f"Fix: {role}=-60 / 20; a body that does not turn is held by lj.bodies.fixed or lj.bodies.prismatic."
         )

@@ -19,7 +19,7 @@ XLA of jax 0.11 has one way, and no such option. `LAGJAX_PLAIN=1` leaves the opt
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable
 from functools import partial, wraps
 from typing import Any, NamedTuple, TypeVar
 
@@ -30,8 +30,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from lagjax.jaxtools.primitives import jitted, one_by_one
-from lagjax.jaxtools.tracing import as_usual, is_eager, is_plain, is_traced
+from lagjax.jaxtools.tracing import is_plain
 
 T = TypeVar("T")
 
@@ -198,34 +197,3 @@ def are_known(options: dict) -> bool:
     except jax.errors.JaxRuntimeError:
         return False
     return True
-
-
-def compiled(function: Callable, in_numpy: bool = False) -> Callable:
-    """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
-
-    With `in_numpy`, a call from Python returns NumPy arrays.
-    """
-    as_part = jitted(function)
-    finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
-
-    @wraps(function)
-    @as_usual
-    def program(*args):
-        if not is_eager() or is_traced(args):
-            return as_part(*args)
-        arrays, static = hashable_partition(args)
-        try:
-            return finish(program_of((function, static), lambda: _jitted(function, static))(arrays))
-        except jax.errors.JaxRuntimeError:
-            # Equinox's wrapper has a better message for the checks that equinox puts into a program.
-            return finish(as_part(*args))
-
-    return program
-
-
-def _jitted(function: Callable, static):
-    return jax.jit(partial(_of_arrays, function, static), compiler_options=compiler_options())
-
-
-def _of_arrays(function: Callable, static, arrays: Sequence):
-    return one_by_one(function)(*static.combine(arrays))

@@ -14,6 +14,7 @@ import dataclasses
 import enum
 import functools
 import hashlib
+import importlib
 import os
 import platform
 import struct
@@ -38,6 +39,7 @@ from jax.extend.core import Primitive
 
 from lagjax.jaxtools.cache import HashablePart, once
 from lagjax.jaxtools.jaxpr import Meaning, content_of
+from lagjax.jaxtools.primitives import LapackCall
 from lagjax.jaxtools.tracing import is_plain
 
 try:
@@ -67,13 +69,19 @@ class NotKept(Exception):
     """A program that cannot be kept; says why."""
 
 
-def digest_of(parts: Iterable[tuple[Any, bool]]) -> str:
+def digest_of(parts: Iterable[tuple[Any, bool]], around: bytes | None = None) -> str:
     """The digest of some things, each with whether it may hold numbers in classes of the user's own.
+
+    `around`: the digest of surroundings that was made outside of JAX's contexts, for something inside them.
 
     **Raises:** `NotKept`.
     """
     writer = _Writer()
-    writer.add(b"surroundings", surroundings())
+    if around is None:
+        writer.add(b"surroundings", surroundings())
+    else:
+        writer.add(b"around", around)
+        writer.all(b"context", [x for x in trace_context() if _can_be_written(x)])
     try:
         for part, of_user in parts:
             writer.of_user = of_user
@@ -140,13 +148,20 @@ class _Writer:
             if not x.empty:
                 raise NotKept("it is for several devices")
             self.all(b"no mesh", (type(x),))
+        elif isinstance(x, jax.sharding.NamedSharding):
+            self.all(b"sharding", (x.mesh, tuple(x.spec), x.memory_kind))
+        elif isinstance(x, LapackCall):
+            self.all(b"call", (x.primitive, *sorted(x.params.items())))
         elif isinstance(x, Primitive):
             self.add(b"primitive", _name_of_primitive(x).encode())
         elif isinstance(x, enum.Enum):
             self.all(b"enum", (type(x), x.name))
         elif isinstance(x, functools.partial):
             self.all(b"partial", (x.func, x.args, x.keywords))
-        elif (name := _name_in_library(x)) is not None:
+        elif name_in_library(type(x)) == "jax._src.util:HashablePartial":
+            # In what `ravel_pytree` returns.
+            self.all(b"partial", (x.f, x.args, x.kwargs))
+        elif (name := name_in_library(x)) is not None:
             self.add(b"library", name.encode())
         elif isinstance(x, types.FunctionType):
             self._function(x)
@@ -186,11 +201,11 @@ class _Writer:
             self._structure(child)
 
     def _may_hold(self, cls: type) -> bool:
-        return self.of_user or _name_in_library(cls) is not None
+        return self.of_user or name_in_library(cls) is not None
 
     def _named(self, cls: type) -> tuple:
         """A class by its name, and by the names of its fields where it is the user's."""
-        name = _name_in_library(cls)
+        name = name_in_library(cls)
         if name is not None:
             return (name,)
         fields = [f.name for f in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else ()
@@ -251,7 +266,7 @@ def _of_meaning(x: Meaning) -> bytes:
     return x.digest
 
 
-def _name_in_library(x: Any) -> str | None:
+def name_in_library(x: Any) -> str | None:
     """The name under which a library has this very object, a class or a function; None if none has."""
     if x is types.NoneType:
         return "types:NoneType"
@@ -260,10 +275,29 @@ def _name_in_library(x: Any) -> str | None:
         module = getattr(x.__self__, "__name__", None)
     if not isinstance(module, str) or not isinstance(name, str) or module.partition(".")[0] not in LIBRARIES:
         return None
+    place = f"{module}:{name}"
+    found: Any = _at(place)
+    if found is x:
+        return place
+    # The function under its decorators.
+    return f"{place}:wrapped" if getattr(found, "__wrapped__", None) is x else None
+
+
+def named_in_library(name: str) -> Any:
+    """What a library has under this name, of those that `name_in_library` gives."""
+    module, _, _ = name.partition(":")
+    if module.partition(".")[0] not in LIBRARIES:
+        raise LookupError(name)
+    importlib.import_module(module)
+    return _at(name)
+
+
+def _at(name: str) -> Any:
+    module, path = name.split(":")[:2]
     found: Any = sys.modules.get(module)
-    for part in name.split("."):
+    for part in path.split("."):
         found = getattr(found, part, None)
-    return f"{module}:{name}" if found is x else None
+    return found
 
 
 def _is_bare(x: Any) -> bool:
@@ -297,7 +331,7 @@ def surroundings() -> bytes:
     # A new thread is in no context. Those of whoever made one come last, in the order of imports.
     with ThreadPoolExecutor(1) as thread:
         here, outside = trace_context(), thread.submit(trace_context).result()
-    written = [type(x) in WRITERS or isinstance(x, enum.Enum) for x in here]
+    written = [_can_be_written(x) for x in here]
     if len(here) != len(outside) or not all(x is y or known for x, y, known in zip(here, outside, written)):
         raise NotKept("it is in a context of JAX's")
     writer.all(b"context", [x for x, known in zip(here, written) if known])
@@ -309,6 +343,10 @@ def surroundings() -> bytes:
     writer.write((environment, [x for x in sys.argv if x.startswith("--xla")]))
     writer.write((is_plain(), versions(), source(), machine(), *devices()))
     return writer.hash.digest()
+
+
+def _can_be_written(x: Any) -> bool:
+    return type(x) in WRITERS or isinstance(x, enum.Enum)
 
 
 @functools.cache

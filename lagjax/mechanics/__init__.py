@@ -25,6 +25,7 @@ from lagjax.mechanics.diagnosis import (
     where,
 )
 from lagjax.mechanics.equations import Equations, all_finite, equations_of, has_networks
+from lagjax.mechanics.inverse_dynamics import inverse_dynamics
 from lagjax.mechanics.lagrangian import (
     applied_force,
     completed,

@@ -77,6 +77,12 @@ def of_states(model: Model) -> np.ndarray:
     return np.zeros(model.n, bool) if first is None else first._replace(massless=()).mask(model.n)
 
 
+def with_states(model: Model) -> Model:
+    """The model that knows its states, and takes massless coordinates as all others."""
+    first = with_first_order(model).form.first_order
+    return _with(model, first._replace(massless=())) if first is not None and first.states else model
+
+
 def without_mass(model: Model) -> Bool[np.ndarray, " n"]:
     """Which rows of M are zero at every state: coordinates whose momenta contain no velocity, not of first order."""
     first = model.form.first_order
@@ -346,7 +352,9 @@ def momentum(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree)
     return _momentum(model, s)
 
 
-def mass_matrix(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, "n n"]:
+def mass_matrix(
+    system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree, *, by_name: bool = False
+) -> PyTree[Float[Array, "..."]]:
     """Return the mass matrix `M = ∂²L/∂v∂v`.
 
     >>> import lagjax as lj
@@ -354,17 +362,25 @@ def mass_matrix(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTr
     >>> print(mass_matrix(bead, 0.0, {"angle": 0.0}, {"angle": 0.0}, {"m": 2.0, "radius": 3.0}))
     [[18.]]
 
-    **Arguments:** as for `momentum`.
+    Of several coordinates, by their names:
 
-    **Returns:** M (n, n), symmetric, rows and columns in the order of `jax.tree.leaves(q)`,
-    `[L] [t]²/([q][q])`. It may be singular or indefinite.
+    >>> cart = lj.System(lambda t, q, v, p: 1.5 * v["x"] ** 2 + v["x"] * v["angle"] + 0.5 * v["angle"] ** 2)
+    >>> mass = mass_matrix(cart, 0.0, {"x": 0.0, "angle": 0.0}, {"x": 0.0, "angle": 0.0}, None, by_name=True)
+    >>> print(mass["x"]["x"], mass["x"]["angle"], mass["angle"]["angle"])
+    3.0 1.0 1.0
+
+    **Arguments:** as for `momentum`; `by_name`: whether in blocks by name, `M[row][column]`, as `jax.hessian` returns
+    them: like `q`, and in it for each coordinate again like `q`.
+
+    **Returns:** M (n, n), symmetric, rows and columns in the order of `jax.tree.leaves(q)` (the entries of a dict by
+    the alphabet: "angle", then "x" above), `[L] [t]²/([q][q])`. It may be singular or indefinite.
 
     **Raises:** as for `momentum`.
 
     Source: Goldstein, Eq. (1.71).
     """
     model, s = prepare(system, t, q, v, params)
-    return _mass_matrix(model, s)
+    return _mass_blocks(model, s) if by_name else _mass_matrix(model, s)
 
 
 def jacobi_integral(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> Float[Array, ""]:
@@ -398,6 +414,12 @@ def _momentum(model: Model, s: State):
 @compiled
 def _mass_matrix(model: Model, s: State):
     return mass_and_forcing(model, s.t, *model.vectors(s.q, s.v)).mass
+
+
+@compiled
+def _mass_blocks(model: Model, s: State):
+    mass = mass_and_forcing(model, s.t, *model.vectors(s.q, s.v)).mass
+    return jtu.tree_map(lambda rows: model.tree(jnp.moveaxis(rows, 0, -1)), model.tree(mass.T))
 
 
 @compiled

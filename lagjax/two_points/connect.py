@@ -201,6 +201,7 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     t_a, duration = s.t, jnp.asarray(other.t, dtype) - s.t
     (x_a, _), (x_b, _) = model.vectors(s.q, s.q), model.vectors(other.q, other.q)
     x_b = x_b.astype(dtype)
+    _check_finite(model, {"q_a": x_a, "q_b": x_b}, {"t_a": t_a, "t_b": other.t})
     if not is_traced(duration) and not float(duration) > 0:
         raise ValueError(
             f"t_b = {float(other.t):.9g} is not after t_a = {float(s.t):.9g}.\n"
@@ -216,6 +217,18 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     elif switching is None:
         x_b = _onto_constraints(model, t_a + duration, x_b)
     return model, Ends(t_a, x_a, x_b, duration, condition, kind, bool(free_time), count, switching)
+
+
+def _check_finite(model: Model, ends: dict[str, Array], times: dict[str, Array]):
+    """Raise for a coordinate or a time that is NaN or infinite, by its name."""
+    given = [(f"coordinate '{name}' of {end}", x[i]) for end, x in ends.items() for i, name in enumerate(model.names)]
+    bad = [(what, x) for what, x in [*given, *times.items()] if not is_traced(x) and not np.isfinite(x)]
+    if bad:
+        raise ValueError(
+            f"{bad[0][0]} is {float(bad[0][1])}, and a motion goes from one finite state to another.\n"
+            "Usual cause: a division by zero where the end was computed, or an output of a motion that had ended.\n"
+            "Fix: a number; a coordinate that is free at the end is left to end=..., and its entry is a guess."
+        )
 
 
 def _check_alike(q_a: PyTree, q_b: PyTree):

@@ -40,6 +40,7 @@ QUICK = {
     "jacobi_integral": by_name("jacobi_integral"),
     "accelerations": by_name("accelerations"),
     "constraint_residual": by_name("constraint_residual", rod),
+    "inverse_dynamics": lambda q, v: lj.inverse_dynamics(system, 0, q, v, q, PARAMS)[0],
     "noether_charge": lambda q, v: lj.noether_charge(system, turning)(0, q, v, PARAMS),
     "integrate": lambda q, v: lj.integrate(rod_pendulum, q, v, {"g": 3.0, "l": 1.0}, ts=FOUR).q,
     "in a program": lambda q, v: jax.jit(lambda q, v: lj.momentum(system, 0, q, v, PARAMS))(q, v),

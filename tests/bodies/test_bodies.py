@@ -230,6 +230,7 @@ WRONG_VALUES = [
     (lambda: lj.bodies.rolling_sphere(ROD.at(), GROUND, -1.0), "the radius of .* above zero, and is -1.0"),
     (lambda: lj.bodies.rolling(ROD.at(), GROUND, NAN), "the radius of lj.bodies.rolling .* above zero, and is nan"),
     (lambda: lj.bodies.rolling_ellipsoid(ROD.at(), GROUND, (1.0, 0.0, 1.0)), "a half axis of .*, and is 0"),
+    (lambda: lj.bodies.multibody(body for body in ()), "lj.bodies.multibody was given no bodies.\nUsual cause: a gen"),
 ]  # fmt: skip
 WRONG_KINDS = [
     (lambda: lj.bodies.revolute(ROD, GROUND), "Body is none.\nFix: lj.bodies.spherical"),

@@ -74,6 +74,22 @@ def test_relativistic_particle():
     np.testing.assert_allclose(jacobi_integral(system, 0.0, np.zeros(2), v, None), m * gamma * c**2, rtol=1e-13)
 
 
+def test_mass_matrix_by_name():
+    """½ u·S u with u = (angle', r1', r2'), a number and a vector: blocks of S, each of the shape of its coordinates."""
+    S = np.array([[2.0, 0.5, 0.25], [0.5, 3.0, -0.75], [0.25, -0.75, 4.0]])
+
+    def kinetic(t, q, v, params):
+        u = jnp.concatenate([v["angle"][None], v["r"]])
+        return 0.5 * u @ params @ u
+
+    at = {"r": np.zeros(2), "angle": 0.0}
+    named = mass_matrix(System(kinetic), 0.0, at, at, S, by_name=True)
+    np.testing.assert_allclose(named["r"]["angle"], S[1:, 0], rtol=1e-15)
+    np.testing.assert_allclose(named["angle"]["r"], S[0, 1:], rtol=1e-15)
+    np.testing.assert_allclose(named["r"]["r"], S[1:, 1:], rtol=1e-15)
+    assert named["angle"]["angle"] == 2.0 and list(named) == list(named["r"]) == ["angle", "r"]
+
+
 def test_a_total_time_derivative_changes_nothing():
     """L + dF(t, q)/dt has the same accelerations; adding F itself does not."""
 

@@ -26,6 +26,7 @@ OF_STATES = (
 )
 # Each with whether it also takes a motion in phases.
 DOORS = {name: (of_states(name), False) for name in OF_STATES} | {
+    "inverse_dynamics": (lambda system: lj.inverse_dynamics(system, 0.0, 1.0, 0.0, 0.0, PARAMS), False),
     "explain": (of_states("explain"), True),
     "draw": (lambda system: lj.draw(system, 1.0, PARAMS), True),
     "integrate": (lambda system: lj.integrate(system, 1.0, 0.0, PARAMS, ts=TS), True),

@@ -91,6 +91,8 @@ def test_free_ends():
     [
         ({"q_b": np.zeros(3)}, "must have the structure and shapes of q_a"),
         ({"t_b": 0.0}, "is not after t_a"),
+        ({"t_b": np.inf}, "t_b is inf, and a motion goes from one finite state"),
+        ({"q_b": np.array([4.0, np.nan])}, r"coordinate 'q\[1\]' of q_b is nan, and a motion goes"),
         ({"t_b": -1.0}, "is not after t_a"),
         ({"end": lambda t, q, v, params: jnp.zeros(3)}, "there are 3 conditions of positions on the end"),
         ({"end": lambda t, q, v, params: v[0]}, "there is one condition with velocities"),

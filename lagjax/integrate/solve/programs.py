@@ -24,17 +24,16 @@ from lagjax.display import waiting
 from lagjax.integrate.both_modes import solve_in_both_modes
 from lagjax.integrate.elements import InElements
 from lagjax.integrate.equal_steps.loop import check_can_be_stepped
-from lagjax.integrate.events.event import Crossings
 from lagjax.integrate.jumps import Jumps, slidable, with_jumps_in_time
 from lagjax.integrate.jumps import found as jumps_found
 from lagjax.integrate.problem import Problem
-from lagjax.integrate.results import RESULTS, Errors, Snapshot, SolveInfo, SolveOptions, pack
+from lagjax.integrate.results import SolveInfo, SolveOptions, pack
 from lagjax.integrate.settings import UNROLL_AT_ONCE_UP_TO, Settings
 from lagjax.integrate.solve.legs import solved_over_jumps, warn_of_missed, with_lost, without_elements
 from lagjax.integrate.solve.one_motion import solved
 from lagjax.integrate.solve.reports import report_settled, with_errors, with_errors_inside
 from lagjax.integrate.solve.segments import solved_in_phases
-from lagjax.integrate.trajectory import HybridTrajectory, Switches, Trajectory
+from lagjax.integrate.trajectory import HybridTrajectory, Trajectory
 from lagjax.jaxtools import (
     HashablePart,
     KeptProgram,
@@ -45,6 +44,7 @@ from lagjax.jaxtools import (
     hashable_partition,
     is_eager,
     jitted,
+    named,
     one_by_one,
     outlined,
     program_of,
@@ -92,12 +92,26 @@ def trajectory_of(problem: Problem) -> Trajectory:
 
 def _inside(problem: Problem) -> Trajectory:
     """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
-    settings = problem.settings
     # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
-    regular = takes_for_regular() and settings.adjoint is None and not _may_hold_too_much(problem)
-    problem = problem._replace(settings=(settings := replace(settings, robust=not regular)))
+    regular = takes_for_regular() and problem.settings.adjoint is None and not _may_hold_too_much(problem)
+    repeats = bool(problem.settings.repeated_up_to)
+    arrays, static = hashable_partition(problem)
+
+    def of_arrays(arrays: list):
+        return (_traced(Problem(*static.combine(arrays)), regular, repeats),)
+
+    def meant():
+        return [((regular, repeats), False), *_meant(static, not regular)]
+
+    found = named(of_arrays, Said(meant, _outline, partial(_said_tree, static)), arrays)
+    return _traced(problem, regular, repeats) if found is None else found[0]
+
+
+def _traced(problem: Problem, regular: bool, repeats: bool) -> Trajectory:
+    settings = replace(problem.settings, robust=not regular)
+    problem = problem._replace(settings=settings)
     found, settled = _trajectory_of(problem)
-    if settings.repeated_up_to:
+    if repeats:
         still = stop_gradient(problem[:-1])
         found = with_errors_inside(lambda s: _trajectory_of(Problem(*still, s))[0], found, settings, problem.ts)
     return report_settled(found, settled) if regular else found
@@ -117,7 +131,7 @@ class _Programs:
     def __init__(self, static: HashablePart, count: int, regular: bool):
         def of(robust: bool) -> KeptProgram:
             said = Said(partial(_meant, static, robust), _outline, partial(_said_tree, static))
-            return KeptProgram(partial(_of_arrays, static, robust, count), said)
+            return KeptProgram(partial(_of_arrays, static, robust, count), said, compiler_options())
 
         self.regular: KeptProgram | None = of(False) if regular else None
         self.robust = of(True)
@@ -155,9 +169,6 @@ def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
 
 
 # The classes of what a motion gives, besides those of the user's states.
-CLASSES = Trajectory, HybridTrajectory, Snapshot, Crossings, Switches, Errors, type(RESULTS.successful)
-
-
 def _meant(static: HashablePart, robust: bool) -> list[tuple[Any, bool]]:
     """What a program computes, for its digest; with whether states and parameters may be in the user's classes.
 
@@ -181,16 +192,16 @@ def _meant(static: HashablePart, robust: bool) -> list[tuple[Any, bool]]:
 def _outline(results: tuple) -> dict[str, Any]:
     """The structure of what `_of_arrays` returns, as data."""
     found, *_ = results
-    given = {"q": found.end.q, "arrays": found.arrays, "static": found.static, "RESULTS": RESULTS}
-    return {"how": list(found.static.how), "results": outlined(results, CLASSES, given)}
+    given = {"q": found.end.q, "arrays": found.arrays, "static": found.static}
+    return {"how": list(found.static.how), "results": outlined(results, given)}
 
 
 def _said_tree(static: HashablePart, outline: dict[str, Any], arrays: list):
     """Results of this structure; what they say of themselves is that of this problem."""
     problem = Problem(*static.combine(arrays))
     of_problem, described = _described(problem, SolveInfo(*outline["how"]))
-    given = {"q": problem.q, "arrays": of_problem, "static": described, "RESULTS": RESULTS}
-    return rebuilt(outline["results"], CLASSES, given)
+    given = {"q": problem.q, "arrays": of_problem, "static": described}
+    return rebuilt(outline["results"], given)
 
 
 def _described(problem: Problem, how: SolveInfo):
