@@ -22,6 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Drawing, Shape, surface
 from lagjax.jaxtools import compiled
+from lagjax.refusals import must
 
 __all__ = ["Drawing", "Shape", "box", "cylinder", "disk", "ellipsoid", "line", "mesh", "rod", "sphere", "trail"]
 
@@ -189,12 +190,9 @@ def _at_points(f: Callable, points: np.ndarray, params: PyTree):
 def _anchor(place: Any) -> Anchor:
     if isinstance(anchor := getattr(place, "anchor", None), Anchor):
         return anchor
-    if np.shape(place) != (3,):
-        raise TypeError(
-            "a place must be a body, body.at(point), lj.bodies.ground or a point (x, y, z), not "
-            f"{type(place).__name__}.\nUsual cause: the name of a body in place of the body.\n"
-            'Fix: lj.shapes.sphere(lj.bodies.Body("ball", ...), 0.5).'
-        )
+    claim = "a place must be a body, body.at(point), lj.bodies.ground or a point (x, y, z)"
+    fix, cause = 'lj.shapes.sphere(lj.bodies.Body("ball", ...), 0.5)', "the name of a body in place of the body"
+    must(np.shape(place) == (3,), claim, place, fix, cause, TypeError)
     return Anchor(None, tuple(np.asarray(place, float).tolist()))
 
 

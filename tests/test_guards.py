@@ -285,7 +285,7 @@ def test_said_by_name():
         lj.guards.touches(above, 0.5, friction=0.2, sliding=1.0)  # pyright: ignore
     q, v = {"x": 0.0, "y": R, "phi": 0.0}, {"x": 1.0, "y": -1.0, "phi": 0.0}
     for wrong, said in (
-        (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, but returned \(2,\)"),
+        (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, and returned shape \(2,\)"),
         (lambda t, q, v, p: jnp.abs(v["x"]), "linear in v, but its slope depends on v"),
     ):
         guard = lj.guards.touches(above, 0.5, friction=0.2, sliding=wrong)

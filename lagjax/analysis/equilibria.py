@@ -41,6 +41,7 @@ from lagjax.analysis.degenerate import CREEPS_BELOW, nearest, soft_below
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import are_angles, invariance, listed, structure
 from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below
+from lagjax.refusals import must_be_among, must_be_like, must_name
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
@@ -90,8 +91,7 @@ def _at_rest(q: PyTree) -> PyTree:
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> SteadySymmetries:
     """The symmetries along which the motion is steady: those that `cyclic` names, or the `moving` (n,) coordinates."""
-    if hold not in (VELOCITY, MOMENTUM, None):
-        raise ValueError(f'hold must be "velocity", "momentum" or None, not {hold!r}.')
+    must_be_among((VELOCITY, MOMENTUM, None), hold, "hold")
     names = coordinates.names(s.q)
     if cyclic is None:
         if moving is None:
@@ -119,10 +119,8 @@ def _names_in(names, given: Iterable):
     for name in given:
         entries = [x for x in names if x == name or isinstance(name, str) and x.split("[")[0] == name]
         if not entries:
-            raise ValueError(
-                f"cyclic names {name!r}, and the coordinates are {listed(names)}.\n"
-                "Fix: use these names, or functions motion(q, params) that return a velocity like v."
-            )
+            fix = "'{}', or functions motion(q, params) that return a velocity like v"
+            must_name([name], names, "cyclic names", "coordinate", fix)
         chosen += entries
     return list(dict.fromkeys(chosen))
 
@@ -143,14 +141,8 @@ def _check_cyclic(system, s, chosen):
 def _check_fields(fields: list[Callable], s: State):
     for field in fields:
         value = jax.eval_shape(lambda q, params, field=field: field(q, params), s.q, s.params)
-        if jtu.tree_structure(value) != jtu.tree_structure(s.q) or jtu.tree_map(jnp.shape, value) != jtu.tree_map(
-            jnp.shape, s.q
-        ):
-            raise ValueError(
-                "cyclic=motion(q, params) must return a velocity like v, one number per coordinate.\n"
-                f"  q has shapes {jtu.tree_map(jnp.shape, s.q)}\n  it has {jtu.tree_map(jnp.shape, value)}\n"
-                "Fix: return the structure of q, with 0.0 for coordinates that do not move (0.0 * q[...] for arrays)."
-            )
+        fix = "return the structure of q, with 0.0 for coordinates that do not move (0.0 * q[...] for arrays)"
+        must_be_like(value, s.q, "the velocity that cyclic=motion(q, params) returns", "q", fix)
 
 
 # The largest imbalance of an equilibrium, relative to the effect of a displacement as large as the coordinates.

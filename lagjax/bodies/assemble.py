@@ -26,6 +26,7 @@ from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.display import CUBE, Anchor, Drawing, Shape
 from lagjax.jaxtools import numpy_of
+from lagjax.refusals import must_be, must_name
 from lagjax.shapes import line
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -154,30 +155,20 @@ def _check_pose(body: Body, given: Pose | PoseOnTree):
 
 
 def _check_joints(joints: Mapping | None):
-    if not isinstance(joints or {}, Mapping):
-        raise TypeError(
-            f"the joints of lj.bodies.multibody are a dict by name, and {type(joints).__name__} was given.\n"
-            "Fix: {'hinge': lj.bodies.revolute(lj.bodies.ground.at(), door.at())}."
-        )
+    example = "{'hinge': lj.bodies.revolute(lj.bodies.ground.at(), door.at())}"
+    must_be(Mapping, joints or {}, "the joints of lj.bodies.multibody must be a dict by name", example)
     for name, joint in (joints or {}).items():
         parts = joint.values() if isinstance(joint, Mapping) else (joint,)
         for part in parts:
-            if not isinstance(part, Holonomic | Nonholonomic):
-                raise TypeError(
-                    f"joint '{name}' of lj.bodies.multibody is no constraint, but {type(part).__name__}.\n"
-                    "Usual cause: a load among the joints, or a function without its kind.\n"
-                    "Fix: lj.bodies.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third "
-                    "argument."
-                )
+            claim = f"joint '{name}' of lj.bodies.multibody must be a constraint"
+            fix = "lj.bodies.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third argument"
+            cause = "a load among the joints, or a function without its kind"
+            must_be(Holonomic | Nonholonomic, part, claim, fix, cause)
 
 
 def _check_keywords(others: Mapping):
-    unknown = [name for name in others if name not in OTHERS]
-    if unknown:
-        raise TypeError(
-            f"lj.bodies.multibody has no argument '{unknown[0]}'.\n"
-            f"Fix: bodies, joints, loads, lagrangian, or one of lj.System's {', '.join(OTHERS)}."
-        )
+    fix = "bodies, joints, loads, lagrangian, or one of lj.System's, as {}="
+    must_name(others, OTHERS, "lj.bodies.multibody was given", "argument of it", fix, error=TypeError)
 
 
 def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Body, Driven, Ground, Marker, check_takes_params, ground, valued
 from lagjax.bodies.joints import Joined, above, apart, aside, cross, tilt, turn
+from lagjax.refusals import must, must_name
 from lagjax.system import Holonomic
 
 # The freedoms that a joint leaves, from the rows that it has as a constraint.
@@ -133,19 +134,14 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
 def check_armature(entries: Sequence[Entry], armature: Mapping) -> dict[str, Any]:
     """The armature by the names of joints; raises where it is of none, or no inertia."""
     shapes = {entry.name: entry.rotors for entry in entries if entry.kinds != ("free",)}
+    must_name(armature, shapes, "armature names", "joint with a coordinate")
     for name, given in armature.items():
-        if name not in shapes:
-            listed = f"one of {', '.join(map(repr, shapes))}" if shapes else "leave it out"
-            raise ValueError(f"armature '{name}' belongs to no joint with a coordinate.\nFix: {listed}.")
         if callable(given):
             check_takes_params("armature", f"'{name}'", given)
             continue
         numbers, shape = np.asarray(given), shapes[name]
-        if numbers.shape not in ((), shape) or not np.all(numbers >= 0):
-            raise ValueError(
-                f"the armature of '{name}' must be a moment of inertia that is not negative"
-                f"{f', or {shape} of them' if shape else ''}, and is {given}."
-            )
+        well, several = numbers.shape in ((), shape) and np.all(numbers >= 0), f", or {shape} of them" * bool(shape)
+        must(well, f"the armature of '{name}' must be a moment of inertia that is not negative{several}", given)
     return dict(armature)
 
 

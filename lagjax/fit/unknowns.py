@@ -43,6 +43,7 @@ from lagjax.integrate import integrate
 from lagjax.jaxtools import at_once, compiled, is_traced, kinds, numpy_of, once, stop_gradient
 from lagjax.mechanics import departures, equations_of, free_coordinates, listed, with_first_order, within
 from lagjax.numerics import last_step, newton, null_space
+from lagjax.refusals import must
 from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system, with_rates
 
 # The standard deviation of a weak prior, relative to the root mean square of the guesses of a network's weights. With
@@ -243,9 +244,9 @@ def _matching(
 
 
 def _check_pair(name: str, pair: Any, what: str):
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
-        raise ValueError(f"{what} of '{name}' must be a pair, not {pair!r}.\nFix: {what}={example}.")
+    example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
+    well = isinstance(pair, tuple | list) and len(pair) == 2
+    must(well, f"{what} of '{name}' must be a pair", pair, f"{what}={example}")
 
 
 def _check_start(found: FreeNumbers, low: np.ndarray, high: np.ndarray):

@@ -23,6 +23,7 @@ from jaxtyping import Array, PyTree
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import balance_matrix, is_determined, of_states, with_first_order
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined, missed
+from lagjax.refusals import listed
 from lagjax.system import Model, State, constraints, coordinates
 
 # An eigenvalue counts as below zero beyond so many round-offs of the largest.
@@ -281,14 +282,6 @@ def dependencies(jacobian: Array, independent: Array, names: Sequence[str]) -> l
         others = np.flatnonzero(share[i] > SHARE * size[i])
         groups.append((names[i], *(names[j] for j in others)))
     return groups
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names in quotes, joined by commas and "and"."""
-    quoted = [f"'{name}'" for name in names]
-    if not quoted:
-        return "none"
-    return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + f" and {quoted[-1]}"
 
 
 def _equilibrate(matrix: Array):

@@ -124,7 +124,7 @@ def test_starts_that_lead_out():
     [
         ({"starts": []}, "starts is an empty list"),
         ({"starts": [1.0], "velocities": 1.0}, "L depends on 'q', which moves at a constant rate"),
-        ({"starts": [1.0], "cyclic": "angle"}, "cyclic names 'angle', and the coordinates are 'q'"),
+        ({"starts": [1.0], "cyclic": "angle"}, "cyclic names 'angle', which is no coordinate; there is 'q'"),
         ({"starts": [1.0], "hold": "energy"}, "hold must be"),
         ({"starts": [1.0, {"q": 1.0}]}, "differ in structure"),
     ],

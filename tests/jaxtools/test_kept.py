@@ -362,7 +362,7 @@ doors = {
     "sweep": lambda: lj.sweep(lambda at: end(at["l"]), lengths).values,
     "equilibria": lambda: lj.equilibria(system, {"l": 2.0}, starts=[q]).q,
     "orbit": lambda: lj.periodic_orbit(system, (rest | {"a": 0.3}, rest), 8.8, {"l": 2.0}).period,
-    "exponents": lambda: lj.lyapunov_exponents(system, q, v, {"l": 2.0}, ts=np.linspace(0.0, 30.0, 31)).values,
+    "exponents": lambda: lj.lyapunov_exponents(system, q, v, {"l": 2.0}, ts=np.linspace(0.0, 30.0, 31)).exponents,
     "fit": lambda: lj.fit(system, record(), {"l": 1.0}, free="l").params,
     "sweep of slopes": lambda: lj.sweep(lambda at: jax.grad(end)(at["l"]), lengths).values,
     "sweep of curvatures": lambda: lj.sweep(lambda at: jax.hessian(end)(at["l"]), lengths).values,

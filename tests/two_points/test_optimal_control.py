@@ -161,16 +161,16 @@ def test_questions_that_are_wrong():
         ({"t_b": (0.0, jnp.inf)}, "a pair of times"),
         ({"bounds": {"puhs": (-1, 1)}}, "Fix: 'push'"),
         ({"bounds": {"q": (-1.0, 0.9)}}, "the end asks for q = 1, and its bounds are -1 and 0.9"),
-        ({"bounds": {"push": (1, -1)}}, "above the upper one"),
+        ({"bounds": {"push": (1, -1)}}, "must be below the upper one"),
         ({"end": (jnp.zeros(2), 0.0)}, "the start has"),
-        ({"elements": 0}, "elements=0 must be a whole number of at least 1"),
-        ({"interpolation": "cubic"}, "'smooth', 'linear' and 'constant'"),
-        ({"starts": 0}, "starts=0 must be a whole number of at least 1"),
+        ({"elements": 0}, "elements must be a whole number above zero, not 0"),
+        ({"interpolation": "cubic"}, "'smooth', 'linear' or 'constant'"),
+        ({"starts": 0}, "starts must be a whole number above zero, not 0"),
         ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
     ):
         with pytest.raises(ValueError, match=words):
             pushed(**options)
-    with pytest.raises(TypeError, match="guess is a function of t or an earlier Steering, not dict"):
+    with pytest.raises(TypeError, match="guess must be a function of t, or an earlier Steering, not {"):
         pushed(guess={"q": 1.0})
     with pytest.raises(TypeError, match="neither q nor v"):
         pushed(start=(None, None))
