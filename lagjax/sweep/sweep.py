@@ -127,8 +127,9 @@ def groups_of_blocks(engine: Any, store: Store, numbers: list[int]) -> Iterator[
 
 def compare_versions(engine: Any, store: Store) -> None:
     """If other versions began the store, recompute some of its points and warn if they differ."""
-    stored, number = store.about["fingerprint"], store.first()
-    if stored["program"] == engine.program.digest or number is None:
+    stored = store.about["fingerprint"]
+    number = None if stored["program"] == engine.program.digest else store.first()
+    if number is None:
         return
     indices = np.r_[store.blocks.points(number)][: engine.program.chunk]
     found, status = engine.first(indices)
@@ -342,6 +343,7 @@ def _in_store(engine: Any, axes: Axes, files: Files, part: tuple[int, int], acce
             _tell_interrupted(why, done, store.blocks.size(missing), "the same call continues from there.")
 
     here = f"{engine.words}, in {files.place}"
+    files.sizes(again=True)
     status, _, lost = store.status()
     if lost:
         fix = "Fix: this call without part, or with the part to which these blocks belong."

@@ -12,6 +12,7 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -200,7 +201,8 @@ def test_workers_come_and_go(cluster, tmp_path, in_store, whole):
         def update(self, count):
             before, self.done = self.done, self.done + count
             if before < 1000 <= self.done:
-                os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+                pids: Any = client.run(os.getpid)
+                os.kill(next(iter(pids.values())), signal.SIGKILL)
             if before < 1500 <= self.done:
                 cluster.scale(4)
 
@@ -272,7 +274,7 @@ def marked(store):
 def test_the_scheduler_is_killed(tmp_path, whole):
     """The same call on another one continues: no block that was finished is computed again."""
     distributed = pytest.importorskip("distributed")
-    store, before = tmp_path / "store", {}
+    store, before, swept = tmp_path / "store", {}, None
 
     def end(scheduler):
         while not (store / "lagjax/marks/c").exists() or len(marked(store)) < 20:
@@ -303,7 +305,7 @@ def test_the_scheduler_is_killed(tmp_path, whole):
                 process.wait()
         if turn == 0:
             before = marked(store)
-    assert 0 < swept.ran < 4000 and len(before) >= 20
+    assert swept is not None and 0 < swept.ran < 4000 and len(before) >= 20
     assert before.items() <= marked(store).items()
     same(swept, whole)
 
