@@ -11,7 +11,9 @@ those of a notebook or a script as they are.
 """
 
 import concurrent.futures
+import importlib
 import inspect
+import io
 import os
 import platform
 import queue
@@ -21,6 +23,7 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +33,7 @@ from jaxtyping import PyTree
 from lagjax.display import waiting
 from lagjax.sweep.axes import Axes
 from lagjax.sweep.engine import STEPS_TOGETHER, Engine, Status, not_run, program_for
-from lagjax.sweep.metadata import versions
+from lagjax.sweep.metadata import DESCRIPTION, description_at, versions
 from lagjax.sweep.objects import Files
 from lagjax.sweep.store import Store
 
@@ -174,10 +177,12 @@ def fill(job: Job, place: str, digest: str, numbers: list[int]) -> Done:
 
 
 def _store(place: str, digest: str):
+    files = Files(place)
     try:
-        store = Store(Files(place), of_own_sweep=True)
-        if store.about["digest"] == digest:
-            return store
+        # Only this file is read: a thousand workers would list all files a thousand times.
+        about, _ = description_at(files, {DESCRIPTION: 0})
+        if about["digest"] == digest:
+            return Store(files, of_own_sweep=True, about=about)
     except (ValueError, OSError):
         pass
     raise Refused(
@@ -418,7 +423,7 @@ def _short(indices: np.ndarray):
 
 def _pickled(run: Callable, what: Any) -> bytes:
     try:
-        return _cloudpickle().dumps(what)
+        return _bytes_of(what)
     except Exception as error:
         culprits = [f"'{name}', a {type(x).__name__}" for name, x in _read_by(run) if not _can_be_sent(x)]
         of = f"it reads {', '.join(culprits)}, which cannot" if culprits else str(error)
@@ -427,6 +432,20 @@ def _pickled(run: Callable, what: Any) -> bytes:
             "Usual cause: an open file, a lock or a connection that run reads.\n"
             "Fix: read it into an array before the sweep, and use that in run."
         ) from error
+
+
+def _bytes_of(what: Any) -> bytes:
+    cloudpickle, to = _cloudpickle(), io.BytesIO()
+
+    class Pickler(cloudpickle.Pickler):
+        def reducer_override(self, obj: Any):
+            # `lagjax` itself is a module of a class of lazy_loader's, for which cloudpickle has no rule.
+            if isinstance(obj, ModuleType) and type(obj) is not ModuleType:
+                return importlib.import_module, (obj.__name__,)
+            return super().reducer_override(obj)
+
+    Pickler(to).dump(what)
+    return to.getvalue()
 
 
 def _read_by(run: Callable):
@@ -439,7 +458,7 @@ def _read_by(run: Callable):
 
 def _can_be_sent(x: Any) -> bool:
     try:
-        _cloudpickle().dumps(x)
+        _bytes_of(x)
     except Exception:
         return False
     return True
