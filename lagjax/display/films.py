@@ -50,7 +50,7 @@ def _ffmpeg(path: Path) -> str:
     if found := which("ffmpeg"):
         return found
     try:
-        import imageio_ffmpeg
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
         return imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):

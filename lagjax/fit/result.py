@@ -461,7 +461,7 @@ class Fit:
         """What the fitted motion predicts, by channel, at times closer than the samples; NaN between windows."""
         windows = np.flatnonzero(np.asarray(self.problem.windows.record) == record)
         states, _ = starts_at(self.problem, self.unknowns, windows)
-        count, found = max(DRAWN // len(windows), 16), {}
+        count, curves = max(DRAWN // len(windows), 16), {}
         for i, w in enumerate(windows):
             of_window, (q, v) = self.problem.windows.ts[w], jax.tree.map(lambda x, i=i: x[i], states)
             ts = np.linspace(of_window[0], of_window[self.problem.windows.last[w]], count)
@@ -469,9 +469,9 @@ class Fit:
             predicted = self.problem.predicted(integrate(self.problem.system, q, v, params, ts=ts, **options))
             for kind, tree in predicted.items():
                 for path, x in jtu.tree_leaves_with_path(tree) if kind != "end" else ():
-                    known = found.setdefault(channel_name(kind, path), [])
+                    known = curves.setdefault(channel_name(kind, path), [])
                     known.append((np.append(ts, np.nan), np.append(x, np.full_like(x[-1:], np.nan), axis=0)))
-        return {name: tuple(map(np.concatenate, zip(*parts))) for name, parts in found.items()}
+        return {k: (np.concatenate([t for t, _ in x]), np.concatenate([y for _, y in x])) for k, x in curves.items()}
 
     def __repr__(self):
         if is_traced(self.cost):

@@ -16,6 +16,7 @@ from lagjax.jaxtools.cache import (
     shape_of,
     varies,
 )
+from lagjax.jaxtools.compiled import NAMING, compiled, named, surroundings_for_names
 from lagjax.jaxtools.dependence import is_linear, pattern
 from lagjax.jaxtools.fuse import (
     PRODUCT,
@@ -62,7 +63,7 @@ from lagjax.jaxtools.jaxpr import (
     without_repeats,
     written,
 )
-from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, Said, compiled
+from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, NotKept, Said, Unusable
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,

@@ -39,6 +39,7 @@ from jax.extend.core import Primitive
 
 from lagjax.jaxtools.cache import HashablePart, once
 from lagjax.jaxtools.jaxpr import Meaning, content_of
+from lagjax.jaxtools.primitives import LapackCall
 from lagjax.jaxtools.tracing import is_plain
 
 try:
@@ -68,13 +69,19 @@ class NotKept(Exception):
     """A program that cannot be kept; says why."""
 
 
-def digest_of(parts: Iterable[tuple[Any, bool]]) -> str:
+def digest_of(parts: Iterable[tuple[Any, bool]], around: bytes | None = None) -> str:
     """The digest of some things, each with whether it may hold numbers in classes of the user's own.
+
+    `around`: the digest of surroundings that was made outside of JAX's contexts, for something inside them.
 
     **Raises:** `NotKept`.
     """
     writer = _Writer()
-    writer.add(b"surroundings", surroundings())
+    if around is None:
+        writer.add(b"surroundings", surroundings())
+    else:
+        writer.add(b"around", around)
+        writer.all(b"context", [x for x in trace_context() if _can_be_written(x)])
     try:
         for part, of_user in parts:
             writer.of_user = of_user
@@ -141,6 +148,10 @@ class _Writer:
             if not x.empty:
                 raise NotKept("it is for several devices")
             self.all(b"no mesh", (type(x),))
+        elif isinstance(x, jax.sharding.NamedSharding):
+            self.all(b"sharding", (x.mesh, tuple(x.spec), x.memory_kind))
+        elif isinstance(x, LapackCall):
+            self.all(b"call", (x.primitive, *sorted(x.params.items())))
         elif isinstance(x, Primitive):
             self.add(b"primitive", _name_of_primitive(x).encode())
         elif isinstance(x, enum.Enum):
@@ -320,7 +331,7 @@ def surroundings() -> bytes:
     # A new thread is in no context. Those of whoever made one come last, in the order of imports.
     with ThreadPoolExecutor(1) as thread:
         here, outside = trace_context(), thread.submit(trace_context).result()
-    written = [type(x) in WRITERS or isinstance(x, enum.Enum) for x in here]
+    written = [_can_be_written(x) for x in here]
     if len(here) != len(outside) or not all(x is y or known for x, y, known in zip(here, outside, written)):
         raise NotKept("it is in a context of JAX's")
     writer.all(b"context", [x for x, known in zip(here, written) if known])
@@ -332,6 +343,10 @@ def surroundings() -> bytes:
     writer.write((environment, [x for x in sys.argv if x.startswith("--xla")]))
     writer.write((is_plain(), versions(), source(), machine(), *devices()))
     return writer.hash.digest()
+
+
+def _can_be_written(x: Any) -> bool:
+    return type(x) in WRITERS or isinstance(x, enum.Enum)
 
 
 @functools.cache

@@ -13,7 +13,7 @@ import stat
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,31 +103,42 @@ def read(path: Path, digest: str) -> tuple[dict[str, Any], memoryview] | None:
 
 @contextmanager
 def tried(path: Path, digest: str) -> Iterator[tuple[dict[str, Any], memoryview] | None]:
-    """`read`, for a program that is run for the first time in this process, inside the context.
+    """`read`, for a program that is made ready for the first time in this process, inside the context; see `marked`.
 
-    While it is, a file beside it has the number of this process. Where such a process is no more, it has ended in
-    there, perhaps by the program: that one is dropped, to be compiled anew.
+    Where a process has ended in there, perhaps by the program, that one is dropped, to be compiled anew.
     """
     mark = path / (digest + TRYING)
-    try:
-        before = int(mark.read_text())
-    except (OSError, ValueError):
-        before = None
+    before = _process_of(mark)
     if before is not None and not _is_running(before):
         _remove(path / (digest + SUFFIX))
         _remove(mark)
     found = read(path, digest)
-    marks = found is not None and before is None
+    with nullcontext() if found is None else marked(path, digest):
+        yield found
+
+
+@contextmanager
+def marked(path: Path, digest: str) -> Iterator[None]:
+    """A context for what may end the process: inside it a file beside the program has the number of this process."""
+    mark = path / (digest + TRYING)
+    marks = _process_of(mark) is None
     if marks:
         try:
             mark.write_text(str(os.getpid()))
         except OSError:
             pass
     try:
-        yield found
+        yield
     finally:
         if marks:
             _remove(mark)
+
+
+def _process_of(mark: Path) -> int | None:
+    try:
+        return int(mark.read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def _is_running(process: int) -> bool:

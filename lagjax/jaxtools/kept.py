@@ -24,26 +24,24 @@ import re
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial, wraps
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import jaxlib.version
-import numpy as np
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
-from lagjax.jaxtools.cache import HashablePart, compiler_options, hashable_partition, program_of
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
-from lagjax.jaxtools.outline import NoOutline, outlined, parts_of, rebuilt
-from lagjax.jaxtools.primitives import jitted, one_by_one
-from lagjax.jaxtools.tracing import HAPPENED, as_usual, is_eager, is_traced
+from lagjax.jaxtools.outline import NoOutline
+from lagjax.jaxtools.tracing import HAPPENED
 
 PRIVATE: Any = None
 try:
@@ -101,12 +99,24 @@ class Said(NamedTuple):
     """How a program's results are put together without tracing it.
 
     `parts`: what it means, for `digest_of`; `outline(tree)`: the structure of its results as data; `tree(outline,
-    arrays)`: results of that structure, whatever their leaves.
+    arrays)`: results of that structure, whatever their leaves; `facts(jaxpr)`: what else is kept of it, as JSON.
     """
 
     parts: Callable[[], Sequence[tuple[Any, bool]]]
     outline: Callable[[PyTree], Any]
     tree: Callable[[Any, list], PyTree]
+    facts: Callable[[ClosedJaxpr], dict[str, Any]] = lambda jaxpr: {}
+
+
+class Ready(NamedTuple):
+    """A program for arrays of one kind: `call` of them gives a flat list, whose tree has this `structure`, with kinds
+    `outputs`; of `jax.jit` itself these are not known."""
+
+    call: Callable[[list], list]
+    structure: Any = None
+    outputs: Sequence[ShapedArray] = ()
+    facts: Mapping[str, Any] = MappingProxyType({})
+    compiled: Any = None
 
 
 class KeptProgram:
@@ -115,93 +125,108 @@ class KeptProgram:
     `is_ready`: whether it has run.
     """
 
-    def __init__(self, function: Callable[[list], PyTree], said: Said):
+    def __init__(self, function: Callable[[list], PyTree], said: Said, options: dict | None):
         self._said, self._structure, self.is_ready = said, None, False
 
         def flat(arrays: list) -> list:
             leaves, self._structure = jtu.tree_flatten(function(arrays))
             return leaves
 
-        self._jit = jax.jit(flat, compiler_options=compiler_options())
-        self._known: dict[tuple, tuple[Callable, Any]] = {}
+        self._jit = jax.jit(flat, compiler_options=options)
+        self._known: dict[tuple, Ready] = {}
 
     def __call__(self, arrays: list) -> PyTree:
         signature = _signature(arrays)
-        if signature in self._known:
-            return self._results(signature, arrays)
-        with explained_if_slow():
-            return self._results(signature, arrays)
+        ready = self._known.get(signature)
+        if ready is None:
+            with explained_if_slow():
+                place = self._place(arrays)
+                # One of `jax.jit` serves all devices; it is compiled as it is called first.
+                ready = Ready(self._jit) if place is None else self._ready_at(place, arrays)
+                self._known[signature] = ready
+                return self._results(signature, ready, arrays)
+        return self._results(signature, ready, arrays)
 
-    def _results(self, signature: tuple, arrays: list) -> PyTree:
-        known = self._known.get(signature)
-        call, structure, found = (*known, None) if known else self._first(signature, arrays)
-        if found is None:
-            try:
-                found = call(arrays)
-            except (TypeError, ValueError):
-                # On another device: a program of `jax.jit` serves all.
-                if call is self._jit:
-                    raise
-                found = self._jit(arrays)
-        if structure is None:
-            # That of `jax.jit` is known once it has traced.
-            structure = self._structure
-            self._known[signature] = call, structure
+    def _results(self, signature: tuple, ready: Ready, arrays: list) -> PyTree:
+        try:
+            found = ready.call(arrays)
+        except Unusable:
+            self._known[signature] = ready = self._made(self._place(arrays), arrays)
+            found = ready.call(arrays)
+        except (TypeError, ValueError):
+            # On another device.
+            if ready.call is self._jit:
+                raise
+            found = self._jit(arrays)
         self.is_ready = True
-        return jtu.tree_unflatten(structure, found)
+        if ready.structure is None:
+            # That of `jax.jit` is known once it has traced.
+            self._known[signature] = ready = ready._replace(structure=self._structure)
+        return jtu.tree_unflatten(ready.structure, found)
 
-    def _first(self, signature: tuple, arrays: list) -> tuple[Callable, Any, list | None]:
-        """What runs with arrays of this kind, and the structure of its results: kept ones, or compiled here.
+    def ready_for(self, arrays: list) -> Ready:
+        """The program of arrays, or shapes, of this kind, which is not run yet; its first call may say `Unusable`."""
+        place = self._place(arrays)
+        return self._made(None, arrays) if place is None else self._ready_at(place, arrays)
 
-        Of a kept program also its results, since it has run to see whether it does: a long motion runs once.
-        """
+    def made_for(self, arrays: list) -> Ready:
+        """The program of arrays, or shapes, of this kind, compiled here."""
+        return self._made(self._place(arrays), arrays)
+
+    def _place(self, arrays: list) -> tuple[Path, str] | None:
+        """The folder and the digest of the program; None if it is not kept."""
         where = folder.place()
         try:
             if where.path is None:
                 raise NotKept(where.why_not)
-            digest = digest_of([(_surely(arrays), False), *((part, own) for part, own in self._said.parts())])
+            return where.path, digest_of([(kept_here(arrays), False), *self._said.parts()])
         except NotKept as reason:
             TALLY.not_kept[str(reason)] += 1
-            return self._jit, None, None
-        with folder.tried(where.path, digest) as entry:
-            found = None if entry is None else self._loaded(*entry, arrays)
-        if found is None:
-            before = HAPPENED.copy()
-            lowered = self._jit.lower(arrays)
-            found = lowered.compile(), self._structure, None
-            if HAPPENED != before:
-                TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
-            else:
-                self._write(where.path, digest, *found[:2], arrays)
-        self._known[signature] = found[:2]
-        return found
+            return None
 
-    def _loaded(self, header: dict[str, Any], program: memoryview, arrays: list) -> tuple[Callable, Any, list] | None:
+    def _ready_at(self, place: tuple[Path, str], arrays: list) -> Ready:
+        with folder.tried(*place) as entry:
+            found = None if entry is None else self._loaded(place, *entry, arrays)
+        return self._made(place, arrays) if found is None else found
+
+    def _made(self, place: tuple[Path, str] | None, arrays: list) -> Ready:
+        before = HAPPENED.copy()
+        traced = self._jit.trace(arrays)
+        compiled = traced.lower().compile()
+        facts = self._said.facts(traced.jaxpr)
+        outputs = [ShapedArray(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.jaxpr.out_avals]
+        made = Ready(compiled, self._structure, outputs, facts, compiled)
+        if HAPPENED != before:
+            TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
+        elif place is not None:
+            self._write(place, made, arrays)
+        return made
+
+    def _loaded(
+        self, place: tuple[Path, str], header: dict[str, Any], program: memoryview, arrays: list
+    ) -> Ready | None:
         try:
             structure = jtu.tree_structure(self._said.tree(header["outline"], arrays))
-            call = _call_of(header, bytes(program), arrays)
-            if structure.num_leaves != len(header["outputs"]):
+            call, outputs = _call_of(header, bytes(program), arrays)
+            if structure.num_leaves != len(outputs):
                 return None
-            # What is wrong with it shows here, not in the middle of something else.
-            results = jax.block_until_ready(call(arrays))
+            return Ready(_Unproved(place, call), structure, outputs, header["facts"], call)
         except REFUSED as error:
-            TALLY.not_kept[f"it could not be loaded: {type(error).__name__}: {str(error)[:200]}"] += 1
+            _refuse(error)
             return None
-        TALLY.found["found"] += 1
-        return call, structure, results
 
-    def _write(self, path: Path, digest: str, call: Any, structure: Any, arrays: list) -> None:
+    def _write(self, place: tuple[Path, str], made: Ready, arrays: list) -> None:
         """Write the program, in another thread."""
 
         def write() -> None:
             try:
-                tree = jtu.tree_unflatten(structure, range(structure.num_leaves))
+                tree = jtu.tree_unflatten(made.structure, range(made.structure.num_leaves))
                 outline = json.loads(json.dumps(self._said.outline(tree)))
                 again = jtu.tree_structure(self._said.tree(outline, arrays))
-                if again != structure:
+                if again != made.structure:
                     raise NotKept("its results are of a structure that has no outline")
-                header, program = _parts_of(call)
-                if folder.write(path, digest, {"outline": outline, **header}, program):
+                header, program = _parts_of(made.compiled)
+                if folder.write(*place, {"outline": outline, "facts": made.facts, **header}, program):
                     TALLY.found["written"] += 1
             except (NotKept, NoOutline) as reason:
                 TALLY.not_kept[str(reason)] += 1
@@ -211,13 +236,47 @@ class KeptProgram:
         LATER.do(write)
 
 
+class Unusable(Exception):
+    """A program that was kept and cannot be run here."""
+
+
+class _Unproved:
+    """The call of a kept program: what is wrong with it shows when it runs first, and not in the middle of something
+    else."""
+
+    def __init__(self, place: tuple[Path, str], call: Callable[[list], list]):
+        self._place, self._call, self._proved = place, call, False
+
+    def __call__(self, arrays: list) -> list:
+        if self._proved:
+            return self._call(arrays)
+        try:
+            with folder.marked(*self._place):
+                results = jax.block_until_ready(self._call(arrays))
+        except REFUSED as error:
+            _refuse(error)
+            raise Unusable from error
+        TALLY.found["found"] += 1
+        self._proved = True
+        return results
+
+
+def _refuse(error: Exception) -> None:
+    TALLY.not_kept[f"it could not be loaded: {type(error).__name__}: {str(error)[:200]}"] += 1
+
+
+def kind(x: Any) -> tuple:
+    """What JAX compiles another program of an array for."""
+    return x.shape, x.dtype, getattr(x, "weak_type", False)
+
+
 def _signature(arrays: list) -> tuple:
     """What JAX compiles another program for, but for devices."""
     context = None if trace_context is None else trace_context()
-    return context, *((x.shape, x.dtype, getattr(x, "weak_type", False)) for x in arrays)
+    return context, *map(kind, arrays)
 
 
-def _surely(arrays: list) -> tuple:
+def kept_here(arrays: list) -> tuple:
     """The kinds of arrays on the one device where programs are kept; or `NotKept`."""
     for name, version in (("jax", jax.__version__), ("jaxlib", jaxlib.version.__version__)):
         if version not in TRIED or PRIVATE is None:
@@ -225,12 +284,12 @@ def _surely(arrays: list) -> tuple:
     if jax.default_backend() != "cpu":
         raise NotKept(f"this was not tried on a {jax.default_backend()}")
     first = jax.devices()[:1]
-    for x in arrays:
-        if isinstance(x, jax.Array) and list(x.devices()) != first:
-            raise NotKept("it runs on another device than the first, or on several")
+    known = [x for x in arrays if isinstance(x, jax.Array) and not isinstance(x, Tracer)]
+    if any(list(x.devices()) != first for x in known):
+        raise NotKept("it runs on another device than the first, or on several")
     # Results are as committed to the device as what they are computed from.
-    committed = any(getattr(x, "committed", False) for x in arrays)
-    return committed, *((x.shape, np.dtype(x.dtype), getattr(x, "weak_type", False)) for x in arrays)
+    committed = any(getattr(x, "committed", False) for x in known)
+    return committed, *map(kind, arrays)
 
 
 def _parts_of(call: Any) -> tuple[dict[str, Any], bytes]:
@@ -249,26 +308,32 @@ def _parts_of(call: Any) -> tuple[dict[str, Any], bytes]:
         "committed": bool(parts.committed),
         "lapack": bool(calls),
         "reads": sorted(parts.kept_var_idx),
-        "outputs": [_kind(x) for x in parts.output_avals],
+        "outputs": [as_data(x) for x in parts.output_avals],
     }
     return header, program
 
 
-def _kind(x: ShapedArray) -> list:
+def as_data(x: Any) -> list:
+    """The kind of a result, as JSON has it; or `NotKept`."""
     if jnp.issubdtype(x.dtype, jax.dtypes.extended) or x != ShapedArray(x.shape, x.dtype, weak_type=x.weak_type):
         raise NotKept(f"it gives a {x}")
     return [list(x.shape), x.dtype.name, bool(x.weak_type)]
 
 
-def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[list], list]:
-    """JAX's own call of a kept program."""
+def kinds_in(header: dict[str, Any]) -> list[ShapedArray]:
+    """The kinds of results of a program that is kept."""
+    return [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
+
+
+def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> tuple[Any, list[ShapedArray]]:
+    """JAX's own call of a kept program, and the kinds of its results."""
     device = jax.devices()[0]
     client: Any = device.client
     unloaded, list_of, find_lapack = PRIVATE
     devices = list_of((device,))
     sharding = jax.sharding.SingleDeviceSharding(device)
     given = [ShapedArray(arrays[i].shape, jnp.dtype(arrays[i].dtype)) for i in header["reads"]]
-    results = [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
+    results = kinds_in(header)
     if header["lapack"]:
         find_lapack()
     parts = unloaded(
@@ -294,47 +359,7 @@ def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> Callable[[
         pgle_profiler=None,
     )
     taken = (([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays],), {})
-    return jax.stages.Compiled(parts.load(), [], taken, jtu.tree_structure([0 for _ in results]))
-
-
-def compiled(function: Callable, in_numpy: bool = False) -> Callable:
-    """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
-
-    Its programs are kept. With `in_numpy`, a call from Python returns NumPy arrays.
-    """
-    as_part = jitted(function)
-    finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
-
-    @wraps(function)
-    @as_usual
-    def program(*args):
-        if not is_eager() or is_traced(args):
-            return as_part(*args)
-        arrays, static = hashable_partition(args)
-        try:
-            return finish(program_of((function, static), lambda: _program(function, static))(arrays))
-        except jax.errors.JaxRuntimeError:
-            # Equinox's wrapper has a better message for the checks that equinox puts into a program.
-            return finish(as_part(*args))
-
-    return program
-
-
-def _program(function: Callable, static: HashablePart) -> KeptProgram:
-    def outline(results: PyTree):
-        return outlined(results, parts_of(static.combine(range(len(static.leaves)))))
-
-    def tree(outline: Any, arrays: list):
-        return rebuilt(outline, parts_of(static.combine(arrays)))
-
-    def meant():
-        return [((function, compiler_options()), False), (static, False)]
-
-    return KeptProgram(partial(_of_arrays, function, static), Said(meant, outline, tree))
-
-
-def _of_arrays(function: Callable, static: HashablePart, arrays: Sequence):
-    return one_by_one(function)(*static.combine(arrays))
+    return jax.stages.Compiled(parts.load(), [], taken, jtu.tree_structure([0 for _ in results])), results
 
 
 class Later:

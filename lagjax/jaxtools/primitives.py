@@ -80,7 +80,7 @@ def _one_by_one(equation: JaxprEqn):
     while name == "vprim":  # One of equinox's primitives, batched, perhaps several times.
         name, params = params["prim"].name, dict(params["params"])
     if name in LAPACK or name in HOLDS_A_SOLVER:
-        return equation.replace(primitive=_library_p, params={"of": _Call(equation.primitive, equation.params)})
+        return equation.replace(primitive=_library_p, params={"of": LapackCall(equation.primitive, equation.params)})
     if name == "custom_jvp_call" and any(map(_has_library, bodies(equation))):
         return _with_rewritten_derivative(equation)
     if name == "custom_vjp_call" and not any(map(_is_rewritten, bodies(equation))):
@@ -98,7 +98,7 @@ def _is_rewritten(jaxpr: Jaxpr):
     return [equation.params.get("name") for equation in jaxpr.eqns] == [WITH_WAY_BACK]
 
 
-class _Call:
+class LapackCall:
     """A primitive with its parameters; equal to another if both are, so that JAX recognises what it has compiled."""
 
     def __init__(self, primitive: Primitive, params: dict):
@@ -106,7 +106,7 @@ class _Call:
         self._key = primitive, tuple(sorted(params.items(), key=lambda item: item[0]))
 
     def __eq__(self, other):
-        return isinstance(other, _Call) and self._key == other._key
+        return isinstance(other, LapackCall) and self._key == other._key
 
     def __hash__(self):
         return hash(self._key)

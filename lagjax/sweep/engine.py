@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
@@ -31,18 +32,26 @@ from jaxtyping import Array, PyTree
 from lagjax.display import waiting
 from lagjax.integrate import ENDED_WELL, PATIENCE, RESULTS, Trajectory, reporting, watched
 from lagjax.jaxtools import (
+    NAMING,
     REGULAR_FIRST,
     TOGETHER,
     ClosedJaxpr,
     Jaxpr,
+    KeptProgram,
     Meaning,
+    NotKept,
+    Said,
+    Unusable,
     as_usual,
     bodies,
     content_of,
     is_traced,
     meaning_of,
     one_by_one,
+    outlined,
     program_of,
+    rebuilt,
+    surroundings_for_names,
 )
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.system import Call, check_arguments, in_words
@@ -142,9 +151,11 @@ def _explained(run: Callable, axes: Axes, patience: int | None, robust: bool):
 
 @as_usual
 def traced_point(run: Callable, axes: Axes, patience: int | None, robust: bool) -> tuple[ClosedJaxpr, PyTree]:
-    """What the user's function computes at one point, and the structure in which it does."""
+    """What the user's function computes at one point, with its motions by their names, and the structure in which it
+    does."""
     shaped = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in axes.arrays]
-    with _explained(run, axes, patience, robust):
+    here = surroundings_for_names()
+    with NAMING(here), _explained(run, axes, patience, robust):
         return watched(run, dict(zip(axes.names, shaped)))
 
 
@@ -157,17 +168,20 @@ def compiled(
     layout: str,
     patience: int | None,
     robust: bool,
+    point: tuple[Meaning, PyTree],
 ) -> Program:
-    """Compile a sweep's program for chunks of some length, split between the devices.
+    """Compile a sweep's program for chunks of some length, split between the devices; or find one that is kept.
 
-    Only the names, shapes and dtypes of the axes matter. Motions are given up after `patience` steps, if given. Unless
-    `robust`, motions are assumed to be regular.
+    Only the names, shapes and dtypes of the axes matter, and the meaning and the structure of one `point`. Motions are
+    given up after `patience` steps, if given. Unless `robust`, motions are assumed to be regular.
     """
-    point = point_of(run)
+    meaning, structure = point
+    at_point = point_of(run)
+    given = {"values": jtu.tree_unflatten(structure, range(structure.num_leaves))}
 
     def lanes(values: tuple):
         def at(values: tuple):
-            return point(dict(zip(axes.names, values)))
+            return at_point(dict(zip(axes.names, values)))
 
         return jax.lax.map(at, values) if layout == "map" else jax.vmap(at)(values)
 
@@ -176,21 +190,45 @@ def compiled(
         mesh, split = Mesh(np.asarray(devices), ("lanes",)), PartitionSpec("lanes")
         function = jax.shard_map(lanes, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
         sharding = NamedSharding(mesh, split)
-    shaped = tuple(jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays)
-    with _explained(run, axes, patience, robust):
-        traced = jax.jit(one_by_one(function)).trace(shaped)
-    shapes, _, settled = traced.out_info
-    program = traced.lower().compile()
-    memory = program.memory_analysis()
+    shaped = [jax.ShapeDtypeStruct((chunk, *x.shape[1:]), x.dtype, sharding=sharding) for x in axes.arrays]
+
+    def of_arrays(arrays: list):
+        with _explained(run, axes, patience, robust):
+            return one_by_one(function)(tuple(arrays))
+
+    def meant():
+        if len(devices) > 1 or devices[0] != jax.devices()[0]:
+            raise NotKept("it runs on another device than the first, or on several")
+        return [(meaning, True), ((__name__, axes.names, layout, patience, robust), False)]
+
+    program = KeptProgram(
+        of_arrays,
+        Said(
+            meant,
+            lambda results: outlined(results, given),
+            lambda outline, arrays: rebuilt(outline, given),
+            lambda jaxpr: {"digest": digest(_text(jaxpr).encode())},
+        ),
+        None,
+    )
+    ready = program.ready_for(shaped)
+    memory = ready.compiled.memory_analysis()
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
 
     @as_usual
     def call(point: dict[str, np.ndarray], count: int):
-        return jax.tree.map(lambda x: np.asarray(x)[:count], program(tuple(point.values())))
+        nonlocal ready
+        arrays = list(point.values())
+        try:
+            found = ready.call(arrays)
+        except Unusable:
+            ready = program.made_for(shaped)
+            found = ready.call(arrays)
+        return jtu.tree_unflatten(ready.structure, [np.asarray(x)[:count] for x in found])
 
-    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes)
-    identity = digest(_text(traced.jaxpr).encode())
-    return Program(call, chunk, one, working, identity, threading.Event(), settled is not None)
+    outputs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in ready.outputs]
+    values, _, settled = jtu.tree_unflatten(ready.structure, outputs)
+    return Program(call, chunk, values, working, ready.facts["digest"], threading.Event(), settled is not None)
 
 
 def program_for(
@@ -210,7 +248,7 @@ def program_for(
         nonlocal seconds
         started = time.perf_counter()
         with waiting(progress, "compiling"):
-            program = compiled(run, axes, chunk, devices, layout, patience, robust)
+            program = compiled(run, axes, chunk, devices, layout, patience, robust, (meaning, structure))
         seconds = time.perf_counter() - started
         return program
 

@@ -1,31 +1,24 @@
-"""What a store says of itself, from which the metadata of all of its arrays follow; and the files of its arrays.
+"""What a store says of itself, from which the metadata of all of its arrays follow.
 
 The description stands in the attributes of the group `lagjax`, with a digest: the fingerprint of the sweep, its blocks,
-and the places of its arrays. What zarr and xarray need, a `zarr.json` for each array, is made from it and read by them
-only; a sweep that continues writes it again where it is damaged. A store is made under a temporary name and then
-renamed, so that several processes may open it at the same time. The fingerprint, of axes, values, program and versions,
-is what two runs must share to use one store.
+and the places of its arrays. What zarr and xarray need, a `zarr.json` for each array, zarr makes from it; lagjax reads
+none of them, and a sweep that continues writes them again where they are damaged. Of several processes that begin a
+store at the same time one writes the description, last of all: there the store begins, for all of them. The
+fingerprint, of axes, values, program and versions, is what two runs must share to use one store.
 
 A store may come from anyone, and opening it writes nothing:
 
 - it consists of folders and files, without links, and its names stay inside of it;
 - every shape follows from those of the axes, so that no other number decides how much memory is taken; and arrays that
   would need far more memory than the files hold are not read.
-
-**The files of its arrays**, one for each block: numbers, compressed by zstd, then their checksum (crc32c). They are
-those that zarr writes and reads. A file may come from anyone: no more bytes are made of one than its block has numbers
-for.
 """
 
 import json
 import math
-import os
 import re
-import shutil
-import uuid
 from collections.abc import Iterable
 from importlib.metadata import version
-from pathlib import Path, PureWindowsPath
+from pathlib import PureWindowsPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,147 +28,7 @@ from lagjax.files import MALFORMED, Explained, parsed
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.engine import NOT_RUN, STATUS_TYPES, Program, Status, digest, nothing
 from lagjax.sweep.labels import STORE_GROUP, labels_of, named_leaves, status_attributes
-
-# The length of a checksum in bytes.
-CHECKSUM = 4
-NEEDS_ZARR = 'stores need zarr, which is an optional extra.\nFix: pip install "lagjax[data]", or leave store out.'
-# The exceptions for files that are missing or damaged.
-UNREADABLE = (ValueError, RuntimeError, TypeError, OSError)
-# The first bytes of a zstd frame, and the lengths of the fields after them.
-ZSTD, DICTIONARY, CONTENT = b"\x28\xb5\x2f\xfd", (0, 1, 2, 4), (0, 2, 4, 8)
-
-
-class Spec(NamedTuple):
-    """How an array lies in its files: in chunks of one shape, compressed or not, in the order of their bytes."""
-
-    shape: tuple[int, ...]
-    chunk: tuple[int, ...]
-    dtype: np.dtype
-    fill: float
-    dims: list[str] | None
-    compressed: bool = True
-
-    @property
-    def bytes(self) -> int:
-        """The bytes of the whole array."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    @property
-    def chunk_bytes(self) -> int:
-        """The bytes of one chunk, before it is compressed."""
-        return math.prod(self.chunk) * self.dtype.itemsize
-
-    def metadata(self, attributes: dict[str, Any]) -> dict[str, Any]:
-        """What zarr 3 says of such an array in its `zarr.json`."""
-        fill = "NaN" if self.fill != self.fill else self.dtype.type(self.fill).item()
-        order = {} if self.dtype.itemsize == 1 else {"configuration": {"endian": "little"}}
-        zstd = [{"name": "zstd", "configuration": {"level": 0, "checksum": False}}] if self.compressed else []
-        return {
-            "zarr_format": 3,
-            "node_type": "array",
-            "shape": list(self.shape),
-            "data_type": str(self.dtype),
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunk)}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": [fill, 0.0] if self.dtype.kind == "c" else fill,
-            "codecs": [{"name": "bytes"} | order, *zstd, {"name": "crc32c"}],
-            "attributes": attributes,
-            **({} if self.dims is None else {"dimension_names": self.dims}),
-            "storage_transformers": [],
-        }
-
-
-def chunk_file(folder: Path, spec: Spec, place: tuple[int, ...] = ()) -> Path | None:
-    """The file of a chunk, the first along the dimensions that `place` does not name; None for an empty array."""
-    inner = "0" * (len(spec.shape) - len(place))
-    return None if math.prod(spec.shape) == 0 else folder.joinpath("c", *map(str, place), *inner)
-
-
-def read_bytes(file: Path, spec: Spec) -> bytes:
-    """The bytes of one file, which are those of its chunk, compressed.
-
-    **Raises:** one of `UNREADABLE` if there is no such file, or it holds anything else.
-    """
-    with open(file, "rb") as content:
-        # Numbers that cannot be compressed take little more than they are.
-        if os.fstat(content.fileno()).st_size > spec.chunk_bytes + spec.chunk_bytes // 64 + 1024:
-            raise ValueError(f"{file} is longer than its numbers.")
-        data = content.read()
-    body = data[:-CHECKSUM]
-    if checksum_of(body) != as_number(data[-CHECKSUM:]):
-        raise ValueError(f"{file} is not as it was written.")
-    if (content_size(body) if spec.compressed else len(body)) != spec.chunk_bytes:
-        raise ValueError(f"{file} does not hold {spec.chunk_bytes:,} bytes.")
-    return body
-
-
-def read_chunk(file: Path | None, spec: Spec) -> np.ndarray:
-    """The numbers of one file, in the shape of a chunk; zeros for an empty array (None).
-
-    **Raises:** as `read_bytes`.
-    """
-    if file is None:
-        return np.zeros(spec.chunk, spec.dtype)
-    data = read_bytes(file, spec)
-    body = np.empty(spec.chunk_bytes, np.uint8) if spec.compressed else np.frombuffer(data, np.uint8)
-    if spec.compressed:
-        _zstd().decode(data, out=body)
-    if spec.dtype.kind == "b" and body.max(initial=0) > 1:
-        raise ValueError(f"{file} has truth values that are neither true nor false.")
-    return body.view(spec.dtype.newbyteorder("<")).reshape(spec.chunk)
-
-
-def write_chunk(file: Path | None, spec: Spec, x: np.ndarray) -> tuple[int, int]:
-    """Write the numbers of one file, (n, ...) up to the shape of a chunk; returns its length and its checksum.
-
-    There is no file (None), of length 0, for an empty array.
-    """
-    if file is None:
-        return 0, 0
-    whole = np.zeros(spec.chunk, spec.dtype.newbyteorder("<"))
-    whole[tuple(map(slice, x.shape))] = x
-    body = bytes(_zstd().encode(whole)) if spec.compressed else whole.tobytes()
-    checksum = checksum_of(body)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f"{file.name}.{uuid.uuid4().hex[:8]}.partial")
-    partial.write_bytes(body + checksum.to_bytes(CHECKSUM, "little"))
-    partial.replace(file)
-    return len(body) + CHECKSUM, checksum
-
-
-def content_size(frame: bytes) -> int | None:
-    """How many bytes a zstd frame says that it holds; None if it does not say it (RFC 8878, 3.1.1.1)."""
-    if frame[:4] != ZSTD or len(frame) < 5:
-        return None
-    single, length = frame[4] >> 5 & 1, CONTENT[frame[4] >> 6]
-    length = 1 if single and length == 0 else length
-    start = 5 + (1 - single) + DICTIONARY[frame[4] & 3]
-    return as_number(frame[start : start + length]) + (256 if length == 2 else 0) if length else None
-
-
-def as_number(data: bytes) -> int:
-    """Bytes as a number, the lowest first."""
-    return int.from_bytes(data, "little")
-
-
-def checksum_of(data: bytes) -> int:
-    """The checksum of some bytes."""
-    try:
-        # A dependency of zarr, which uses it for the same checksums.
-        from google_crc32c import value
-    except ImportError as error:
-        raise ImportError(NEEDS_ZARR) from error
-    return value(data)
-
-
-def _zstd():
-    try:
-        # A dependency of zarr, which compresses with it.
-        from numcodecs.zstd import Zstd
-    except ImportError as error:
-        raise ImportError(NEEDS_ZARR) from error
-    return Zstd(level=0)
-
+from lagjax.sweep.objects import Coder, Files, Spec, consolidated, needed
 
 META = "zarr.json"
 # Stores of other formats are not read.
@@ -184,7 +37,7 @@ ANOTHER_FUNCTION = "run is another function"
 # Names reserved by zarr or by a store.
 RESERVED = ("", ".", "..", META, STORE_GROUP)
 MARKS = f"{STORE_GROUP}/marks"
-GROUP = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+DESCRIPTION = f"{STORE_GROUP}/{META}"
 # Arrays of a store hold truth values and numbers, in the names of zarr and NumPy.
 NUMBERS = "bool int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 float32 float64 complex64 complex128".split()
 # A file of metadata has at most this many bytes.
@@ -260,28 +113,37 @@ class Described(NamedTuple):
     blocks: Blocks
 
 
-def description_at(path: Path) -> tuple[dict[str, Any], Described]:
-    """The description of a store, and what it says.
+def is_begun(sizes: dict[str, int]) -> bool:
+    """Whether there is a store, or anything else, among these files; not what a process left that began one."""
+    of_marks = [name for name in sizes if name.startswith(f"{MARKS}/")]
+    return bool(sizes) and (DESCRIPTION in sizes or of_marks != [f"{MARKS}/{META}"])
+
+
+def description_at(files: Files, sizes: dict[str, int]) -> tuple[dict[str, Any], Described]:
+    """The description of a store, and what it says; `sizes` are those of its files.
 
     **Raises:** `ValueError` if there is no such store, or its description is damaged or not as lagjax writes it.
     """
-    if not path.exists():
-        raise ValueError(f"there is no {path}.\nFix: the path that was passed to lj.sweep as store=.")
-    file = path / STORE_GROUP / META
-    if not file.exists() and not (path / MARKS).exists():
+    place = files.place
+    if not sizes:
+        raise ValueError(f"there is no {place}.\nFix: the path that was passed to lj.sweep as store=.")
+    if DESCRIPTION not in sizes and not any(name.startswith(f"{MARKS}/") for name in sizes):
         raise ValueError(
-            f"{path} exists, but is not the store of a sweep that this version reads.\n"
+            f"{place} exists, but is not the store of a sweep that this version reads.\n"
             "Usual cause: another folder; or a store of lagjax 0.1.\n"
             "Fix: another path, or remove it if it is not needed."
         )
     try:
-        description = _read_metadata(file)["attributes"]["lagjax"]
+        if sizes[DESCRIPTION] > MOST_METADATA:
+            raise ValueError("it is too long.")
+        content = files.read([DESCRIPTION])[DESCRIPTION]
+        description = parsed(content, MOST_METADATA)["attributes"]["lagjax"]
         _require(description["digest"] == digest_of(description), "its digest is that of another")
     except (OSError, ValueError, *MALFORMED) as error:
         raise ValueError(
-            f"{file} is damaged: the sweep of this store is unknown.\n"
+            f"{files.at(DESCRIPTION)} is damaged: the sweep of this store is unknown.\n"
             "Usual cause: a copy that was cut short, or a disk that failed.\n"
-            f"Fix: copy that file again from the original; or remove {path} and compute it again."
+            f"Fix: copy that file again from the original; or remove {place} and compute it again."
         ) from error
     try:
         number = description["fingerprint"]["format"]
@@ -298,7 +160,7 @@ def description_at(path: Path) -> tuple[dict[str, Any], Described]:
         return description, checked(description)
     except (ValueError, *MALFORMED) as error:
         why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {printable(error)[:200]}"
-        raise ValueError(by_line(f"{path} cannot be read: {why}")) from error
+        raise ValueError(by_line(f"{place} cannot be read: {why}")) from error
 
 
 def digest_of(description: dict) -> str:
@@ -384,42 +246,19 @@ def _require(holds: bool, otherwise: str) -> None:
         raise ValueError(f"{otherwise}.")
 
 
-def check_files(path: Path) -> int:
-    """The bytes of all files in a store.
-
-    **Raises:** `ValueError` for a link, or anything else that is neither a folder nor a file.
-    """
-    folders, size = [path], 0
-    while folders:
-        with os.scandir(folders.pop()) as entries:
-            for entry in entries:
-                if entry.is_dir(follow_symlinks=False):
-                    folders.append(Path(entry.path))
-                elif entry.is_file(follow_symlinks=False):
-                    size += entry.stat(follow_symlinks=False).st_size
-                else:
-                    what = "a link" if entry.is_symlink() else "not a file"
-                    raise Explained(
-                        f"{entry.path!r} is {what}, and a store has only files of its own.\n"
-                        "Usual cause: a copy made of links; or a store that was changed.\n"
-                        "Fix: copy the files themselves (cp -rL), if you trust what they link to."
-                    )
-    return size
-
-
-def check_room(path: Path, described: Described, size: int) -> None:
+def check_room(place: object, described: Described, size: int) -> None:
     """Raise `ValueError` if the arrays need far more memory than the files of a store, `size` bytes, can hold."""
     needed = sum(spec.bytes for spec in described.arrays.values())
     if needed > MOST_BYTES and needed > MOST_EXPANSION * size:
         raise Explained(
-            f"the arrays of {path} need {needed / 1e9:.3g} GB, and its files have {size / 1e9:.3g} GB.\n"
+            f"the arrays of {place} need {needed / 1e9:.3g} GB, and its files have {size / 1e9:.3g} GB.\n"
             "Usual cause: a sweep of which hardly anything has been computed; or a store that was changed.\n"
             "Fix: lj.sweep(run, axes, store=path), which computes what is missing."
         )
 
 
 def create(
-    path: Path,
+    files: Files,
     axes: Axes,
     program: Program,
     fingerprint: dict,
@@ -427,42 +266,34 @@ def create(
     times: dict[str, np.ndarray],
     structure: dict | None,
 ) -> None:
-    """Make a store; if another process was first, its store is kept. A failure leaves nothing behind.
+    """Make a store; if another process was first, its description is kept.
 
     `times`: the times of trajectories that all points share, by leaf. `structure`: the description of the values
     (`structures`).
     """
-    made = [folder for folder in (path.parent, *path.parent.parents) if not folder.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        description = {"fingerprint": fingerprint, "block": blocks.block, "names": list(axes.values)}
-        description |= {"paired": axes.paired, "structure": structure} | _places(axes, program, times)
-        description = json.loads(json.dumps(description))
-        description["digest"] = digest_of(description)
-        arrays, texts = checked(description).arrays, _metadata_of(description)
-        if max(map(len, texts.values())) > MOST_METADATA:
-            raise ValueError(
-                f"run returns {len(fingerprint['values']):,} arrays, whose description is longer than a store's may be."
-                "\nFix: return fewer and larger arrays."
-            )
-        temporary.mkdir()
-        for name, text in texts.items():
-            _write(temporary / name / META, text)
-        whole = {description["places"]["axes"][name]: x for name, x in axes.values.items()}
-        whole |= {place: times[key] for place, key in description["times"].items()}
-        for place, x in whole.items():
-            write_chunk(chunk_file(temporary / place, arrays[place]), arrays[place], x)
-        os.rename(temporary, path)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        # Another process was first; the caller checks next whether its store belongs to this sweep.
-        if path.exists() and isinstance(error, Exception):
-            return
-        for folder in made:
-            if folder.exists() and not any(folder.iterdir()):
-                folder.rmdir()
-        raise
+    description = {"fingerprint": fingerprint, "block": blocks.block, "names": list(axes.values)}
+    description |= {"paired": axes.paired, "structure": structure} | _places(axes, program, times)
+    description = json.loads(json.dumps(description))
+    description["digest"] = digest_of(description)
+    arrays, texts = checked(description).arrays, metadata_of(description)
+    if max(map(len, texts.values())) > MOST_METADATA:
+        raise ValueError(
+            f"run returns {len(fingerprint['values']):,} arrays, whose description is longer than a store's may be."
+            "\nFix: return fewer and larger arrays."
+        )
+    whole = {description["places"]["axes"][name]: x for name, x in axes.values.items()}
+    whole |= {place: times[key] for place, key in description["times"].items()}
+    begun = texts.pop(DESCRIPTION)
+    # First what tells it from the folder of anything else (`is_begun`).
+    files.write({f"{MARKS}/{META}": texts.pop(f"{MARKS}/{META}")})
+    files.write(texts | axis_files(arrays, whole))
+    files.write_once(DESCRIPTION, begun)
+
+
+def axis_files(arrays: dict[str, Spec], whole: dict[str, np.ndarray]) -> dict[str, bytes]:
+    """The files of arrays of one chunk each, given by the places of the arrays."""
+    given = {place: (arrays[place], x) for place, x in whole.items() if arrays[place].key()}
+    return {f"{place}/{spec.key()}": Coder(spec).encoded((0,) * x.ndim, x) for place, (spec, x) in given.items()}
 
 
 def _places(axes: Axes, program: Program, times: dict[str, np.ndarray]):
@@ -495,35 +326,41 @@ def _hidden_name(key: str, taken: Iterable[str]):
     return name
 
 
-def _metadata_of(description: dict[str, Any]):
-    """The text of the `zarr.json` of every group and array of a store, by place."""
+def metadata_of(description: dict[str, Any]) -> dict[str, bytes]:
+    """The `zarr.json` of every group and array of a store, by their names, as zarr makes them."""
     status = {place: status_attributes(name) for name, place in description["places"]["status"].items()}
-    arrays = {place: spec.metadata(status.get(place, {})) for place, spec in checked(description).arrays.items()}
+    arrays, zarr, files = checked(description).arrays, needed(), {}
     # Of the axes, xarray knows as coordinates those that are named like their dimension.
     axes, dims = description["places"]["axes"].values(), description["dims"]
     attributes = {"about": "a sweep, which lagjax.open_sweep reads with its checksums"}
     if others := [place for place in axes if dims[place] != [place]]:
         attributes["coordinates"] = " ".join(others)
+    store = zarr.storage.MemoryStore(files)
+    zarr.create_group(store, attributes=attributes)
+    hidden = {place: spec for place, spec in arrays.items() if place.startswith(f"{STORE_GROUP}/")}
+    for place, spec in arrays.items():
+        if place not in hidden:
+            spec.made(files, place, status.get(place))
     # xarray reads these instead of the metadata of each array.
-    shown = {place: x for place, x in arrays.items() if not place.startswith(f"{STORE_GROUP}/")}
-    consolidated = {"kind": "inline", "must_understand": False, "metadata": shown}
-    groups = {"": GROUP | {"attributes": attributes, "consolidated_metadata": consolidated}}
-    groups[STORE_GROUP] = GROUP | {"attributes": {"lagjax": description}}
-    groups[f"{STORE_GROUP}/values"] = GROUP
-    return {place: json.dumps(x, indent=2) for place, x in (groups | arrays).items()}
+    consolidated(files)
+    zarr.create_group(store, path=STORE_GROUP, attributes={"lagjax": description})
+    zarr.create_group(store, path=f"{STORE_GROUP}/values")
+    for place, spec in hidden.items():
+        spec.made(files, place)
+    return {name: content.to_bytes() for name, content in files.items()}
 
 
-def damaged(path: Path, description: dict[str, Any]) -> dict[str, str]:
-    """The places in a store whose `zarr.json` is damaged or missing, each with a line about it."""
+def damaged(files: Files, sizes: dict[str, int], texts: dict[str, bytes]) -> dict[str, str]:
+    """The names of the `zarr.json` in a store that are damaged or missing, each with a line about it."""
+    contents = files.read(name for name in texts if name in sizes and sizes[name] <= MOST_METADATA)
     found = {}
-    for place, text in _metadata_of(description).items():
-        file = path / place / META
+    for name, text in texts.items():
         try:
-            intact = place == STORE_GROUP or _holds(_read_metadata(file), json.loads(text))
-        except (OSError, ValueError, *MALFORMED):
+            intact = name == DESCRIPTION or _holds(parsed(contents[name], MOST_METADATA), json.loads(text))
+        except (ValueError, *MALFORMED):
             intact = False
         if not intact:
-            found[place] = f"{file} was {'damaged' if file.exists() else 'missing'}"
+            found[name] = f"{files.at(name)} was {'damaged' if name in sizes else 'missing'}"
     return found
 
 
@@ -534,36 +371,15 @@ def _holds(found: Any, expected: Any):
     return all(key == "attributes" or _holds(found[key], x) for key, x in expected.items())
 
 
-def restore(path: Path, description: dict[str, Any]) -> list[str]:
+def restore(files: Files, sizes: dict[str, int], texts: dict[str, bytes]) -> list[str]:
     """Write each `zarr.json` again that is damaged or missing; returns a line about each.
 
     **Raises:** `ValueError` if they cannot be written.
     """
-    found, texts = damaged(path, description), _metadata_of(description)
-    for place, line in found.items():
+    found = damaged(files, sizes, texts)
+    for name, line in found.items():
         try:
-            _write(path / place / META, texts[place])
+            files.write({name: texts[name]})
         except OSError as error:
             raise ValueError(f"{line}, and cannot be restored: {error.strerror}.") from error
     return list(found.values())
-
-
-def _read_metadata(file: Path):
-    if file.stat().st_size > MOST_METADATA:
-        raise ValueError(f"{file} is longer than {MOST_METADATA:,} bytes.")
-    return parsed(file.read_bytes(), MOST_METADATA)
-
-
-def _write(file: Path, text: str):
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(f".{uuid.uuid4().hex[:8]}.partial")
-    partial.write_text(text)
-    partial.replace(file)
-
-
-def remove_leftovers(path: Path) -> None:
-    """Remove the temporary folders of processes that were killed while they made this store."""
-    leftover = re.compile(re.escape(f".{path.name}.") + "[0-9a-f]{8}")
-    for other in path.parent.iterdir():
-        if leftover.fullmatch(other.name):
-            shutil.rmtree(other, ignore_errors=True)

@@ -25,8 +25,9 @@ from lagjax.sweep import store as structure
 from lagjax.sweep.axes import POINT, Axes
 from lagjax.sweep.engine import LOST, NOT_RUN, TRUSTED, Status, is_motion, nothing
 from lagjax.sweep.labels import key_of, motions_in, named_leaves, with_path, words_of
-from lagjax.sweep.metadata import damaged, versions
+from lagjax.sweep.metadata import damaged, metadata_of, versions
 from lagjax.sweep.metadata import in_words as versions_in_words
+from lagjax.sweep.objects import Files
 from lagjax.sweep.store import Store, warn_of_damage
 from lagjax.system import Call, check_arguments, coordinates
 
@@ -521,7 +522,7 @@ def open_sweep(
     ...     print(open_sweep(folder + "/squares").counts())
     {'successful': 2}
 
-    **Arguments:** `path`: the folder that was passed to `lj.sweep` as `store`. Functions are not stored, so a
+    **Arguments:** `path`: the folder or URL that was passed to `lj.sweep` as `store`. Functions are not stored, so a
     trajectory does not know its system. It can be plotted and animated all the same. For methods that need the system
     (`print`, `drift()`), pass `system`, the one that was integrated, or `run`, the function that was swept; `run` is
     only traced, not run. `classes`: your own classes among the values, named tuples and dataclasses: `classes=[Pair]`.
@@ -532,9 +533,9 @@ def open_sweep(
     earlier format, or `run` returns another structure. `values` is a dictionary by name for values that contain
     functions, or objects of classes that were not passed (which a warning names).
     """
-    path, table = Path(path), Table(classes)
-    store = Store(path)
-    if wrong := damaged(path, store.about):
+    files, table = Files(path), Table(classes)
+    store, path = Store(files), files.place
+    if wrong := damaged(files, files.sizes(), metadata_of(store.about)):
         warn_of_damage(path, wrong.values(), "It is read all the same. " + RESTORED, stacklevel=2)
     axes, (status, missing, lost) = store.axes(), store.status()
     if lost:
@@ -568,17 +569,18 @@ def of_store(swept: Sweep, run: Callable | None, indices: np.ndarray):
 class Stored:
     """The values of a store, read on access; `like` has the shapes of one point. A pickle holds only the path."""
 
-    def __init__(self, store: Store | Path, like: PyTree = None):
+    def __init__(self, store: Store | Path | str, like: PyTree = None):
         self._store, self._like = store, like
 
     def __reduce__(self):
-        return Stored, (Path(os.path.abspath(self.store.path)),)
+        place = self.store.place
+        return Stored, (place if isinstance(place, str) else Path(os.path.abspath(place)),)
 
     @property
     def store(self) -> Store:
         """The store, opened on first access."""
-        if isinstance(self._store, Path):
-            self._store = Store(self._store)
+        if not isinstance(self._store, Store):
+            self._store = Store(Files(self._store))
         return self._store
 
     @property
@@ -598,7 +600,7 @@ class Stored:
             new += [] if known[here].all() else [wrong]
             where[here] = True
         if new:
-            warn_of_damage(self.store.path, new, COMPUTED_AGAIN, stacklevel=3)
+            warn_of_damage(self.store.place, new, COMPUTED_AGAIN, stacklevel=3)
         for x in jax.tree.leaves(values):
             x[where] = nothing(x.dtype)
         return values, where

@@ -9,12 +9,12 @@ A block is a box of the grid with consecutive flat indices (`axes`). A block tha
 if parts of it were written. Zarr reads a missing file as a block of fill values, so the marks must record which files
 belong there. Files are compared with their marks in two ways:
 
-- a quick check, whenever a store is opened: each file exists, has its length and ends with its checksum. It reads 4
-  bytes per file, and detects files that are missing, cut off, or of another block;
+- a quick check, whenever a store is opened: each file exists and has its length, by a listing of all files;
 - a full check when a sweep continues, of this process's part: each file is read and its checksum (crc32c) computed.
 
-Any other damage is detected when values are read. Files are read and written without zarr, and nothing outside of the
-store is, whatever its description says (`metadata`); opening a store writes nothing.
+Any other damage is detected when values are read. Zarr makes the bytes of blocks and reads them (`objects`), and
+nothing outside of the store is read or written, whatever its description says (`metadata`); opening a store writes
+nothing.
 
 Needs zarr (`pip install "lagjax[data]"`). A transactional store made for object stores (icechunk 1.1) was tried: of 64
 blocks that 8 processes had committed on a file system, 16 were lost, as its documentation warns.
@@ -26,16 +26,14 @@ cannot be described in JSON, have no such description: they are read as a dictio
 
 import base64
 import math
-import os
 import warnings
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import PyTree
 
 from lagjax.display import by_line, printable
 from lagjax.files import KINDS_OF_ARRAY, MALFORMED, NotWritable, Reader, Table, Writer
@@ -48,49 +46,65 @@ from lagjax.integrate import (
     trajectory_from,
 )
 from lagjax.sweep.axes import Axes, Blocks
-from lagjax.sweep.engine import LOST, NOT_RUN, Program, Status, is_motion, nothing
+from lagjax.sweep.engine import LOST, NOT_RUN, Program, Status, is_motion
 from lagjax.sweep.labels import flags, motions_in, named_leaves, shapes_of
 from lagjax.sweep.metadata import (
     ANOTHER_FUNCTION,
-    CHECKSUM,
     MARKS,
-    UNREADABLE,
-    Spec,
-    as_number,
-    check_files,
+    axis_files,
     check_room,
-    chunk_file,
+    checked,
     create,
     description_at,
     differences,
     fingerprint,
+    is_begun,
+    metadata_of,
     of_axis,
-    read_bytes,
-    read_chunk,
-    remove_leftovers,
     restore,
-    write_chunk,
 )
+from lagjax.sweep.objects import CHECKSUM, Coder, Files, Spec, ending, most_of, wrong_with
 from lagjax.system import UnknownSystem
 
 # The largest number of files that a message names.
 SHOWN = 5
+# The bytes of files that are read together.
+BYTES_TOGETHER = 64e6
+
+
+class Marks(NamedTuple):
+    """What tells which blocks of a store are finished.
+
+    `sizes`: the lengths of all files of the store; `of_files` (blocks, arrays, 2): the length and checksum of each file
+    of a block, 0 if it is not marked; `damaged`: the blocks whose mark is damaged.
+    """
+
+    sizes: dict[str, int]
+    of_files: np.ndarray
+    damaged: list[int]
+
+    @property
+    def marked(self) -> np.ndarray:
+        """Which blocks are marked."""
+        return np.any(self.of_files > 0, axis=(1, 2))
 
 
 class Store:
     """An open store of a sweep.
 
     `of_own_sweep`: the caller knows its axes, which decide how much memory it takes; otherwise arrays far larger than
-    its files are refused.
+    its files are refused. `about`: its description, if that was read before.
     """
 
-    def __init__(self, path: str | os.PathLike, of_own_sweep: bool = False):
-        self.path = Path(path)
-        size = check_files(self.path) if self.path.is_dir() else 0
-        self.about: dict[str, Any]
-        self.about, described = description_at(self.path)
+    def __init__(self, files: Files, of_own_sweep: bool = False, about: dict[str, Any] | None = None):
+        self.files, self.about = files, about or {}
+        sizes = {} if about else files.sizes()
+        if about:
+            described = checked(about)
+        else:
+            self.about, described = description_at(files, sizes)
         if not of_own_sweep:
-            check_room(self.path, described, size)
+            check_room(files.place, described, sum(sizes.values()))
         self._specs, self.blocks = described
         # The array of each leaf of the values, and of each field of the status.
         places = self.about["places"]
@@ -98,6 +112,12 @@ class Store:
         self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
         names = *self._values.values(), *self._status.values()
         self.arrays: dict[str, Spec] = {name: self._specs[name] for name in names}
+        self._coders: dict[str, Coder] = {}
+
+    @property
+    def place(self) -> Any:
+        """Where it is: a path or a URL."""
+        return self.files.place
 
     @property
     def size(self) -> int:
@@ -106,104 +126,109 @@ class Store:
 
     def missing(self) -> np.ndarray:
         """The numbers of the blocks that are not marked."""
-        return self._missing(self._marks()[0])
+        return np.flatnonzero(~self._marks(self.files.sizes()).marked)
 
-    def _marks(self):
-        """(the marks of all blocks, 0 for unmarked ones; the numbers of the blocks whose mark is damaged)."""
-        spec, unreadable = self._specs[MARKS], []
-        found = np.zeros(spec.shape, spec.dtype)
-        for number in range(len(self.blocks)):
-            try:
-                found[number] = read_chunk(self._file(MARKS, number), spec)[0]
-            except FileNotFoundError:
-                pass
-            except UNREADABLE:
-                unreadable.append(number)
-        return found, unreadable
+    def _marks(self, sizes: dict[str, int]):
+        spec, damaged = self._specs[MARKS], []
+        of_files, names = np.zeros(spec.shape, np.uint64), [self._file(MARKS, i) for i in range(len(self.blocks))]
+        contents = self.files.read(name for name in names if 0 < sizes.get(name, 0) <= most_of(spec))
+        for number, name in enumerate(names):
+            if name in sizes and wrong_with(contents.get(name, b""), spec):
+                damaged.append(number)
+            elif name in sizes:
+                of_files[number] = np.frombuffer(contents[name][:-CHECKSUM], "<u8").reshape(spec.chunk[1:])
+        return Marks(sizes, of_files, damaged)
 
-    def _missing(self, marks: np.ndarray):
-        return np.flatnonzero(marks.reshape(len(self.blocks), -1).max(axis=1) == 0)
-
-    def write(self, number: int, values: PyTree, status: Status):
-        """Write a block, and then mark it."""
+    def write(self, number: int, values: PyTree, status: Status) -> np.ndarray:
+        """Write a block, and then mark it; returns the lengths and checksums of its files."""
         shape = tuple(x.stop - x.start for x in self.blocks.region(number))
-        flat = [x for _, x in named_leaves(values)] + list(status)
-        marks = [
-            write_chunk(self._file(name, number), spec, x.reshape(shape + x.shape[1:]))
-            for (name, spec), x in zip(self.arrays.items(), flat)
-        ]
-        self._mark(number, marks)
+        contents, marks = {}, []
+        for name, x in zip(self.arrays, [x for _, x in named_leaves(values)] + list(status)):
+            content = self._coder(name).encoded(self.blocks.place(number), x.reshape(shape + x.shape[1:]))
+            marks.append((len(content), ending(content)))
+            if content:
+                contents[self._file(name, number)] = content
+        self.files.write(contents)
+        return self._mark(number, np.asarray(marks, np.uint64))
 
-    def _mark(self, number: int, marks: ArrayLike):
-        write_chunk(self._file(MARKS, number), self._specs[MARKS], np.asarray([marks], np.uint64))
+    def _mark(self, number: int, marks: np.ndarray):
+        content = self._coder(MARKS).encoded((number, 0, 0), marks[None])
+        self.files.write({self._file(MARKS, number): content})
+        return marks
+
+    def _coder(self, name: str):
+        if name not in self._coders:
+            self._coders[name] = Coder(self._specs[name])
+        return self._coders[name]
 
     def unmark(self, numbers: Iterable[int]):
         """Mark some blocks as not written."""
         for number in numbers:
-            self._mark(number, np.zeros((len(self.arrays), 2)))
+            self._mark(number, np.zeros((len(self.arrays), 2), np.uint64))
 
-    def damage(self, numbers: Iterable[int], read: bool, marks=None) -> dict[int, str]:
+    def damage(self, numbers: Iterable[int], read: bool, marks: "Marks | None" = None) -> dict[int, str]:
         """The damage of some blocks: by the block's number, the file and what is wrong with it.
 
         A quick check, or a full check if `read`. Blocks that are not marked are skipped.
         """
-        marks, unreadable = self._marks() if marks is None else marks
-        found = {}
-        for number in numbers:
-            if number in unreadable:
-                found[number] = f"{self._file(MARKS, number)} is damaged"
-            elif np.any(marks[number]):
-                wrong = next(self._damage(number, marks[number], read), None)
-                if wrong is not None:
-                    found[number] = wrong
-        return found
+        marks, found = self._marks(self.files.sizes()) if marks is None else marks, {}
+        numbers = set(numbers)
+        for number in sorted(numbers & {*marks.damaged}):
+            found[number] = f"{self.files.at(self._file(MARKS, number))} is damaged"
+        for name in self.arrays:
+            for number, _, wrong in self._contents(name, sorted(numbers), marks, read):
+                if wrong:
+                    found.setdefault(number, wrong)
+        return dict(sorted(found.items()))
+
+    def _contents(self, name: str, numbers: Iterable[int], marks: "Marks", read: bool = True):
+        """Yield (number, content, what is wrong) of an array's files in marked blocks; content None without `read`."""
+        spec, which = self._specs[name], [*self.arrays].index(name)
+        there, files = [], {i: self._file(name, i) for i in numbers if marks.of_files[i, which, 0] > 0}
+        for number, file in files.items():
+            length = int(marks.of_files[number, which, 0])
+            if file not in marks.sizes:
+                yield number, None, f"{self.files.at(file)} is missing"
+            elif marks.sizes[file] != length:
+                yield number, None, f"{self.files.at(file)} has {marks.sizes[file]:,} bytes of {length:,}"
+            elif length > most_of(spec):
+                yield number, None, f"{self.files.at(file)} is not as it was written"
+            else:
+                there.append(number)
+        together = max(1, int(BYTES_TOGETHER / most_of(spec)))
+        for start in range(0, len(there) if read else 0, together):
+            some = there[start : start + together]
+            contents = self.files.read(files[i] for i in some)
+            for number in some:
+                content = contents[files[number]]
+                wrong = wrong_with(content, spec)
+                if not wrong and ending(content) != marks.of_files[number, which, 1]:
+                    wrong = "is not as it was written"
+                yield number, content, wrong and f"{self.files.at(files[number])} {wrong}"
+
+    def _file(self, name: str, number: int):
+        """The file of a block; "" for an empty array."""
+        key = self._specs[name].key((number,) if name == MARKS else self.blocks.place(number))
+        return key and f"{name}/{key}"
 
     def first(self) -> int | None:
-        """The number of the first marked block."""
-        missing = set(self.missing().tolist())
-        return next((number for number in range(len(self.blocks)) if number not in missing), None)
+        """The number of the first marked block that is intact."""
+        marks = self._marks(self.files.sizes())
+        there = np.flatnonzero(marks.marked).tolist()
+        return next((number for number in there if not self.damage([number], True, marks)), None)
 
     def read(self, number: int) -> list[np.ndarray]:
         """The values of a block, each (points, ...)."""
-        lead = len(self.blocks.shape)
-        found = [self._block(name, number) for name in self._values.values()]
-        return [x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:]) for x in found]
-
-    def _block(self, name: str, number: int):
-        """The numbers of a block, in the shape of its region."""
-        spec, here = self.arrays[name], self.blocks.region(number)
-        shape = *(x.stop - x.start for x in here), *spec.shape[len(here) :]
-        # Blocks at the end of an axis are filled up to their whole shape.
-        return read_chunk(self._file(name, number), spec)[tuple(map(slice, shape))]
-
-    def _damage(self, number: int, mark: np.ndarray, read: bool):
-        for name, (length, checksum) in zip(self.arrays, mark.tolist()):
-            if length == 0:
-                continue
+        lead, found = len(self.blocks.shape), []
+        shape = tuple(x.stop - x.start for x in self.blocks.region(number))
+        for name in self._values.values():
+            spec = self._specs[name]._replace(shape=self._specs[name].chunk)
             file = self._file(name, number)
-            try:
-                with open(file, "rb") as content:
-                    stored = os.fstat(content.fileno()).st_size
-                    content.seek(max(0, stored - CHECKSUM))
-                    end = as_number(content.read())
-                if stored == length and read:
-                    read_bytes(file, self.arrays[name])
-            except FileNotFoundError:
-                yield f"{file} is missing"
-            except OSError as error:
-                yield f"{file} cannot be read ({error.strerror})"
-            except UNREADABLE:
-                yield f"{file} is not as it was written"
-            else:
-                if stored != length:
-                    yield f"{file} has {stored:,} bytes of {length:,}"
-                elif end != checksum:
-                    yield f"{file} is not as it was written"
-
-    def _file(self, name: str, number: int):
-        """The file of a block; None for an empty array."""
-        place = (number,) if name == MARKS else self.blocks.place(number)
-        return chunk_file(self.path / name, self._specs[name], place)
+            contents = {spec.key(): self.files.read([file])[file]} if file else {}
+            # Blocks at the end of an axis are filled up to their whole shape.
+            x = Coder(spec).decoded(contents)[tuple(map(slice, shape))]
+            found.append(x.reshape(math.prod(shape), *x.shape[lead:]))
+        return found
 
     def axes(self) -> Axes:
         """The axes.
@@ -215,16 +240,16 @@ class Store:
 
     def _axis(self, name: str):
         place = self.about["places"]["axes"][name]
-        folder, spec = self.path / place, self._specs[place]
-        try:
-            x = read_chunk(chunk_file(folder, spec), spec)[tuple(map(slice, spec.shape))]
-        except UNREADABLE:
-            x = None
+        spec, x = self._specs[place], None
+        file = f"{place}/{spec.key()}"
+        content = self.files.read([file])[file]
+        if not wrong_with(content, spec):
+            x = self._coder(place).decoded({spec.key(): content})
         if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
             raise ValueError(
-                f"the values of the axis '{name}' in {folder} are damaged.\n"
+                f"the values of the axis '{name}' in {self.files.at(place)} are damaged.\n"
                 "Usual cause: a file that was lost in a copy.\n"
-                f"Fix: lj.sweep(run, axes, store='{self.path}'), which writes them again."
+                f"Fix: lj.sweep(run, axes, store='{self.place}'), which writes them again."
             )
         return x
 
@@ -236,8 +261,8 @@ class Store:
                 self._axis(name)
             except ValueError:
                 place = self.about["places"]["axes"][name]
-                write_chunk(chunk_file(self.path / place, self._specs[place]), self._specs[place], x)
-                damaged.append(f"{self.path / place} was damaged")
+                self.files.write(axis_files(self._specs, {place: x}))
+                damaged.append(f"{self.files.at(place)} was damaged")
         return damaged
 
     def values(self, like: PyTree = None) -> tuple[Any, dict[int, str]]:
@@ -255,18 +280,21 @@ class Store:
 
         Arrays have nothing in blocks that are unmarked or cannot be read.
         """
-        marks, unreadable = self._marks()
-        missing = set(self._missing(marks).tolist()) - set(unreadable)
-        arrays, lost = {}, self.damage(range(len(self.blocks)), False, (marks, unreadable))
+        marks = self._marks(self.files.sizes())
+        everywhere = range(len(self.blocks))
+        arrays, lost = {}, self.damage(everywhere, False, marks)
         for name, place in places.items():
+            contents = {}
+            for number, content, wrong in self._contents(place, everywhere, marks):
+                if wrong:
+                    lost.setdefault(number, wrong)
+                elif number not in lost:
+                    contents[number] = content
             spec = self.arrays[place]
-            found = np.full(spec.shape, nothing(spec.dtype), spec.dtype)
-            for number in set(range(len(self.blocks))) - missing:
-                try:
-                    found[self.blocks.region(number)] = self._block(place, number)
-                except UNREADABLE:
-                    lost.setdefault(number, f"{self._file(place, number)} is damaged")
+            contents = {spec.key(self.blocks.place(number)): content for number, content in contents.items()}
+            found = self._coder(place).decoded(contents)
             arrays[name] = found.reshape(self.size, *spec.shape[len(self.blocks.shape) :])
+        missing = set(np.flatnonzero(~marks.marked).tolist()) - {*marks.damaged}
         return arrays, missing, lost
 
     def one(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -280,7 +308,7 @@ class Store:
         status = Status(**found)
         if unknown := sorted({*np.unique(status.result).tolist()} - {*flags()["flag_values"]}):
             raise ValueError(
-                f"{self.path} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
+                f"{self.place} has results with the number {unknown[0]}, which this version of lagjax does not know.\n"
                 "Fix: pip install -U lagjax."
             )
         for numbers, code in ((missing, NOT_RUN), (lost, LOST)):
@@ -295,24 +323,25 @@ def indented(lines: Iterable[str]) -> str:
     return "".join(f"    {line}\n" for line in lines)
 
 
-def warn_of_damage(path: Path, wrong: Iterable[str], then: str, stacklevel: int):
+def warn_of_damage(place: object, wrong: Iterable[str], then: str, stacklevel: int):
     """Warn of damage in a store."""
     wrong = list(wrong)
     more = [f"and {len(wrong) - SHOWN:,} more"] if len(wrong) > SHOWN else []
     warnings.warn(
-        f"the store {path} is damaged or incomplete:\n{indented([*wrong[:SHOWN], *more])}"
+        f"the store {place} is damaged or incomplete:\n{indented([*wrong[:SHOWN], *more])}"
         "Usual cause: a copy that was cut short, files removed, a disk or its network that failed.\n" + then,
         stacklevel=stacklevel + 1,
     )
 
 
-def chunk_of(path: str | os.PathLike) -> int:
-    """The chunk length that a store was begun with."""
-    return description_at(Path(path))[0]["fingerprint"]["chunk"]
+def chunk_of(files: Files) -> int | None:
+    """The chunk length that a store was begun with; None if there is none."""
+    sizes = files.sizes()
+    return description_at(files, sizes)[0]["fingerprint"]["chunk"] if is_begun(sizes) else None
 
 
 def open_store(
-    path: Path,
+    files: Files,
     axes: Axes,
     program: Program,
     layout: str,
@@ -325,37 +354,36 @@ def open_store(
     `new_store()`: the blocks of a new store, the times of trajectories that all points share, the structure of values.
     Damage causes a warning; metadata and axes are restored, and damaged blocks of this part are marked as missing.
     """
-    wanted = fingerprint(axes, program, layout)
-    if not path.exists():
-        create(path, axes, program, wanted, *new_store())
-    store = Store(path, of_own_sweep=True)
-    _check_belongs(path, store.about["fingerprint"], wanted, accept)
-    remove_leftovers(path)
-    wrong = restore(path, store.about)
+    wanted, place = fingerprint(axes, program, layout), files.place
+    if not is_begun(files.sizes()):
+        create(files, axes, program, wanted, *new_store())
+    store = Store(files, of_own_sweep=True)
+    _check_belongs(place, store.about["fingerprint"], wanted, accept)
+    wrong = restore(files, files.sizes(), metadata_of(store.about))
     wrong += store.write_axes(axes)
     lost = store.damage(range(part[0], len(store.blocks), part[1]), read=True)
     if wrong or lost:
         recomputed = f"Blocks that are computed again: {len(lost):,} of {len(store.blocks):,}"
         outcome = recomputed if lost else "It has been restored"
-        warn_of_damage(path, [*wrong, *lost.values()], f"{outcome}; nothing needs to be done.", stacklevel=4)
+        warn_of_damage(place, [*wrong, *lost.values()], f"{outcome}; nothing needs to be done.", stacklevel=4)
     store.unmark(lost)
     return store
 
 
-def _check_belongs(path: Path, stored: dict, here: dict, accept: bool):
+def _check_belongs(place: object, stored: dict, here: dict, accept: bool):
     found = differences(stored, here)
     older = [line for line in found if line.startswith(("versions", "format"))]
     # Other versions may trace another program from the same function.
     other = [line for line in found if line not in older and not (older and line == ANOTHER_FUNCTION)]
     if other:
         raise ValueError(
-            f"{path} belongs to another sweep, and is left unchanged:\n{indented(found)}"
+            f"{place} belongs to another sweep, and is left unchanged:\n{indented(found)}"
             "Usual cause: run, the axes or a setting has changed since it was begun.\n"
             "Fix: another path; or undo the differences, to continue this one."
         )
     if older and not accept:
         raise ValueError(
-            f"{path} was written by other versions, and is left unchanged:\n{indented(older)}"
+            f"{place} was written by other versions, and is left unchanged:\n{indented(older)}"
             "Its contents can be read: lj.open_sweep(path).\n"
             "Fix: lj.sweep(..., accept_versions=True) continues it if run is still the same function, which "
             "cannot be checked across versions; or another path."
@@ -442,14 +470,14 @@ def as_stored(store: Store, system: Any, table: Table) -> PyTree:
     description = store.about.get("structure")
     if system is not None and (not isinstance(description, dict) or not description.get("trajectories")):
         raise ValueError(
-            f"{store.path} has no trajectories that need a system.\n"
+            f"{store.place} has no trajectories that need a system.\n"
             "Usual cause: run returned numbers.\nFix: leave system out, or pass run=."
         )
     one = store.one()
     if description is None:
         return one
     try:
-        tree = tree_of(description, system, store.path, table)
+        tree = tree_of(description, system, store.place, table)
         # A store also has the arrays of a system, which is not known here.
         if not {name for name, _ in named_leaves(tree)} <= {*one}:
             raise ValueError("its structure has other values than its arrays.")
@@ -457,7 +485,7 @@ def as_stored(store: Store, system: Any, table: Table) -> PyTree:
         if system is not None:
             raise
         warnings.warn(
-            by_line(f"the values of {store.path} are a dictionary by name: {error}")
+            by_line(f"the values of {store.place} are a dictionary by name: {error}")
             + "\nIn any case: lj.open_sweep(path, run=run), with the function that was swept.",
             stacklevel=3,
         )
@@ -475,7 +503,7 @@ def as_run_returns(run: Callable, axes: Axes, store: Store) -> PyTree:
     stored, here = shapes_of(store.one(), 0), shapes_of(like, 0)
     if stored != here:
         raise ValueError(
-            f"run returns {here}, but {store.path} has {stored}.\nFix: the function that was swept; or leave run out."
+            f"run returns {here}, but {store.place} has {stored}.\nFix: the function that was swept; or leave run out."
         )
     return like
 

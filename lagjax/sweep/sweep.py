@@ -18,6 +18,7 @@ from lagjax.sweep.axes import Axes, Blocks, axes_of, divided
 from lagjax.sweep.engine import CHUNKS_EACH, GOOD, LAYOUTS, Engine, Program, Status, chunk_length, not_run, usable_cores
 from lagjax.sweep.labels import labels_of, named_leaves, shapes_of
 from lagjax.sweep.metadata import check_file_names, in_words, versions
+from lagjax.sweep.objects import Files
 from lagjax.sweep.result import Stored, Sweep, of_store
 from lagjax.sweep.store import Store, chunk_of, description_of, open_store, warn_of_damage
 
@@ -135,7 +136,7 @@ def compare_versions(engine: Any, store: Store) -> None:
             worst, name = difference, leaf
     if not worst <= ALIKE_VERSIONS:
         warnings.warn(
-            f"{store.path} was begun with {in_words(stored['versions'])} and is continued with {in_words(versions())}: "
+            f"{store.place} was begun with {in_words(stored['versions'])}, continued with {in_words(versions())}: "
             f"of {len(indices):,} points computed again, '{name}' differs by {worst:.1e} of its largest value.\n"
             "Usual cause: run is not the same function as before; or a motion that amplifies round-off.\n"
             "Fix: another path, to compute the whole sweep again.",
@@ -187,8 +188,8 @@ def sweep(
 
     **Long sweeps:**
 
-    - `store`: a directory to which blocks of points are written as they are finished (zarr). When the same sweep is
-      called again, only missing points are computed; a store of another sweep is refused. Stored files are read once
+    - `store`: a directory, or any URL that fsspec opens (`"s3://bucket/name"`), to which blocks of points are written as
+      they are finished (zarr). When the same sweep is called again, only missing points are computed; a store of another sweep is refused. Stored files are read once
       and checked against their checksums; damaged blocks cause a warning and are computed again.
     - `accept_versions`: continue a store that other versions of lagjax, jax or diffrax began. Whether `run` is still
       the same function is then unknown: a few points are computed again, with a warning if they differ.
@@ -225,20 +226,21 @@ def sweep(
     platform = devices[0].platform
     cores = usable_cores() if platform == "cpu" else 2
     workers = (cores if len(devices) == 1 else 2) if workers is None else workers
-    if chunk is None and store is not None and Path(store).exists():
+    files = None if store is None else Files(store)
+    if chunk is None and files is not None:
         # A store keeps its chunk length, even when it is continued on another number of cores.
-        chunk = chunk_of(store)
-    elif chunk is None:
+        chunk = chunk_of(files)
+    if chunk is None:
         chunk = chunk_length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
     engine = Engine(run, grid, chunk, workers, sort, layout, devices, progress)
-    if store is not None:
+    if files is not None:
         labels = labels_of(grid, engine.program.values)
         check_file_names("axis", labels.axes)
         check_file_names("value", [label.name for label in labels.values.values()])
     _check_memory(grid, engine.program, workers, store, devices)
-    if store is None:
+    if files is None:
         return _in_memory(engine, np.arange(grid.size), None)
-    return _in_store(engine, grid, Path(store), part, accept_versions)
+    return _in_store(engine, grid, files, part, accept_versions)
 
 
 def _in_memory(engine: Engine, indices: np.ndarray, before: PyTree):
@@ -300,10 +302,10 @@ def _again(swept: Sweep, engine: Engine, which: np.ndarray):
     return _in_memory(engine, which, flat)
 
 
-def _in_store(engine: Engine, axes: Axes, path: Path, part: tuple[int, int], accept_versions: bool):
+def _in_store(engine: Engine, axes: Axes, files: Files, part: tuple[int, int], accept_versions: bool):
     started = time.perf_counter()
     new = partial(new_store, engine, axes, CHUNKS_EACH * part[1])
-    store = open_store(path, axes, engine.program, engine.layout, part, accept_versions, new)
+    store = open_store(files, axes, engine.program, engine.layout, part, accept_versions, new)
     compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
@@ -321,11 +323,11 @@ def _in_store(engine: Engine, axes: Axes, path: Path, part: tuple[int, int], acc
             done = store.blocks.size(set(missing) - set(store.missing().tolist()))
             _tell_interrupted(done, store.blocks.size(missing), "the same call continues from there.")
 
-    here = f"{engine.words}, in {path}"
+    here = f"{engine.words}, in {files.place}"
     status, _, lost = store.status()
     if lost:
         fix = "Fix: this call without part, or with the part to which these blocks belong."
-        warn_of_damage(path, lost.values(), fix, stacklevel=3)
+        warn_of_damage(files.place, lost.values(), fix, stacklevel=3)
     compiling, seconds = engine.seconds_since(started)
     return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, of_store)
 

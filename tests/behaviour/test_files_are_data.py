@@ -20,7 +20,7 @@ import pytest
 import lagjax as lj
 from lagjax.files import npz
 from lagjax.files import table as file_table
-from lagjax.sweep import metadata, store
+from lagjax.sweep import metadata, objects, store
 from tests import mutated
 from tests.by_hand import with_problem
 from tests.mutated import describe, mutated_file, mutated_store
@@ -269,9 +269,8 @@ def larger_grid(path, n):
     """A store that claims n times n points, in every part of its description, of which none were computed."""
     folder, axes = path / "lagjax/marks/c", {"k": np.zeros(n), "x": np.zeros(n)}
     shutil.rmtree(folder)
-    for name, x in axes.items():
-        spec = metadata.Spec(x.shape, x.shape, x.dtype, np.nan, [name])
-        metadata.write_chunk(path / name / "c/0", spec, x)
+    specs = {name: objects.Spec(x.shape, x.shape, x.dtype, np.nan, [name]) for name, x in axes.items()}
+    objects.Files(path).write(metadata.axis_files(specs, axes))
 
     def change(said):
         said["block"] = [1, n]

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax.jaxtools import cache
-from lagjax.jaxtools.cache import compiled
+from lagjax.jaxtools import cache, compiled
 from tests.counting import compiles
 from tests.plain import not_plain
 

@@ -180,7 +180,7 @@ def program(function, traced=None):
         return [(Meaning((meaning_of(closed.jaxpr), tuple(np.asarray(x).tobytes() for x in closed.consts))), False)]
 
     outline = lambda tree: outlined(tree, {})
-    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})))
+    return KeptProgram(counted, Said(parts, outline, lambda outline, arrays: rebuilt(outline, {})), None)
 
 
 def factor(x, y):
@@ -304,7 +304,7 @@ def test_what_takes_long_is_explained(monkeypatch, capsys):
 
     for slow, words in ((0.1, ["Very slow compile", "it is none"]), (100.0, [])):
         monkeypatch.setattr(kept, "SLOW", slow)
-        program = KeptProgram(noted, Said(lambda: [], outline, tree))
+        program = KeptProgram(noted, Said(lambda: [], outline, tree), None)
         for expected in (words, []):
             assert float(program([np.asarray(2.0)])) == 2.0
             told = capsys.readouterr().err

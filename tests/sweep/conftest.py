@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from lagjax.sweep.objects import Files
 from lagjax.sweep.store import Store
 from tests.sweep.small_stores import swept
 
@@ -12,7 +13,7 @@ from tests.sweep.small_stores import swept
 def whole(tmp_path_factory):
     """An intact store."""
     path = tmp_path_factory.mktemp("whole") / "store"
-    assert swept(path).ran == 40 and Store(path).blocks.block == (1, 8)
+    assert swept(path).ran == 40 and Store(Files(path)).blocks.block == (1, 8)
     return path
 
 

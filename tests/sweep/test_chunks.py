@@ -1,40 +1,65 @@
-"""Blocks of arrays in files: those that zarr would write, with a checksum in each."""
+"""Blocks of arrays in files: those that zarr writes, each with a checksum, and no more than they have numbers for."""
 
 import json
-import shutil
+import tracemalloc
 
 import numpy as np
 import pytest
+from numcodecs.zstd import Zstd
 
 from lagjax.sweep.engine import nothing
-from lagjax.sweep.metadata import Spec, chunk_file, read_chunk, write_chunk
-from tests.sweep.small_stores import flip_bit
+from lagjax.sweep.objects import Coder, Files, Spec, checksum_of, ending, wrong_with
 
 
 @pytest.mark.parametrize("dtype", ["bool", "int8", "uint64", "float16", "float32", "complex128"])
 @pytest.mark.parametrize("compressed", [True, False])
-def test_zarr_would_write_the_same(tmp_path, dtype, compressed):
-    """Metadata and files are those that zarr writes, in meaning; zarr reads them, and detects a flipped bit."""
+def test_zarr_reads_and_writes_the_same(tmp_path, dtype, compressed):
+    """Zarr reads the blocks, of which the last is shorter, and a block of fill values has a file; it writes the same.
+
+    A flipped bit is found by both.
+    """
     import zarr
-    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     x = np.arange(15).reshape(5, 3).astype(dtype)
     spec = Spec((5, 3), (2, 3), x.dtype, nothing(x.dtype), ["a", "b"], compressed)
-    codecs = [ZstdCodec(level=0)] * compressed + [Crc32cCodec()]
-    zarr.create_array(
-        tmp_path / "zarr", shape=x.shape, chunks=spec.chunk, dtype=dtype, compressors=codecs,
-        fill_value=spec.fill, dimension_names=spec.dims, attributes={"about": "x"},
-    )[:] = x  # fmt: skip
-    theirs = json.loads((tmp_path / "zarr/zarr.json").read_text())
-    assert spec.metadata({"about": "x"}) == theirs
-    for i in range(3):
-        file = chunk_file(tmp_path / "ours", spec, (i,))
-        length, checksum = write_chunk(file, spec, x[2 * i : 2 * i + 2])
-        assert length == file.stat().st_size and file.read_bytes()[-4:] == checksum.to_bytes(4, "little")
-        here = chunk_file(tmp_path / "zarr", spec, (i,))
-        np.testing.assert_array_equal(read_chunk(here, spec)[: len(x) - 2 * i], x[2 * i : 2 * i + 2])
-        shutil.copy(file, here)
-    np.testing.assert_array_equal(zarr.open_array(tmp_path / "zarr")[:], x)
-    flip_bit(0)(chunk_file(tmp_path / "zarr", spec, (0,)))
+    x[2:4] = spec.fill
+    coder, metadata, files = Coder(spec), {}, Files(tmp_path / "ours")
+    spec.made(metadata, "", {"about": "x"})
+    contents = {spec.key((i,)): coder.encoded((i, 0), x[2 * i : 2 * i + 2]) for i in range(3)}
+    files.write({name: content.to_bytes() for name, content in metadata.items()} | contents)
+    assert set(files.sizes()) == {"zarr.json", "c/0/0", "c/1/0", "c/2/0"}
+    array = zarr.open_array(tmp_path / "ours")
+    np.testing.assert_array_equal(array[:], x)
+    assert array.attrs["about"] == "x" and json.loads(files.read(["zarr.json"])["zarr.json"])["dimension_names"] == [
+        "a",
+        "b",
+    ]
+    array[:2] = x[:2]
+    assert files.read(["c/0/0"])["c/0/0"] == contents["c/0/0"]
+    np.testing.assert_array_equal(coder.decoded(contents), x)
+    assert not any(wrong_with(content, spec) for content in contents.values())
+    first = bytearray(contents["c/0/0"])
+    assert ending(first) == checksum_of(first[:-4])
+    first[0] ^= 4
+    files.write({"c/0/0": bytes(first)})
+    assert wrong_with(bytes(first), spec) == "is not as it was written"
     with pytest.raises(ValueError, match="checksum"):
-        zarr.open_array(tmp_path / "zarr")[:]
+        zarr.open_array(tmp_path / "ours")[:]
+
+
+def repeated(n):
+    """A frame of zstd that does not say how long its content is: n times 100 kB of zeros, in 4 bytes each."""
+    block = lambda last: (last | 2 | 100_000 << 3).to_bytes(3, "little") + b"\0"
+    return b"\x28\xb5\x2f\xfd\x00\x58" + block(0) * (n - 1) + block(1)
+
+
+@pytest.mark.parametrize("body", [Zstd(level=1).encode(bytes(30_000_000)), repeated(300)])
+def test_a_file_that_grows(body):
+    """What would be more than the numbers of a block is not made. Twin: the same in a block that has so many."""
+    file = bytes(body) + checksum_of(body).to_bytes(4, "little")
+    for n, wrong in ((1000, "is not as it was written"), (30_000_000, "")):
+        tracemalloc.start()
+        assert wrong_with(file, Spec((n,), (n,), np.dtype(np.uint8), 0, None)) == wrong
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert (peak < 100_000) == (n == 1000)

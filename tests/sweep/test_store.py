@@ -1,6 +1,7 @@
 """Sweeps on disk: resumed, refused, killed, shared."""
 
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import lagjax as lj
+from lagjax.sweep.objects import Files
 from lagjax.sweep.store import Store
 from tests.sweep import worker
 
@@ -57,6 +59,57 @@ def test_written_resumed_and_read(tmp_path):
     assert alone.to_xarray()["value"].dims == ("g", "angle")
     with pytest.raises(ValueError, match="does not know the function that ran it"):
         alone.resweep(where=True)
+
+
+def whole_life(url):
+    """A store at a URL: begun, read by xarray, continued, damaged, read, mended."""
+    import fsspec
+    import xarray
+
+    axes = {"k": np.arange(1.0, 4.0), "x": np.linspace(0.1, 1.0, 8)}
+    call = lambda: lj.sweep(lambda p: p["k"] * p["x"], axes, store=url, chunk=8, workers=1, progress=False)
+    exact = axes["k"][:, None] * axes["x"]
+    first, fs = call(), fsspec.core.url_to_fs(url)[0]
+    assert first.ran == 24 and call().ran == 0 and str(url) in repr(first)
+    for found in (first.values, lj.open_sweep(url).values, xarray.open_zarr(url)["value"].values):
+        np.testing.assert_array_equal(found, exact)
+    fs.rm(f"{url}/lagjax/marks/c/2/0/0")
+    fs.pipe_file(f"{url}/value/c/1/0", fs.cat_file(f"{url}/value/c/0/0"))
+    with pytest.warns(UserWarning, match="value/c/1/0 is not as it was written"):
+        opened = lj.open_sweep(url)
+        np.testing.assert_array_equal(np.isfinite(opened.values), [[True] * 8, [False] * 8, [False] * 8])
+    assert opened.counts() == {"successful": 8, "lost from the store": 8, "not run": 8}
+    with pytest.warns(UserWarning, match="computed again: 1 of 3"):
+        mended = call()
+    assert mended.ran == 16
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(mended)).values, exact)
+
+
+def test_anywhere():
+    """A store may be at any URL that fsspec opens; another is refused in words."""
+    whole_life("memory://lagjax/swept")
+    with pytest.raises(ValueError, match="(?s)nowhere://x cannot be opened.*Fix: a path, or a URL of fsspec"):
+        lj.open_sweep("nowhere://x")
+
+
+@pytest.mark.slow
+def test_in_a_bucket(monkeypatch):
+    """The same in an object store that speaks the protocol of Amazon's S3."""
+    moto, s3fs = pytest.importorskip("moto.server"), pytest.importorskip("s3fs")
+    server = moto.ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    for name, value in {
+        "ACCESS_KEY_ID": "x",
+        "SECRET_ACCESS_KEY": "x",
+        "ENDPOINT_URL": f"http://{host}:{port}",
+    }.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    try:
+        s3fs.S3FileSystem().mkdir("lagjax")
+        whole_life("s3://lagjax/swept")
+    finally:
+        server.stop()
 
 
 @pytest.mark.slow
@@ -105,13 +158,14 @@ def test_another_sweep_is_refused(tmp_path):
         assert words in str(refusal.value)
     assert lj.sweep(run(2.0), axes, store=path, progress=False).ran == 0
     (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="is not the store of a sweep"):
         lj.sweep(run(2.0), axes, store=tmp_path / "other", progress=False)
 
 
 def points_there(path):
     """The number of points in the marked blocks."""
-    store = Store(path)
+    store = Store(Files(path))
     there = set(range(len(store.blocks))) - set(store.missing().tolist())
     return sum(len(np.r_[store.blocks.points(number)]) for number in there)
 
@@ -119,7 +173,7 @@ def points_there(path):
 def kill_when(process, path, count):
     """`kill -9` once `count` blocks are marked."""
     deadline = time.monotonic() + 120
-    while not path.exists() or len(Store(path).blocks) - len(Store(path).missing()) < count:
+    while not path.exists() or len(Store(Files(path)).blocks) - len(Store(Files(path)).missing()) < count:
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)

@@ -44,6 +44,7 @@ from lagjax.jaxtools import (
     hashable_partition,
     is_eager,
     jitted,
+    named,
     one_by_one,
     outlined,
     program_of,
@@ -91,12 +92,26 @@ def trajectory_of(problem: Problem) -> Trajectory:
 
 def _inside(problem: Problem) -> Trajectory:
     """The trajectory in a program that is being traced, which reports `settled` if it assumes the equations regular."""
-    settings = problem.settings
     # If the user gave an adjoint, the motion will be differentiated, which needs the robust solve.
-    regular = takes_for_regular() and settings.adjoint is None and not _may_hold_too_much(problem)
-    problem = problem._replace(settings=(settings := replace(settings, robust=not regular)))
+    regular = takes_for_regular() and problem.settings.adjoint is None and not _may_hold_too_much(problem)
+    repeats = bool(problem.settings.repeated_up_to)
+    arrays, static = hashable_partition(problem)
+
+    def of_arrays(arrays: list):
+        return (_traced(Problem(*static.combine(arrays)), regular, repeats),)
+
+    def meant():
+        return [((regular, repeats), False), *_meant(static, not regular)]
+
+    found = named(of_arrays, Said(meant, _outline, partial(_said_tree, static)), arrays)
+    return _traced(problem, regular, repeats) if found is None else found[0]
+
+
+def _traced(problem: Problem, regular: bool, repeats: bool) -> Trajectory:
+    settings = replace(problem.settings, robust=not regular)
+    problem = problem._replace(settings=settings)
     found, settled = _trajectory_of(problem)
-    if settings.repeated_up_to:
+    if repeats:
         still = stop_gradient(problem[:-1])
         found = with_errors_inside(lambda s: _trajectory_of(Problem(*still, s))[0], found, settings, problem.ts)
     return report_settled(found, settled) if regular else found
@@ -116,7 +131,7 @@ class _Programs:
     def __init__(self, static: HashablePart, count: int, regular: bool):
         def of(robust: bool) -> KeptProgram:
             said = Said(partial(_meant, static, robust), _outline, partial(_said_tree, static))
-            return KeptProgram(partial(_of_arrays, static, robust, count), said)
+            return KeptProgram(partial(_of_arrays, static, robust, count), said, compiler_options())
 
         self.regular: KeptProgram | None = of(False) if regular else None
         self.robust = of(True)
