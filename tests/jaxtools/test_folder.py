@@ -189,14 +189,14 @@ import importlib.util, sys
 spec = importlib.util.spec_from_file_location("folder", sys.argv[1])
 folder = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(folder)
-path, digest, program = folder.Path(sys.argv[2]), sys.argv[3], bytes(range(256)) * 400
-for turn in range(20):
+path, digest, program = folder.Path(sys.argv[2]), sys.argv[3], bytes(range(256)) * 40
+for turn in range(8):
     with folder.tried(path, digest) as entry:
         if entry is not None and (entry[0]["name"] != "motion" or bytes(entry[1]) != program):
             sys.exit(f"turn {turn}: {entry[0]}")
-    if entry is None or turn % 5 == 0:
+    if entry is None or turn % 3 == 0:
         folder.write(path, digest, {"name": "motion"}, program)
-    if turn == 10:
+    if turn == 4:
         folder.drop(path, 0)
 """
 
