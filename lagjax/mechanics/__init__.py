@@ -20,6 +20,7 @@ from lagjax.mechanics.diagnosis import (
     dependencies,
     describe,
     explain_failure,
+    indefinite_in_words,
     indefinite_mass,
     listed,
     where,

@@ -147,7 +147,7 @@ WRONG_SHAPES = {
                 r"has the shapes \(\) and \(\)"),
     "one size": (ValueError, lj.shapes.Drawing([lj.shapes.box(SWUNG, 0.3)], swung),
                  "the size of a shape must be three finite numbers, and is 0.3"),
-    "a negative size": (ValueError, lj.shapes.Drawing([lj.shapes.sphere(SWUNG, -0.3)], swung), "is negative"),
+    "a negative size": (ValueError, lj.shapes.Drawing([lj.shapes.box(SWUNG, (-0.3, 1, 1))], swung), "is negative"),
     "a body": (TypeError, SWUNG, "not Body"),
     "bodies": (TypeError, [SWUNG], "list of Body"),
     "an empty list": (TypeError, [], "not list"),
