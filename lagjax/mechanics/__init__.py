@@ -8,6 +8,7 @@ from lagjax.mechanics.constrained_state import (
     constraint_residual,
     departures,
     free_coordinates,
+    residuals_and_slopes,
     returned,
     to_manifold,
     unreachable_ahead,

@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import balance_matrix, is_determined, of_states, with_first_order
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined, missed
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, examined, missed
 from lagjax.system import Model, State, constraints, coordinates
 
 # An eigenvalue counts as below zero beyond so many round-offs of the largest.
@@ -317,12 +317,14 @@ def _violated_by_velocities(model: Model, s: State, names: Sequence[str]):
 
 def dependencies(jacobian: Array, independent: Array, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Each dependent constraint equation, followed by those that it is a combination of, by name."""
-    size = np.linalg.norm(jacobian, axis=1)
-    share = np.abs(combinations(jacobian, independent)) * size[None, :]
+    rows, chosen = np.asarray(jacobian, float), np.flatnonzero(independent)
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = rows / np.where(size > 0, size, 1.0)
     groups = []
     for i in np.flatnonzero(~np.asarray(independent)):
-        others = np.flatnonzero(share[i] > SHARE * size[i])
-        groups.append((names[i], *(names[j] for j in others)))
+        # Of rows of length one, whatever their units.
+        share = np.abs(np.linalg.lstsq(rows[chosen].T, rows[i], rcond=None)[0])
+        groups.append((names[i], *(names[j] for j in chosen[share > SHARE])))
     return groups
 
 
