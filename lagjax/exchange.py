@@ -31,7 +31,6 @@ from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import reduce
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import count
 from typing import Any
 
@@ -47,6 +46,7 @@ from lagjax.integrate import RESULTS, Trajectory
 from lagjax.integrate import in_words as result_in_words
 from lagjax.jaxtools import SILENT, calls_host, jaxpr_as_fun, once, poisoned
 from lagjax.mechanics import listed
+from lagjax.refusals import installed, must, must_be, must_be_function, must_not_meet
 from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System
 
 # JAX's functions by SymPy's names, where SymPy's printer for JAX has none.
@@ -66,11 +66,7 @@ RESERVED = {"t", "q", "v", "params", "jax", "jnp", "multipliers"}
 
 def sympy_itself(user: str = "lj.from_sympy") -> Any:
     """Import SymPy, or say how to get it; `user` is the function that needs it."""
-    try:
-        import sympy
-    except ImportError as error:
-        raise ImportError(f"{user} needs SymPy.\nFix: pip install 'lagjax[sympy]'.") from error
-    return sympy
+    return installed("sympy", user, "sympy")
 
 
 class NotInJax(Exception):
@@ -296,11 +292,8 @@ def from_sympy(
     if isinstance(lagrangian, sympy.physics.mechanics.LagrangesMethod):
         method, lagrangian = lagrangian, lagrangian._L[0]
         for word, value in (("coordinates", coordinates), ("constraints", constraints), ("force", force)):
-            if value is not None:
-                raise TypeError(
-                    f"a LagrangesMethod has its own {word}.\n"
-                    "Fix: lj.from_sympy(method, parameters=[m, g]), or pass the parts of it separately."
-                )
+            fix = "lj.from_sympy(method, parameters=[m, g]), or pass the parts of it separately"
+            must_not_meet({"a LagrangesMethod": method, word: value}, f"the method has its own {word}", fix, TypeError)
         coordinates, constraints = list(method.q), _equations_of(method)
         force = _forces_of(method)
     if coordinates is None:
@@ -325,12 +318,14 @@ class _Names:
         for x in coordinates:
             _check_coordinate(sympy, x)
         for x in parameters:
-            if not isinstance(x, sympy.Symbol):
-                raise TypeError(
-                    f"a parameter must be a symbol, but {x} is not.\n"
-                    "Usual cause: a coordinate, a name or a number among the parameters.\n"
-                    'Fix: m, g = symbols("m g"), and parameters=[m, g].'
-                )
+            fix = 'm, g = symbols("m g"), and parameters=[m, g]'
+            must_be(
+                sympy.Symbol,
+                x,
+                "a parameter must be a symbol",
+                fix,
+                "a coordinate, a name or a number among the parameters",
+            )
         times = {x.args[0] for x in coordinates}
         if len(times) > 1:
             raise ValueError(
@@ -367,12 +362,10 @@ class _Names:
             found = None if isinstance(given, str) else sympy.sympify(given)
         if isinstance(found, sympy.Equality) and role.startswith("constraint"):
             found = found.lhs - found.rhs
-        if not isinstance(found, sympy.Expr) or getattr(found, "is_Matrix", False):
-            raise TypeError(
-                f"{role} must be a scalar SymPy expression, and is a {type(given).__name__}.\n"
-                "Usual cause: a matrix with one entry, a vector, or x == y, which Python evaluates to False.\n"
-                "Fix: L[0] of a matrix, a.dot(b) of vectors, and x - y or Eq(x, y) for a constraint."
-            )
+        well = isinstance(found, sympy.Expr) and not getattr(found, "is_Matrix", False)
+        cause = "a matrix with one entry, a vector, or x == y, which Python evaluates to False"
+        fix = "L[0] of a matrix, a.dot(b) of vectors, and x - y or Eq(x, y) for a constraint"
+        must(well, f"{role} must be a scalar SymPy expression", given, fix, cause, TypeError)
         if found.has(sympy.Derivative, sympy.Sum, sympy.Product):
             found = found.doit(integrals=False)
         self._check(found, role)
@@ -420,11 +413,7 @@ class _Names:
 
     def force(self, given) -> SymPyFunction:
         """The force, one component per coordinate."""
-        if not isinstance(given, Mapping):
-            raise TypeError(
-                f"force must be a dictionary by coordinate, not a {type(given).__name__}.\n"
-                "Fix: force={x: -c * x.diff()}."
-            )
+        must_be(Mapping, given, "force must be a dictionary by coordinate", "force={x: -c * x.diff()}")
         for x in given:
             if x not in self.coordinates:
                 raise ValueError(
@@ -578,16 +567,10 @@ def export(run: Callable, *examples: PyTree, platforms: Sequence[str] | None = N
 
     Source: https://docs.jax.dev/en/latest/export/export.html; `docs/taking-a-solve-elsewhere.md`.
     """
-    if not callable(run):
-        raise TypeError(
-            f"lj.export takes a function, not {type(run).__name__}.\n"
-            "Fix: lj.export(lambda params: lj.integrate(system, q0, v0, params, ts=ts), params)."
-        )
+    fix = "lj.export(lambda params: lj.integrate(system, q0, v0, params, ts=ts), params)"
+    must_be_function(run, "the first argument of lj.export", "its examples", fix)
     # JAX itself asks for it in `serialize`, when all has been compiled.
-    if find_spec("flatbuffers") is None:
-        raise ImportError(
-            "lj.export needs flatbuffers, with which JAX writes programs.\nFix: pip install 'lagjax[export]'."
-        )
+    installed("flatbuffers", "lj.export, whose programs JAX writes with it,", "export")
     given, places = jtu.tree_flatten(examples, is_leaf=lambda x: type(x) not in PLAIN)
     examples = jtu.tree_unflatten(places, map(_as_argument, given))
 

@@ -57,6 +57,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.integrate import OfPhases, Plastic, check_linear
 from lagjax.jaxtools import shape_of, stop_gradient
 from lagjax.mechanics import velocity_change
+from lagjax.refusals import must_be_among, must_be_function, must_go_together, must_name, must_return
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -196,13 +197,9 @@ def _moved(v: PyTree, size: int, along: Callable):
 def _check_sliding(sliding, t: Array, q: PyTree, v: PyTree, params: PyTree):
     """Raise if a sliding velocity is not one number, or not linear in v."""
     found = shape_of(sliding, t, q, v, params)
-    shape = getattr(found, "shape", () if isinstance(found, float | int) else None)
-    if shape != ():
-        raise ValueError(
-            f"sliding(t, q, v, params) must return one number, but returned {shape or type(found).__name__}.\n"
-            "Usual cause: the velocity of a point in space.\n"
-            "Fix: its component along the contact, in the plane of the motion."
-        )
+    well = getattr(found, "shape", () if isinstance(found, float | int) else None) == ()
+    fix = "its component along the contact, in the plane of the motion"
+    must_return(well, "sliding(t, q, v, params)", "one number", found, fix, "the velocity of a point in space")
     check_linear(sliding, t, q, v, params)
 
 
@@ -256,24 +253,13 @@ def touches(
     Source: Glocker, *Set-Valued Force Laws*, §6; for friction Pfeiffer & Glocker, *Multibody Dynamics with Unilateral
     Contacts*, §8, with Newton's law in place of Poisson's and no tangential restitution.
     """
-    if not callable(gap):
-        raise TypeError(
-            f"a gap must be a function of (t, q, params), not {type(gap).__name__}.\n"
-            'Fix: lj.guards.touches(lambda t, q, params: q["y"]).'
-        )
+    must_be_function(gap, "a gap", "(t, q, params)", 'lj.guards.touches(lambda t, q, params: q["y"])')
     if friction is None and sliding is None:
         return Touches(gap, Plastic() if restitution is None else Impact(gap, _number(restitution)))
-    if friction is None or sliding is None:
-        given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
-        raise ValueError(
-            f"{given} is given, but {missing} is not: friction in an impact needs a coefficient and a velocity.\n"
-            'Fix: lj.guards.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
-        )
-    if not callable(sliding):
-        raise TypeError(
-            f"sliding must be a function of (t, q, v, params), not {type(sliding).__name__}.\n"
-            'Fix: sliding=lambda t, q, v, params: v["x"].'
-        )
+    pair = {"friction": friction, "sliding": sliding}
+    fix = 'lj.guards.touches(gap, 0.5, friction=0.3, sliding=lambda t, q, v, params: v["x"])'
+    must_go_together(pair, "friction in an impact needs a coefficient and a velocity", fix)
+    must_be_function(sliding, "sliding", "(t, q, v, params)", 'sliding=lambda t, q, v, params: v["x"]')
     if restitution is None:
         raise ValueError(
             "friction in an impact needs a restitution: without one, the constraints of the next phase fix the "
@@ -349,8 +335,7 @@ def slips(held: str, on: str, coefficient: Callable | ArrayLike, side: int = 0) 
 
     **Raises:** `ValueError` for another side; and, by `lj.integrate`, if the phase has no constraint of these names.
     """
-    if side not in (-1, 0, 1):
-        raise ValueError(f"side must be 1, -1, or 0 for both, not {side!r}.")
+    must_be_among((1, -1, 0), side, "side", "side=0 for both")
     return Slips(held, on, side, _number(coefficient))
 
 
@@ -384,11 +369,7 @@ def sticks(sliding: Callable) -> Sticks:
 
 
 def _multiplier(multipliers: dict[str, Array], name: str, many=False):
-    if name not in multipliers:
-        raise ValueError(
-            f"there is no constraint '{name}' in this phase; there {'are ' if multipliers else 'is '}"
-            f"{', '.join(map(repr, multipliers)) or 'none'}.\nFix: use its name in constraints=."
-        )
+    must_name(name, multipliers, "a guard names", "constraint of this phase", "its name in constraints=, '{}'")
     found = multipliers[name]
     if jnp.size(found) != 1 and not many:
         raise ValueError(f"constraint '{name}' has {jnp.size(found)} equations, but a contact has one.")

@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from lagjax.jaxtools import at_once
-from lagjax.mechanics import accelerations, listed, mass_matrix
+from lagjax.mechanics import accelerations, mass_matrix
+from lagjax.refusals import must_name
 from lagjax.system import Hybrid, System, coordinates
 
 # The points at which an activation is checked, the distance over which its curvature may not jump, and the size of a
@@ -84,9 +85,9 @@ class Network(eqx.Module):
         angles = [angles] if isinstance(angles, str) else list(angles)
         # An array of angles may also be given by its name alone.
         accepted_names = [{name, name.partition("[")[0]} for name in names]
-        unknown = [angle for angle in angles if not any(angle in x for x in accepted_names)]
-        if unknown:
-            raise ValueError(f"angles names {listed(unknown)}, but the coordinates are {listed(names)}.")
+        for angle in angles:
+            if not any(angle in x for x in accepted_names):
+                must_name(angle, names, "angles names", "coordinate", "angles=['{}']")
         _check_activation(activation)
         self.sizes, self.angular = tuple(flat), tuple(not x.isdisjoint(angles) for x in accepted_names)
         mlp = eqx.nn.MLP(len(flat) + sum(self.angular), out or "scalar", width, depth, activation, key=key)

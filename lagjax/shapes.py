@@ -22,6 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax.display import CUBE, CYLINDER, DISK, SPHERE, TUBE, Anchor, Drawing, Shape, surface
 from lagjax.jaxtools import compiled
+from lagjax.refusals import must
 
 __all__ = ["Drawing", "Shape", "box", "cylinder", "disk", "ellipsoid", "line", "mesh", "rod", "sphere", "trail"]
 
@@ -189,12 +190,9 @@ def _at_points(f: Callable, points: np.ndarray, params: PyTree):
 def _anchor(place: Any) -> Anchor:
     if isinstance(anchor := getattr(place, "anchor", None), Anchor):
         return anchor
-    if np.shape(place) != (3,):
-        raise TypeError(
-            "a place must be a body, body.at(point), lj.bodies.ground or a point (x, y, z), not "
-            f"{type(place).__name__}.\nUsual cause: the name of a body in place of the body.\n"
-            'Fix: lj.shapes.sphere(lj.bodies.Body("ball", ...), 0.5).'
-        )
+    claim = "a place must be a body, body.at(point), lj.bodies.ground or a point (x, y, z)"
+    fix, cause = 'lj.shapes.sphere(lj.bodies.Body("ball", ...), 0.5)', "the name of a body in place of the body"
+    must(np.shape(place) == (3,), claim, place, fix, cause, TypeError)
     return Anchor(None, tuple(np.asarray(place, float).tolist()))
 
 
@@ -202,13 +200,11 @@ def _sizes(*lengths: Any) -> Any:
     """Three lengths; a function of params if one of them is."""
     if not any(map(callable, lengths)):
         found = tuple(map(float, lengths))
-        if not all(0 <= x < math.inf for x in found):
-            raise ValueError(
-                f"a radius, length or half axis of a shape must be a finite number from zero on, and is "
-                f"{next(x for x in found if not 0 <= x < math.inf)}.\n"
-                "Usual cause: a division by zero where it was computed, or a difference the wrong way round.\n"
-                "Fix: lj.shapes.sphere(ball, 0.5), or a function of params."
-            )
+        claim = "a radius, length or half axis of a shape must be a finite number from zero on"
+        fix = "lj.shapes.sphere(ball, 0.5), or a function of params"
+        cause = "a division by zero where it was computed, or a difference the wrong way round"
+        for x in found:
+            must(0 <= x < math.inf, claim, x, fix, cause)
         return found
     return _of_params(lengths)
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from lagjax.display import plots
 from lagjax.integrate import in_words
+from lagjax.refusals import installed, must_be_function, must_name
 from lagjax.sweep import LAYOUTS, MOST_CURVES, TRUSTED, Drawn, axes_of, drawn, program_for
 
 DPI = 100
@@ -366,13 +367,7 @@ def _labels(control):
 
 def import_widgets():
     """Import ipywidgets, or say how to get it."""
-    try:
-        import ipywidgets
-    except ImportError as error:
-        raise ImportError(
-            'sliders in a notebook need ipywidgets, which is an optional extra.\nFix: pip install "lagjax[interact]"'
-        ) from error
-    return ipywidgets
+    return installed("ipywidgets", "a slider in a notebook", "interact")
 
 
 def widget(name: str, control: Control, value: Any):
@@ -448,15 +443,10 @@ def interact(
     **Raises:** `ImportError` without ipywidgets or matplotlib; `TypeError`, `ValueError` for knobs that are none; what
     `run` or `draw` raises at the first point.
     """
-    if not callable(run):
-        raise TypeError(
-            f"run must be a function of a point, not {type(run).__name__}.\n"
-            "Fix: lambda point: lj.integrate(system, q0, v0, params | point, ts=ts)."
-        )
+    must_be_function(run, "run", "a point", "lambda point: lj.integrate(system, q0, v0, params | point, ts=ts)")
     import_widgets()
     controls, start = controls_of(knobs), dict(start or {})
-    if unknown := [name for name in start if name not in controls]:
-        raise ValueError(f"start has '{unknown[0]}', which is no knob.\nFix: one of {', '.join(controls)}.")
+    must_name(start, controls, "start names", "knob")
     point = {name: start_of(name, control, start) for name, control in controls.items()}
     return Knobs(run, controls, point, draw, progress)
 
@@ -506,8 +496,7 @@ class Knobs:
 
         **Raises:** `ValueError` for what is no knob or beyond its range.
         """
-        if unknown := [name for name in values if name not in self._controls]:
-            raise ValueError(f"'{unknown[0]}' is no knob.\nFix: one of {', '.join(self._controls)}.")
+        must_name(values, self._controls, "set names", "knob")
         values = {name: checked(name, self._controls[name], x) for name, x in values.items()}
         self._held = True
         try:

@@ -44,6 +44,7 @@ from lagjax.jaxtools import (
 )
 from lagjax.mechanics import Equations, all_finite, equations_of, to_manifold
 from lagjax.numerics import RK4, ExplicitRungeKutta, in_our_form
+from lagjax.refusals import must, shown
 from lagjax.system import (
     Call,
     Model,
@@ -191,9 +192,8 @@ def explicit_method(method: Any) -> ExplicitRungeKutta:
     if ours is None and isinstance(method, diffrax.AbstractSolver):
         ours = in_our_form(method)
     if ours is None:
-        given = f"the class {method.__name__}" if isinstance(method, type) else f"a {type(method).__name__}"
         raise TypeError(
-            f"method must be lj.RK4(), lj.Tsit5() or lj.Dopri8() for steps of a fixed length, and is {given}.\n"
+            f"method must be lj.RK4(), lj.Tsit5() or lj.Dopri8() for steps of a fixed length, not {shown(method)}.\n"
             "Usual cause: an implicit method, one of diffrax's that lagjax has no form of, or missing brackets.\n"
             "Fix: leave method out (lj.RK4()); or lj.integrate(..., method=method, "
             "stepsize_controller=diffrax.ConstantStepSize(), dt0=dt)."
@@ -204,12 +204,9 @@ def explicit_method(method: Any) -> ExplicitRungeKutta:
 def step_length(dt: Any, dtype: DTypeLike):
     """`dt` as an array of one number; raise unless it is a finite one."""
     number = isinstance(dt, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(dt, bool)
-    if not number or np.ndim(dt) or not (is_traced(dt) or np.isfinite(dt)):
-        raise ValueError(
-            f"dt must be one finite number, the length of each step, not {dt!r:.60}.\n"
-            "Usual cause: the output times in its place, or arguments in another order.\n"
-            "Fix: dt=0.01."
-        )
+    well = number and not np.ndim(dt) and (is_traced(dt) or np.isfinite(dt))
+    cause = "the output times in its place, or arguments in another order"
+    must(well, "dt must be one finite number, the length of each step", dt, "dt=0.01", cause)
     return numpy_of(dt).asarray(dt, dtype)
 
 

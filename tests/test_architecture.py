@@ -23,15 +23,15 @@ ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own room or from those before it.
 ROOMS = (
-    "jaxtools", "numerics", "display", "shapes", "files", "system", "mechanics", "learned", "steps", "integrate",
-    "guards", "exchange", "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report", "bodies",
-    "models", "mechanisms", "scenes", "stability",
+    "jaxtools", "refusals", "numerics", "display", "shapes", "files", "system", "mechanics", "learned", "steps",
+    "integrate", "guards", "exchange", "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report",
+    "bodies", "models", "mechanisms", "scenes", "stability",
 )  # fmt: skip
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pandas", "sympy", "tqdm", "xarray"}
-OPTIONAL |= {"casadi", "fsspec", "imageio_ffmpeg", "mujoco", "zarr"}
+OPTIONAL |= {"casadi", "cloudpickle", "fsspec", "imageio_ffmpeg", "mujoco", "zarr"}
 LATE = ("scipy.", "matplotlib")
 
 

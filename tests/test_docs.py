@@ -22,6 +22,7 @@ import result_pages
 
 import lagjax as lj
 from benchmarks import measure
+from lagjax import refusals
 from lagjax.mechanisms import MECHANISMS
 from lagjax.scenes import SCENES
 
@@ -88,15 +89,18 @@ def f(x):
     if x:
         raise ValueError(f"{x} is quite wrong, {x}{x}.\\nFix: " + f(x))
     warnings.warn("beware of this", AccuracyWarning)
+    fix, y = "x=1", x + 1
+    must_be_whole(x, f"{y} of {f}", fix=fix)
     return "the rope is torn.\\nUsual cause: age.\\nFix: a new one."
 '''
 
 
 def test_messages_are_found():
-    """Messages that are raised, used in warnings, or built for other functions are found; docstrings are not."""
+    """Messages that are raised, by rules too, used in warnings, or built for others are found; docstrings are not."""
     assert error_pages.messages(MESSAGES) == [
         ("ValueError", "… is quite wrong, ….\nFix: …"),
         ("AccuracyWarning", "beware of this"),
+        ("ValueError", "… of … must be a whole number …, not ….\nFix: x=1."),
         ("", "the rope is torn.\nUsual cause: age.\nFix: a new one."),
     ]
 
@@ -123,8 +127,9 @@ def test_every_message_has_its_place(files, least):
     page = error_pages.page(files)
     with pytest.raises(TypeError) as raised:
         lj.Holonomic(3)  # pyright: ignore[reportArgumentType]
-    pattern = re.escape("… needs a function …, not ….").replace("…", ".+")
-    assert re.match(pattern, str(raised.value)) and "… needs a function …, not …." in page
+    said = "g of lj.Holonomic(g) must be a function of (t, q, params), not ….\nFix: lj.Holonomic(g), with def"
+    assert re.match(re.escape(said).replace("…", ".+"), str(raised.value)) and said in page
+    assert set(error_pages.RULES) == {name for name in vars(refusals) if name.startswith("must") or name == "installed"}
     anchors = re.findall(r"^\((.*)\)=$", page, re.MULTILINE)
     assert len(anchors) == len(set(anchors)) > least
 

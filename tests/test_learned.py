@@ -122,7 +122,7 @@ def test_mistakes():
     key = jax.random.key(0)
     for act, words in (
         (lambda: Network({"x": 0.0}, key=key), "must be positive"),
-        (lambda: Network({"x": 1.0}, angles="y", key=key), "angles names 'y', but the coordinates are 'x'"),
+        (lambda: Network({"x": 1.0}, angles="y", key=key), "angles names 'y', which is no coordinate; there is 'x'"),
         (lambda: Network(np.ones(2), key=key)(np.ones(3)), "takes 2 numbers, but was given 3"),
         (lambda: disagreement(swing, [None], np.zeros(2), np.zeros(2)), "nothing to disagree"),
         *((lambda n=n: positive_definite(np.zeros(n)), r"n\(n\+1\)/2 numbers") for n in (0, 2, 4)),

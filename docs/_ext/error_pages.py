@@ -5,12 +5,14 @@ that are inserted.
 """
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
 from written import write
 
 import lagjax
+from lagjax import refusals
 
 ROOT = Path(lagjax.__file__).parent
 PAGE = Path(__file__).parent.parent / "generated" / "errors.md"
@@ -74,6 +76,41 @@ def text_of(node: ast.expr) -> str | None:
     return None
 
 
+# What the rules of `lagjax/refusals.py` say first, of their arguments; cause and fix follow.
+RULES = {
+    "must": "{claim}, not ….", "must_be": "{claim}, not ….", "must_be_among": "{role} must be one of …, not ….",
+    "must_be_function": "{role} must be a function of {takes}, not ….",
+    "must_return": "{call} must return {wanted}, and returned ….",
+    "must_be_whole": "{role} must be a whole number …, not ….", "must_be_finite": "there is NaN or infinity in {role}.",
+    "must_be_like": "{role} must be like {of}, in structure and shapes: {of} has …, and it has ….",
+    "must_be_single": "{what} is a batch of shape …: take one lane of it.",
+    "must_have_values": "{what}, and JAX is tracing.",
+    "must_differ": "{what} are called ….",
+    "must_name": "{what} …, which is no {kind}; there are ….", "must_not_meet": "… exclude each other: {why}.",
+    "must_go_together": "… is given, but … is not: {why}.", "installed": "{user} needs {module}, an optional extra.",
+}  # fmt: skip
+TYPE_ERRORS = ("must_be", "must_be_function", "must_have_values")
+
+
+def refusal(call: ast.Call, tree: ast.Module) -> tuple[str, str]:
+    """(kind, text) of a message that a rule gives; texts may be assigned to names before the call."""
+    assigned = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and node.lineno < call.lineno:
+            target, value = node.targets[0], node.value
+            several = isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+            for name, text in zip(target.elts, value.elts) if several else [(target, value)]:
+                assigned[ast.unparse(name)] = max(assigned.get(ast.unparse(name), (0, None)), (node.lineno, text))
+    rule = ast.unparse(call.func)
+    bound = inspect.signature(getattr(refusals, rule)).bind(*call.args, **{x.arg: x.value for x in call.keywords})
+    arguments = {name: assigned.get(ast.unparse(x), (0, x))[1] for name, x in bound.arguments.items()}
+    kind = "ImportError" if rule == "installed" else "TypeError" if rule in TYPE_ERRORS else "ValueError"
+    kind = ast.unparse(arguments.pop("error")) if "error" in arguments else kind
+    texts = {name: text_of(x) or "…" for name, x in arguments.items()}
+    parts = (("Usual cause", texts.get("cause")), ("Fix", texts.get("fix")))
+    return kind, RULES[rule].format(**texts) + "".join(f"\n{name}: {text}." for name, text in parts if text)
+
+
 def telling(text: str) -> str:
     """The first line of a message with words of its own, not only inserted text; empty if there is none."""
     lines = [re.sub("^…?(Usual cause|Fix): …?", "", line) for line in text.split("\n")]
@@ -109,6 +146,8 @@ def messages(source: str) -> list[tuple[str, str]]:
         call = node.exc if isinstance(node, ast.Raise) else node
         raised = isinstance(node, ast.Raise) and isinstance(call, ast.Call)
         warned = isinstance(call, ast.Call) and ast.unparse(call.func) in ("warnings.warn", "warn")
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in RULES:
+            add(*refusal(call, tree))
         if (raised or warned) and call.args:
             add(kind_of(call), text_of(call.args[0]))
             inside |= {id(part) for part in ast.walk(call)}
@@ -165,7 +204,7 @@ def page(files: str = "**/*.py") -> str:
     by_theme: dict[str, list[tuple[str, str]]] = {}
     for path in sorted(ROOT.glob(files)):
         module = str(path.relative_to(ROOT).with_suffix(""))
-        if module.startswith(("scenes", "mechanisms", "stability", "report", "job", "__")):
+        if module.startswith(("scenes", "mechanisms", "stability", "report", "refusals", "job", "__")):
             continue
         by_theme.setdefault(theme_of(module), []).extend(messages(path.read_text()))
     taken: set[str] = set()

@@ -19,8 +19,9 @@ from lagjax.analysis.degenerate import unknowns
 from lagjax.analysis.equilibria import held_at, searched, stacked, stacked_one, symmetries_of
 from lagjax.analysis.following import BranchFollower, BranchPath
 from lagjax.display import plots as plot
-from lagjax.jaxtools import compiled, is_eager, is_traced
+from lagjax.jaxtools import compiled
 from lagjax.mechanics import are_angles, describe, is_autonomous
+from lagjax.refusals import must_have_values, must_name
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 MARKS = {
@@ -152,11 +153,7 @@ class Branches(eqx.Module):
 
         **Raises:** `ValueError` for a name that is not a coordinate; `ImportError` without matplotlib.
         """
-        if unknown := [name for name in names if name not in self.names]:
-            raise ValueError(
-                f"plot({unknown[0]!r}) names no coordinate; there are {', '.join(self.names)}.\n"
-                f"Fix: plot({self.names[0]!r})."
-            )
+        must_name(names, self.names, "plot names", "coordinate", "plot('{}')")
         shown = list(names) or self._varying(self._curves())
         fig, axes = plot.panel_axes(len(shown), 2, (4.8, 3.4))
         for axis, name in zip(axes, shown):
@@ -336,12 +333,9 @@ def continue_equilibria(
     q, v = stacked_one(start)
     if velocity is not None:
         v = jax.tree.map(lambda x: x[0], stacked([velocity], "velocity"))
-    if not is_eager() or is_traced((q, v, params, t, to)):
-        raise TypeError(
-            "lj.continue_equilibria needs values to choose its steps, but JAX is tracing.\n"
-            "Fix: call it outside jit, vmap and grad; critical points carry their derivatives, "
-            "branches.critical[0].derivative, and lj.equilibria works inside."
-        )
+    fix = "call it outside jit, vmap and grad; critical points carry their derivatives, branches.critical[0].derivative"
+    what = "lj.continue_equilibria needs values to choose its steps"
+    must_have_values((q, v, params, t, to), what, f"{fix}, and lj.equilibria works inside", eager=True)
     system, s = checked(system, State(t, q, v, params))
     moving = np.concatenate([np.ravel(x) for x in jax.tree.leaves(s.v)]) != 0
     symmetries = symmetries_of(system, s, cyclic, hold, None if velocity is None else moving)

@@ -40,7 +40,8 @@ from lagjax.analysis.periodic_orbit import PeriodicOrbit
 from lagjax.analysis.shooting import Goal, OrbitRequest, guessed
 from lagjax.display import labelled
 from lagjax.display import plots as plot
-from lagjax.jaxtools import compiled, hashable_partition, is_eager, is_traced
+from lagjax.jaxtools import compiled, hashable_partition
+from lagjax.refusals import must_be, must_be_single, must_have_values, must_name
 from lagjax.system import State, checked, coordinates
 
 
@@ -135,11 +136,7 @@ class OrbitBranch(eqx.Module):
         **Raises:** `ValueError` for an unknown name; `ImportError` without matplotlib.
         """
         known = self._names()
-        if unknown := [name for name in names if name not in (*known, "period")]:
-            raise ValueError(
-                f"plot({unknown[0]!r}) names no coordinate; there are {', '.join(known)}, and 'period'.\n"
-                f"Fix: plot({known[0]!r})."
-            )
+        must_name(names, [*known, "period"], "plot names", "coordinate", "plot('{}')")
         shown = list(names) or known[:6]
         fig, axes = plot.panel_axes(len(shown), 2, (4.8, 3.4))
         for axis, name in zip(axes, shown):
@@ -259,22 +256,11 @@ def continue_orbits(
 
 
 def _check(orbit):
-    if not isinstance(orbit, PeriodicOrbit):
-        raise TypeError(
-            f"lj.continue_orbits needs a periodic orbit, not {type(orbit).__name__}.\n"
-            "Fix: orbit = lj.periodic_orbit(system, (q, v), period, params), and lj.continue_orbits(orbit, "
-            'along="...", to=...).'
-        )
-    if not is_eager() or is_traced(orbit):
-        raise TypeError(
-            "lj.continue_orbits needs values to choose its steps, but JAX is tracing.\n"
-            "Fix: call it outside jit, vmap and grad; lj.periodic_orbit works inside."
-        )
-    if np.ndim(orbit.period):
-        raise ValueError(
-            f"this is a batch of orbits, of shape {np.shape(orbit.period)}: a branch begins at a single orbit.\n"
-            "Fix: orbit = jax.tree.map(lambda x: x[0], orbit)."
-        )
+    fix = "orbit = lj.periodic_orbit(system, (q, v), period, params); lj.continue_orbits(orbit, along=..., to=...)"
+    must_be(PeriodicOrbit, orbit, "orbit of lj.continue_orbits must be a periodic orbit", fix)
+    fix = "call it outside jit, vmap and grad; lj.periodic_orbit works inside"
+    must_have_values(orbit, "lj.continue_orbits needs values to choose its steps", fix, eager=True)
+    must_be_single(np.shape(orbit.period), "this orbit, at which a branch begins,", "orbit = {orbit}")
     if not bool(orbit.converged):
         raise ValueError(
             f"this orbit does not close: its end is {float(orbit.residual):.2g} of its size away from its start.\n"

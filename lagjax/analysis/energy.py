@@ -35,9 +35,10 @@ from lagjax.integrate import (
     message,
     traced_phases,
 )
-from lagjax.jaxtools import compiled, is_traced
+from lagjax.jaxtools import compiled
 from lagjax.mechanics import of_states, sees_time
 from lagjax.numerics import quadrature
+from lagjax.refusals import must_be, must_be_single, must_have_values
 from lagjax.system import (
     Hybrid,
     InModes,
@@ -546,16 +547,10 @@ def energy_ledger(trajectory: Trajectory, system: System | Hybrid | None = None)
 
     Source: Goldstein, Eq. (2.54): dh/dt = -∂L/∂t, with the forces that L does not contain.
     """
-    if not isinstance(trajectory, Trajectory) or is_traced(trajectory):
-        raise TypeError(
-            f"a ledger needs a motion that was computed, not {_kind(trajectory)}.\n"
-            "Fix: lj.energy_ledger(lj.integrate(...)), outside jax.jit and jax.vmap."
-        )
-    if np.ndim(trajectory.t) != 1:
-        raise ValueError(
-            f"this trajectory is a batch of shape {trajectory.t.shape[:-1]}: account for one lane of it.\n"
-            "Fix: lj.energy_ledger(jax.tree.map(lambda x: x[0], traj))."
-        )
+    fix = "lj.energy_ledger(lj.integrate(...)), outside jax.jit and jax.vmap"
+    must_be(Trajectory, trajectory, "a ledger needs a motion that was computed", fix)
+    must_have_values(trajectory, "a ledger needs a motion that was computed", fix)
+    must_be_single(np.shape(trajectory.t)[:-1], "this trajectory", "lj.energy_ledger({traj})")
     accounted = trajectory.system if system is None else system
     check_system(accounted, phases=True, elements=True)
     if accounted.elements is not None:
@@ -604,7 +599,3 @@ def _ledger(motion: Motion) -> EnergyLedger:
 
 def _count(n, word):
     return f"{n} {word}" + ("" if n == 1 else "es")
-
-
-def _kind(x):
-    return "one that JAX is tracing" if isinstance(x, Trajectory) else type(x).__name__

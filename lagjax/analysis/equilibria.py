@@ -41,6 +41,7 @@ from lagjax.analysis.degenerate import CREEPS_BELOW, nearest, soft_below
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import are_angles, invariance, listed, structure
 from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below
+from lagjax.refusals import must, must_be_among, must_be_like, must_name
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
@@ -49,8 +50,7 @@ AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.li
 def stacked(starts, what="starts") -> PyTree:
     """Starts as one tree whose leaves have a leading axis, from a list of states, such a tree, or one state."""
     if isinstance(starts, list):
-        if not starts:
-            raise ValueError(f"{what} is an empty list: a search needs a place to start from.\nFix: {AS_STARTS}.")
+        must(starts, f"{what} must hold a place to start from", starts, AS_STARTS)
         structures = {jtu.tree_structure(start) for start in starts}
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
@@ -59,8 +59,7 @@ def stacked(starts, what="starts") -> PyTree:
         xp = numpy_of(starts)
         return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
-    if not leaves:
-        raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
+    must(leaves, f"{what} must have coordinates", starts, AS_STARTS)
     starts = jtu.tree_map(lambda x: numpy_of(x).asarray(x), coordinates.as_floats(starts))
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
@@ -73,8 +72,7 @@ def stacked(starts, what="starts") -> PyTree:
             "Usual cause: one start whose coordinates are arrays, where several are expected.\n"
             f"Fix: a list of states, {what}=[q]."
         )
-    if () in counts or min(counts)[0] == 0:
-        raise ValueError(f"{what} contains no start.\nFix: {AS_STARTS}.")
+    must(() not in counts and min(counts)[0] > 0, f"{what} must hold a start", starts, AS_STARTS)
     return starts
 
 
@@ -90,8 +88,7 @@ def _at_rest(q: PyTree) -> PyTree:
 
 def symmetries_of(system, s: State, cyclic, hold, moving: np.ndarray | None) -> SteadySymmetries:
     """The symmetries along which the motion is steady: those that `cyclic` names, or the `moving` (n,) coordinates."""
-    if hold not in (VELOCITY, MOMENTUM, None):
-        raise ValueError(f'hold must be "velocity", "momentum" or None, not {hold!r}.')
+    must_be_among((VELOCITY, MOMENTUM, None), hold, "hold")
     names = coordinates.names(s.q)
     if cyclic is None:
         if moving is None:
@@ -119,10 +116,8 @@ def _names_in(names, given: Iterable):
     for name in given:
         entries = [x for x in names if x == name or isinstance(name, str) and x.split("[")[0] == name]
         if not entries:
-            raise ValueError(
-                f"cyclic names {name!r}, and the coordinates are {listed(names)}.\n"
-                "Fix: use these names, or functions motion(q, params) that return a velocity like v."
-            )
+            fix = "'{}', or functions motion(q, params) that return a velocity like v"
+            must_name([name], names, "cyclic names", "coordinate", fix)
         chosen += entries
     return list(dict.fromkeys(chosen))
 
@@ -143,14 +138,8 @@ def _check_cyclic(system, s, chosen):
 def _check_fields(fields: list[Callable], s: State):
     for field in fields:
         value = jax.eval_shape(lambda q, params, field=field: field(q, params), s.q, s.params)
-        if jtu.tree_structure(value) != jtu.tree_structure(s.q) or jtu.tree_map(jnp.shape, value) != jtu.tree_map(
-            jnp.shape, s.q
-        ):
-            raise ValueError(
-                "cyclic=motion(q, params) must return a velocity like v, one number per coordinate.\n"
-                f"  q has shapes {jtu.tree_map(jnp.shape, s.q)}\n  it has {jtu.tree_map(jnp.shape, value)}\n"
-                "Fix: return the structure of q, with 0.0 for coordinates that do not move (0.0 * q[...] for arrays)."
-            )
+        fix = "return the structure of q, with 0.0 for coordinates that do not move (0.0 * q[...] for arrays)"
+        must_be_like(value, s.q, "the velocity that cyclic=motion(q, params) returns", "q", fix)
 
 
 # The largest imbalance of an equilibrium, relative to the effect of a displacement as large as the coordinates.

@@ -45,6 +45,7 @@ from lagjax.analysis.periodic_orbit import PeriodicOrbit
 from lagjax.display import labelled, plots
 from lagjax.display import plots as plot
 from lagjax.jaxtools import compiled, is_traced, numpy_of
+from lagjax.refusals import must, must_be, must_be_single, must_be_whole
 from lagjax.system import Hybrid, State, System, by_name, coordinates
 
 # The largest extent of the axes: beyond this the circle would be too small to see.
@@ -266,11 +267,8 @@ def floquet(
 
 
 def _of_orbit(orbit, rtol, given):
-    if not isinstance(orbit, PeriodicOrbit):
-        raise TypeError(
-            f"floquet needs a lj.System or a periodic orbit, not {type(orbit).__name__}.\n"
-            "Fix: lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit."
-        )
+    fix = "lj.floquet(system, t, q, v, params, period), or lj.floquet(orbit) of a lj.periodic_orbit"
+    must_be(PeriodicOrbit, orbit, "the first argument of floquet must be a lj.System or a periodic orbit", fix)
     if any(x is not None for x in given):
         raise TypeError(
             "a periodic orbit already contains its state, parameters and period.\n"
@@ -368,11 +366,7 @@ class LyapunovExponents(eqx.Module):
 
         **Raises:** `ImportError` without matplotlib; `ValueError` for a batch.
         """
-        if np.ndim(self.settled):
-            raise ValueError(
-                f"these are exponents of a batch of shape {np.shape(self.settled)}: draw one lane of it.\n"
-                "Fix: jax.tree.map(lambda x: x[0], found).plot()"
-            )
+        must_be_single(np.shape(self.settled), "this", "{found}.plot()")
         curves = {f"λ{i + 1}": curve for i, curve in enumerate(np.asarray(self.running()).T)}
         return plot.time_series(np.asarray(self.t)[1:], {"mean growth": curves})
 
@@ -440,11 +434,7 @@ def lyapunov_exponents(
     problem = any_problem_of(system, State(ts[0], q, v, params), phase)
     s = coordinates.state(*problem.state)
     most = any_flow(problem.system, s, 1.0, problem.rows).dimension
-    if not (isinstance(count, int) and 1 <= count <= most):
-        raise ValueError(
-            f"count must be between 1 and {most}, not {count!r}: the state space has {most} directions.\n"
-            f"Fix: count={most} for all of them."
-        )
+    must_be_whole(count, "count", most=most, fix=f"count={most} for all directions of the state space")
     rtol = np.asarray(TOLERANCE.get(np.dtype(s.t.dtype), 1e-5) if rtol is None else rtol, s.t.dtype)
     estimates = _followed(problem.system, s, ts.astype(s.t.dtype), rtol, problem.rows, count)
     exponents = LyapunovExponents(*estimates, count == most)
@@ -454,14 +444,10 @@ def lyapunov_exponents(
 
 
 def _check(ts):
-    if ts.ndim != 1 or len(ts) < FEWEST:
-        raise ValueError(
-            f"ts must be a vector of at least {FEWEST} times, and has shape {ts.shape}.\n"
-            "Usual cause: only the end time; between two distant times the fastest-growing tangent hides all others.\n"
-            "Fix: ts=jnp.linspace(0.0, 1000.0, 1001)."
-        )
-    if not is_traced(ts) and not np.all(np.asarray(ts[1:] > ts[:-1])):
-        raise ValueError("ts must increase throughout.\nFix: ts=jnp.unique(ts).")
+    cause = "only the end time; between two distant times the fastest-growing tangent hides all others"
+    well, claim = ts.ndim == 1 and len(ts) >= FEWEST, f"ts must be a vector of at least {FEWEST} times"
+    must(well, claim, ts, "ts=jnp.linspace(0.0, 1000.0, 1001)", cause)
+    must(is_traced(ts) or np.all(np.asarray(ts[1:] > ts[:-1])), "ts must increase throughout", ts, "ts=jnp.unique(ts)")
 
 
 @compiled

@@ -49,6 +49,7 @@ from lagjax.integrate import Trajectory, in_one_solve
 from lagjax.jaxtools import compiled, depends, is_eager, is_traced, judging, remembered
 from lagjax.mechanics import SINGULAR_BELOW, applied_force, describe, forced_by, listed, what_changes_momentum
 from lagjax.numerics import dense, newton, quadrature
+from lagjax.refusals import must_be_function, must_be_like, must_be_single
 from lagjax.system import (
     WITH_MULTIPLIERS,
     Holonomic,
@@ -147,12 +148,7 @@ class Hamiltonian(eqx.Module):
         return v, momentum_rate
 
     def _at(self, t, q: PyTree, p, params: PyTree):
-        if jax.tree.structure(p) != jax.tree.structure(q):
-            has = [", ".join(coordinates.names(tree)) for tree in (q, p)]
-            raise ValueError(
-                f"p must have the structure of q.\n  q: {has[0]}\n  p: {has[1]}\n"
-                "Fix: p = lj.momentum(system, t, q, v, params)."
-            )
+        must_be_like(p, q, "p", "q", "p = lj.momentum(system, t, q, v, params)")
         s = coordinates.state(t, q, p, params)
         system = traced_system(self.system, s)
         value, v, momentum_rate, mass, regular, reached = _hamiltonian(system, *s)
@@ -447,11 +443,7 @@ def action(
     if isinstance(path, Trajectory):
         found = _action_of_trajectory(system, path, params, t0, t1, pieces)
         return found if error else found[0]
-    if not callable(path):
-        raise TypeError(
-            f"a path is a function of t or a Trajectory, not {type(path).__name__}.\n"
-            'Fix: lambda t: {"x": 2.0 * t, "y": 0.0 * t}.'
-        )
+    must_be_function(path, "a path", "t, or a Trajectory", 'lambda t: {"x": 2.0 * t, "y": 0.0 * t}')
     if t0 is None or t1 is None:
         raise ValueError("a path that is a function needs its ends.\nFix: lj.action(system, path, params, 0.0, 1.0).")
     t0, t1 = (jnp.asarray(t, jnp.result_type(float)) for t in (t0, t1))
@@ -471,11 +463,7 @@ def action(
 
 
 def _action_of_trajectory(system, path, params: PyTree, t0, t1, pieces):
-    if path.t.ndim != 1:
-        raise ValueError(
-            f"this trajectory is a batch of shape {path.t.shape[:-1]}: take the action of one lane of it.\n"
-            "Fix: jax.vmap(lambda traj: lj.action(system, traj))(trajectories)."
-        )
+    must_be_single(path.t.shape[:-1], "this trajectory", "jax.vmap(lambda traj: lj.action(system, traj))(trajectories)")
     params = path.params if params is None else params
     t, q, v = path.t, path.q, path.v
     s = coordinates.state(t[0], *jax.tree.map(lambda x: x[0], (q, v)), params)

@@ -3,7 +3,6 @@
 analyse the system  ->  one compiled search (`shooting.py`)  ->  raise or warn about what went wrong
 """
 
-import difflib
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -20,7 +19,8 @@ from lagjax.analysis.shooting import OrbitRequest
 from lagjax.display import labelled
 from lagjax.integrate import RESULTS, Report, Switches, Trajectory, integrate, reported
 from lagjax.jaxtools import HashablePart, hashable_partition, is_eager, is_traced, numpy_of, stop_gradient
-from lagjax.mechanics import describe, listed
+from lagjax.mechanics import describe
+from lagjax.refusals import must, must_be_single, must_name
 from lagjax.system import Held, Hybrid, State, System, coordinates
 
 POINTS = 401
@@ -88,11 +88,7 @@ class PeriodicOrbit(eqx.Module):
         return self.trajectory.phase_portrait()
 
     def _check_alone(self, what):
-        if np.ndim(self.period):
-            raise ValueError(
-                f"this is a batch of orbits of shape {np.shape(self.period)}: select one of them.\n"
-                f"Fix: jax.tree.map(lambda x: x[0], orbit).{what}"
-            )
+        must_be_single(np.shape(self.period), "this orbit", f"{{orbit}}.{what}")
 
     def __repr__(self):
         if is_traced(self):
@@ -206,8 +202,8 @@ def periodic_orbit(
             )
         asked = asked._replace(angles=tuple(name in (turns or {}) for name in names))
     rtol, period = tolerance_of(rtol, dtype), numpy_of(period).asarray(period, dtype)
-    if not is_traced(period) and not (np.ndim(period) == 0 and float(period) > 0):
-        raise ValueError(f"period must be one positive number, not {period}.\nFix: about the time of one swing.")
+    well = is_traced(period) or np.ndim(period) == 0 and float(period) > 0
+    must(well, "period must be one positive number", period, "about the time of one swing")
     given_turns = None if turns is None else _turns(turns, names, dtype)
     eager = is_eager() and not is_traced((s, period))
     if eager:
@@ -228,11 +224,9 @@ def _report(orbit: PeriodicOrbit) -> Report:
 
 
 def _pair(start):
-    if not (isinstance(start, (tuple, list)) and len(start) == 2):
-        raise TypeError(
-            f"start must be a pair (q, v), not {type(start).__name__}.\n"
-            "Fix: lj.periodic_orbit(system, (q, v), period, params)."
-        )
+    fix = "lj.periodic_orbit(system, (q, v), period, params)"
+    well = isinstance(start, (tuple, list)) and len(start) == 2
+    must(well, "start must be a pair (q, v)", start, fix, error=TypeError)
     return start
 
 
@@ -240,9 +234,7 @@ def _asked(problem, names, hold, relative) -> OrbitRequest:
     driven = not problem.reasons.autonomous
     all_names = [*names, *(_velocity(name) for name in names)]
     wanted = {relative} if isinstance(relative, str) else set(relative)
-    unknown = sorted(wanted - set(names))
-    if unknown:
-        raise ValueError(_no_such("relative", unknown[0], names))
+    must_name(sorted(wanted), names, "relative names", "coordinate", "relative='{}'")
     depended_on = [name for name, free in zip(names, problem.reasons.ignorable) if name in wanted and not free]
     if depended_on:
         raise ValueError(
@@ -264,9 +256,7 @@ def _asked(problem, names, hold, relative) -> OrbitRequest:
     entries = [name for name in hold if name not in ("energy", "period")]
     if len(all_names) == 2:
         all_names = ["q" if names[0] == "q" else names[0], all_names[1]]
-    for name in entries:
-        if name not in all_names:
-            raise ValueError(_no_such("hold", name, ["energy", "period", *all_names]))
+    must_name(entries, ["energy", "period", *all_names], "hold names", "coordinate or velocity", "hold='{}'")
     if "energy" in hold and not problem.reasons.energy:
         raise ValueError(
             "the Jacobi integral is not conserved here, so the orbit cannot hold that of the guess.\n"
@@ -296,15 +286,8 @@ def _velocity(name: str):
     return f"v{name[1:]}" if name == "q" or name.startswith("q[") else f"v.{name}"
 
 
-def _no_such(argument, name: str, names):
-    near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
-    return f"{argument} names '{name}', and there are {listed(names)}.\nFix: {argument}=\"{near}\"."
-
-
 def _turns(turns, names, dtype):
-    unknown = sorted(set(turns) - set(names))
-    if unknown:
-        raise ValueError(_no_such("turns", unknown[0], names))
+    must_name(turns, names, "turns names", "coordinate", "turns={'{}': 1}")
     return np.array([turns.get(name, 0) for name in names], dtype)
 
 

@@ -12,7 +12,6 @@ equals the effective potential, `E = U(r) + h²/(2r²)`.
 All of this comes from the crossings that `lj.integrate` records; `event_times.py` has their derivatives.
 """
 
-import difflib
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
@@ -25,6 +24,7 @@ from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.integrate import Crossing, Crossings, Trajectory, angle_mask, crossings_of, curves, integrate
 from lagjax.jaxtools import is_traced
+from lagjax.refusals import must_be, must_be_function, must_differ, must_go_together, must_name
 from lagjax.system import Hybrid, System, by_name, coordinates
 
 SECTION = "section"
@@ -56,12 +56,8 @@ class PoincareSection(eqx.Module):
     event: str = eqx.field(static=True, default=SECTION)
 
     def __check_init__(self):
-        if self.event not in self.trajectory.events:
-            recorded = ", ".join(map(repr, self.trajectory.events)) or "none"
-            raise ValueError(
-                f"the trajectory has no event '{self.event}'; recorded: {recorded}.\n"
-                f'Fix: lj.integrate(..., events={{"{self.event}": {AS_CROSSING}}}), or lj.poincare(..., section=...).'
-            )
+        fix = f"lj.integrate(..., events={{'{self.event}': {AS_CROSSING}}}), or lj.poincare(..., section=...)"
+        must_name(self.event, self.trajectory.events, "a section names", "event of the trajectory", fix)
 
     @property
     def crossings(self) -> Crossings:
@@ -109,13 +105,10 @@ class PoincareSection(eqx.Module):
                 "Usual cause: times that end too soon, a level that is not reached, or the wrong direction.\n"
                 "Fix: a later ts[-1], or section=lj.Crossing(..., direction=0, terminal=False)."
             )
-        if (x is None) != (y is None):
-            raise ValueError(
-                'a panel needs both x and y, and only one of them was given.\nFix: plot(x="q.theta", y="v.theta").'
-            )
+        must_go_together({"x": x, "y": y}, "a panel needs both", 'plot(x="q.theta", y="v.theta")')
+        must_name([name for name in (x, y) if name is not None], drawn, "plot was given", "column", "'{}'")
         pairs, angles = self._pairs(lanes[0])
-        asked = [(_among(list(drawn), x, "to plot"), _among(list(drawn), y, "to plot"))] if x is not None else None
-        pairs = asked or _varying(drawn, pairs, angles)
+        pairs = _varying(drawn, pairs, angles) if x is None else [(x, y)]
         # All lanes are wrapped or none: they share the picture.
         around = [name for name in angles if np.ptp(np.concatenate(drawn[name])) > TURN]
         drawn |= {name: [_within_half_turns(values) for values in drawn[name]] for name in around}
@@ -198,11 +191,7 @@ def poincare(
     the surface).
     """
     others = crossings_of(events, None)
-    if SECTION in others:
-        raise ValueError(
-            f"an event in events= is named '{SECTION}', which is the name of the section itself.\n"
-            "Fix: another name in events=."
-        )
+    must_differ([SECTION, *others], "an event in events= and the section itself", "another name in events=")
     recorded = {SECTION: _recorded(section), **others}
     return PoincareSection(integrate(system, q0, v0, params, ts=ts, events=recorded, **settings))
 
@@ -227,12 +216,9 @@ def periods(crossings: Crossings | PoincareSection) -> Float[Array, " C-1"]:
 
     Source: Landau & Lifshitz, *Mechanics*, §11.
     """
-    if not isinstance(crossings, Crossings | PoincareSection):
-        raise TypeError(
-            f"periods are computed from crossings, not from a {type(crossings).__name__}.\n"
-            'Fix: lj.periods(traj.events["apex"]), with events={"apex": lj.turning_points(direction=-1)} in '
-            "lj.integrate; or lj.periods(lj.poincare(...))."
-        )
+    example = 'lj.periods(traj.events["apex"]), with events={"apex": lj.turning_points(direction=-1)} in lj.integrate'
+    claim = "the argument of lj.periods must be crossings"
+    must_be(Crossings | PoincareSection, crossings, claim, f"{example}; or lj.periods(lj.poincare(...))")
     if crossings.t.shape[-1] < 2:
         raise ValueError(
             "only one crossing was kept, and a period is the time from one to the next.\n"
@@ -268,11 +254,8 @@ def turning_points(
 
     Source: Landau & Lifshitz, *Mechanics*, §11 and eq. (14.9).
     """
-    if not (coordinate is None or isinstance(coordinate, str)):
-        raise TypeError(
-            f"a coordinate is given by its name, not as {type(coordinate).__name__}.\n"
-            'Fix: lj.turning_points("theta"), or lj.turning_points("q[0]") of a vector.'
-        )
+    fix = 'lj.turning_points("theta"), or lj.turning_points("q[0]") of a vector'
+    must_be(str | None, coordinate, "a coordinate must be given by its name", fix)
     return Crossing(Velocity(coordinate), direction, terminal, most)
 
 
@@ -288,18 +271,16 @@ class Velocity(eqx.Module):
                 f"turning points of which coordinate? There are {', '.join(names)}.\n"
                 f'Fix: lj.turning_points("{names[0]}").'
             )
-        wanted = names[0] if wanted is None else _among(names, wanted, "turning points of", 'lj.turning_points("{}")')
+        wanted = names[0] if wanted is None else wanted
+        must_name(wanted, names, "turning points of", "coordinate", "lj.turning_points('{}')")
         return coordinates.numbers(v)[names.index(wanted)]
 
 
 def _recorded(section):
     """Return the section as a crossing to be recorded."""
     if not isinstance(section, Crossing):
-        if not callable(section):
-            raise TypeError(
-                f"a section must be a function of (t, q, v, params) or an lj.Crossing, not {type(section).__name__}.\n"
-                'Fix: section=lambda t, q, v, params: q["x"].'
-            )
+        example = 'section=lambda t, q, v, params: q["x"]'
+        must_be_function(section, "a section", "(t, q, v, params), or a lj.Crossing", example)
         return Crossing(section, direction=1, terminal=False, most=ROOM)
     if section.terminal:
         raise ValueError(
@@ -307,14 +288,6 @@ def _recorded(section):
             f"Fix: section={AS_CROSSING}."
         )
     return section
-
-
-def _among(names, name: str, asked, fix="'{}'"):
-    """Return `name`; raise unless it is one of `names`. `asked`: for what it was given."""
-    if name not in names:
-        near = (difflib.get_close_matches(str(name), names, 1) or names)[0]
-        raise ValueError(f"{asked} '{name}': there is none; there are {', '.join(names)}.\nFix: {fix.format(near)}.")
-    return name
 
 
 def _entry(name: str):

@@ -56,8 +56,9 @@ from lagjax.analysis.symmetry_test import (
     rates,
     too_few,
 )
-from lagjax.jaxtools import filled_up, is_traced, remembered
+from lagjax.jaxtools import filled_up, remembered
 from lagjax.mechanics import Generator, NoetherCharge, as_generator, conserved_momenta, describe
+from lagjax.refusals import must_have_values
 from lagjax.system import Model, check_system, coordinates, model_of, traced_system
 
 PIVOT_ABOVE = 1e-2
@@ -245,11 +246,8 @@ def symmetries(
     """
     check_system(system, q, v, params, states=False)
     s = coordinates.state(t, q, v, params)
-    if is_traced(s):
-        raise TypeError(
-            "symmetries are found from values, but JAX is tracing here.\n"
-            "Fix: call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside."
-        )
+    fix = "call it outside of jax.jit, jax.vmap and sweeps; lj.is_symmetry(...).holds tests one symmetry inside"
+    must_have_values(s, "symmetries are found from values", fix)
     model = model_of(traced_system(system, s), *s)
     own = _given(basis, s)
     tried = motions(s.q)

@@ -37,6 +37,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import Anchor
 from lagjax.jaxtools import is_traced, judging, numpy_of, to_jax
+from lagjax.refusals import must, must_be, must_have_values
 from lagjax.system import OF_STATE, Call, Holonomic, Nonholonomic, check_arguments
 
 # Not a jump of a force that reads a quaternion: e and -e are one rotation.
@@ -162,10 +163,8 @@ class Pose(NamedTuple):
         **Raises:** `ValueError` unless both are three numbers, and for an axis that is zero.
         """
         along = _three("the axis of a pose", axis)
-        if not is_traced(along) and not 0 < np.max(np.abs(np.asarray(along))) < np.inf:
-            raise ValueError(
-                "the axis of a pose must be finite and not zero.\nFix: axis=(0.0, 0.0, 1.0), of any length."
-            )
+        well = is_traced(along) or 0 < np.max(np.abs(np.asarray(along))) < np.inf
+        must(well, "the axis of a pose must be finite and not zero", along, "axis=(0.0, 0.0, 1.0), of any length")
         return cls(_three("the position of a pose", position), about(along, angle))
 
     def turned(self, axis: ArrayLike, angle: ArrayLike) -> "Pose":
@@ -265,13 +264,10 @@ def check_quantity(role: str, owner: str, given, shape: tuple[int, ...] = (), ab
         return
     numbers = np.asarray(given)
     well = numbers.shape == shape and np.issubdtype(numbers.dtype, np.number) and np.all(np.isfinite(numbers))
-    if not well or above_zero and not np.all(numbers > 0):
-        wanted = "a finite number" if shape == () else f"{shape[0]} finite numbers"
-        raise ValueError(
-            f"{role} of {owner} must be {wanted}{' above zero' * above_zero}, and is {given}.\n"
-            "Usual cause: a number that was computed before, and is NaN or has another sign.\n"
-            "Fix: numbers, or a function of params."
-        )
+    wanted = ("a finite number" if shape == () else f"{shape[0]} finite numbers") + " above zero" * above_zero
+    cause = "a number that was computed before, and is NaN or has another sign"
+    holds = well and (not above_zero or np.all(numbers > 0))
+    must(holds, f"{role} of {owner} must be {wanted}", given, "numbers, or a function of params", cause)
 
 
 def check_takes_state(role: str, owner: str, given):
@@ -327,11 +323,9 @@ class Body:
                 Call("motion", self.motion, ("t", "params"), f" of '{self.name}'"),
                 "an argument left out that is not needed",
             )
-        if not callable(self.mass) and not _is_mass(self.mass, massless):
-            raise ValueError(
-                f"the mass of '{self.name}' must be a positive number, and is {self.mass!r}.\n"
-                "Fix: its mass; of a frame in a lj.bodies.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)."
-            )
+        well = callable(self.mass) or _is_mass(self.mass, massless)
+        fix = "its mass; of a frame in a lj.bodies.Tree, mass=0.0 and inertia=(0.0, 0.0, 0.0)"
+        must(well, f"the mass of '{self.name}' must be a positive number", self.mass, fix)
 
     @property
     def unit(self) -> Holonomic:
@@ -547,8 +541,8 @@ class Marker:
         """A marker on a body."""
         _check_not_traced(f"place and axis of a marker on '{body.name}'", "point", point, axis)
         along = np.asarray(axis, float)
-        if along.shape != (3,) or not 0 < np.max(np.abs(along)) < np.inf:
-            raise ValueError(f"the axis of a marker on '{body.name}' must be three numbers, not all zero: {axis}.")
+        well = along.shape == (3,) and 0 < np.max(np.abs(along)) < np.inf
+        must(well, f"the axis of a marker on '{body.name}' must be three numbers that are not all zero", axis)
         along = unit_vector(along)
         near = np.eye(3)[1 if abs(along[0]) > 0.9 else 0]
         first = unit_vector(near - (near @ along) * along)
@@ -584,11 +578,8 @@ class Marker:
 def check_markers(what: str, *given):
     """Raise a `TypeError` that begins with `what`, unless all are markers."""
     for x in given:
-        if not isinstance(x, Marker):
-            raise TypeError(
-                f"{what}, and {type(x).__name__} is none.\n"
-                "Fix: lj.bodies.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))."
-            )
+        fix = "lj.bodies.spherical(crank.at((0.5, 0.0, 0.0)), rod.at((-1.0, 0.0, 0.0)))"
+        must_be(Marker, x, f"{what}: a lj.bodies.Marker", fix)
 
 
 def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
@@ -609,21 +600,15 @@ def check_bodies(what: str, given: Iterable[Body]) -> tuple[Body, ...]:
 def _three(what: str, given: ArrayLike) -> Float[Array, "3"]:
     """A vector; a `ValueError` that begins with `what`, unless it has three numbers."""
     found = numpy_of(given).asarray(given, jax.dtypes.canonicalize_dtype(float))
-    if found.shape != (3,):
-        raise ValueError(
-            f"{what} must be three numbers, and has shape {found.shape}.\n"
-            "Usual cause: a plane, or one number about an axis.\nFix: all of them, (0.0, 0.0, 1.0)."
-        )
+    fix, cause = "all of them, (0.0, 0.0, 1.0)", "a plane, or one number about an axis"
+    must(found.shape == (3,), f"{what} must be three numbers", given, fix, cause)
     return to_jax(found)
 
 
 def _check_not_traced(what: str, role: str, *given: Any):
-    if is_traced(given):
-        raise TypeError(
-            f"{what} must be numbers, and JAX is tracing what was given.\n"
-            "Usual cause: a body made inside of jit, vmap or grad, compiled again for each value.\n"
-            f"Fix: {role}=lambda params: params['{role}'], with the value among the parameters."
-        )
+    fix = f"{role}=lambda params: params['{role}'], with the value among the parameters"
+    cause = "a body made inside of jit, vmap or grad, compiled again for each value"
+    must_have_values(given, f"{what} must be numbers", fix, cause)
 
 
 def _is_mass(given: Any, massless: bool) -> bool:
@@ -633,11 +618,8 @@ def _is_mass(given: Any, massless: bool) -> bool:
 
 def _check_inertia(name: str, given: np.ndarray):
     is_symmetric = given.ndim == 1 or given.shape == (3, 3) and np.allclose(given, given.T)
-    if given.shape not in ((3,), (3, 3)) or not is_symmetric or not np.all(np.isfinite(given)):
-        raise ValueError(
-            f"the inertia of '{name}' must be three principal moments or a symmetric matrix (3, 3), and is "
-            f"{given.tolist()}."
-        )
+    well = given.shape in ((3,), (3, 3)) and is_symmetric and np.all(np.isfinite(given))
+    must(well, f"the inertia of '{name}' must be three principal moments or a symmetric matrix (3, 3)", given)
     # Sums of the largest numbers overflow, those of shares of them do not.
     size = np.abs(given).max() or 1.0
     moments = np.sort(given / size if given.ndim == 1 else np.linalg.eigvalsh(given / size))
@@ -723,10 +705,7 @@ class OfPlaced(SystemFunction):
 
 def _pose(body: Body, t, params: PyTree, dtype) -> Pose:
     pose = body.motion(t, params) if body.motion is not None else None
-    if not isinstance(pose, Pose):
-        raise TypeError(
-            f"the motion of '{body.name}' must return a lj.bodies.Pose, and returned {type(pose).__name__}.\n"
-            f'Fix: lj.bodies.Body("{body.name}", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t)).'
-        )
+    fix = f'lj.bodies.Body("{body.name}", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t))'
+    must_be(Pose, pose, f"the motion of '{body.name}' must return a lj.bodies.Pose", fix)
     position, e = (jnp.asarray(x, dtype) for x in pose)
     return Pose(position, e / jnp.sqrt(jnp.sum(e**2)))

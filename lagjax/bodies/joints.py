@@ -34,6 +34,7 @@ from jaxtyping import Array, Float, PyTree
 from lagjax.bodies.body import Body, Ground, Marker, SystemFunction, check_markers, check_takes_params, ground, valued
 from lagjax.display import Shape
 from lagjax.jaxtools import is_traced
+from lagjax.refusals import must, must_be
 from lagjax.shapes import axis, gap, line
 from lagjax.system import Holonomic, Nonholonomic
 
@@ -351,12 +352,8 @@ def _turning(place: Marker, carrier: Body | Ground, q: PyTree, v: PyTree) -> Flo
 
 def _check_gear(whose: str, a: Marker, b: Marker, carrier: Body | Ground):
     check_two(a, b)
-    if not isinstance(carrier, Body | Ground):
-        raise TypeError(
-            f"the carrier of {whose} is a body, and {type(carrier).__name__} is none.\n"
-            "Fix: carrier=arm, the lj.bodies.Body itself and no place on it; lj.bodies.ground, the default, where it "
-            "does not turn."
-        )
+    fix = "carrier=arm, the lj.bodies.Body itself and no place on it; lj.bodies.ground if it does not turn"
+    must_be(Body | Ground, carrier, f"the carrier of {whose} must be a body", fix)
     if isinstance(carrier, Body) and carrier in (a.body, b.body):
         raise ValueError(
             f"the carrier of {whose}, '{carrier.name}', is one of the two bodies, which does not turn against itself.\n"
@@ -370,11 +367,8 @@ def _check_number(role: str, whose: str, given: ArrayLike | Callable):
     if callable(given) or is_traced(given):
         return
     number = np.asarray(given)
-    if number.shape or not np.isfinite(number) or number == 0:
-        divided = not number.shape and not np.isfinite(number)
-        cause = "a division by zero" if divided else "numbers of teeth divided as whole numbers, 20 // 60"
-        raise ValueError(
-            f"the {role} of {whose} must be a finite number that is not 0, and is {given}.\n"
-            f"Usual cause: {cause}.\n"
-            f"Fix: {role}=-60 / 20; a body that does not turn is held by lj.bodies.fixed or lj.bodies.prismatic."
-        )
+    well = not number.shape and np.isfinite(number) and number != 0
+    fix = f"{role}=-60 / 20; a body that does not turn is held by lj.bodies.fixed or lj.bodies.prismatic"
+    divided = not number.shape and not np.isfinite(number)
+    cause = "a division by zero" if divided else "numbers of teeth divided as whole numbers, 20 // 60"
+    must(well, f"the {role} of {whose} must be a finite number that is not 0", given, fix, cause)

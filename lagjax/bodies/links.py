@@ -11,7 +11,6 @@ always fork at most log2(n), as the largest branch comes last.
 places that are functions of params are called once for each function, however many links have it.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +24,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Body, Driven, Ground, Marker, check_takes_params, ground, valued
 from lagjax.bodies.joints import Joined, above, apart, aside, cross, tilt, turn
+from lagjax.refusals import must, must_differ, must_name
 from lagjax.system import Holonomic
 
 # The freedoms that a joint leaves, from the rows that it has as a constraint.
@@ -124,28 +124,21 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
             held_by[body.name] = body.name, Joined(ground.at(), body.at(), ()), ("free",), quaternions
             entries.append(Entry(body.name, ("free",), None))
             quaternions += 1
-    names = [entry.name for entry in entries]
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"a joint and a free body are called '{twice[0]}'.\nFix: a name for each.")
+    must_differ([entry.name for entry in entries], "a joint and a free body")
     return _in_order(bodies, held_by), entries
 
 
 def check_armature(entries: Sequence[Entry], armature: Mapping) -> dict[str, Any]:
     """The armature by the names of joints; raises where it is of none, or no inertia."""
     shapes = {entry.name: entry.rotors for entry in entries if entry.kinds != ("free",)}
+    must_name(armature, shapes, "armature names", "joint with a coordinate")
     for name, given in armature.items():
-        if name not in shapes:
-            listed = f"one of {', '.join(map(repr, shapes))}" if shapes else "leave it out"
-            raise ValueError(f"armature '{name}' belongs to no joint with a coordinate.\nFix: {listed}.")
         if callable(given):
             check_takes_params("armature", f"'{name}'", given)
             continue
         numbers, shape = np.asarray(given), shapes[name]
-        if numbers.shape not in ((), shape) or not np.all(numbers >= 0):
-            raise ValueError(
-                f"the armature of '{name}' must be a moment of inertia that is not negative"
-                f"{f', or {shape} of them' if shape else ''}, and is {given}."
-            )
+        well, several = numbers.shape in ((), shape) and np.all(numbers >= 0), f", or {shape} of them" * bool(shape)
+        must(well, f"the armature of '{name}' must be a moment of inertia that is not negative{several}", given)
     return dict(armature)
 
 

@@ -25,6 +25,7 @@ from lagjax.bodies.body import (
 )
 from lagjax.display import Shape
 from lagjax.jaxtools import numpy_of
+from lagjax.refusals import must_be
 from lagjax.shapes import line
 
 
@@ -344,12 +345,9 @@ def check_loads(whose: str, loads: Iterable[Load]) -> tuple[Load, ...]:
         )
     loads = tuple(loads)
     for i, load in enumerate(loads):
-        if not isinstance(load, Load):
-            raise TypeError(
-                f"load {i} of {whose} is no lj.bodies.Load, but {type(load).__name__}.\n"
-                "Usual cause: a function of (t, q, v, params) by itself, or a joint among the loads.\n"
-                "Fix: lj.bodies.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force."
-            )
+        fix = "lj.bodies.Load(potential=f), or lagrangian=f for a term of L, force=f for a generalized force"
+        cause = "a function of (t, q, v, params) by itself, or a joint among the loads"
+        must_be(Load, load, f"load {i} of {whose} must be a lj.bodies.Load", fix, cause)
     return loads
 
 

@@ -36,6 +36,7 @@ from lagjax.bodies.body import Ground, Marker, SystemFunction, check_quantity, g
 from lagjax.bodies.joints import check_two
 from lagjax.display import Shape
 from lagjax.jaxtools import is_traced, jaxpr_as_fun, rule_follows
+from lagjax.refusals import must, must_be, must_be_function
 from lagjax.shapes import disk, ellipsoid, level, sphere
 from lagjax.system import Call, Holonomic, Nonholonomic, check_arguments
 
@@ -192,19 +193,12 @@ class Surface:
     is_distance: bool = False
 
     def __post_init__(self):
-        if not callable(self.f):
-            raise TypeError(
-                f"a lj.bodies.Surface takes a function f(r, params), not {type(self.f).__name__}.\n"
-                "Fix: lj.bodies.Surface(lambda r, params: r[2] - r[0] ** 2)."
-            )
+        fix = "lj.bodies.Surface(lambda r, params: r[2] - r[0] ** 2)"
+        must_be_function(self.f, "f of a lj.bodies.Surface", "(r, params)", fix)
         check_arguments(Call("f", self.f, ("r", "params"), " of lj.bodies.Surface"), "x, y and z as three arguments")
         if isinstance(self.on, Ground):
             object.__setattr__(self, "on", self.on.at())
-        if not isinstance(self.on, Marker):
-            raise TypeError(
-                f"a lj.bodies.Surface is on a marker, and {type(self.on).__name__} is none.\n"
-                "Fix: lj.bodies.Surface(f, on=table.at())."
-            )
+        must_be(Marker, self.on, "a lj.bodies.Surface must be on a marker", "lj.bodies.Surface(f, on=table.at())")
 
     @cached_property
     def drawing(self) -> tuple[Shape]:
@@ -280,12 +274,8 @@ def rolling_ellipsoid(stone: Marker, floor: "Marker | Surface", half_axes: Seque
 
     Source: Garcia & Hubbard, Proc. R. Soc. A 418 (1988) 165 (the rattleback).
     """
-    if np.shape(half_axes) != (3,):
-        raise ValueError(
-            f"lj.bodies.rolling_ellipsoid takes three half axes, and was given {half_axes!r}.\n"
-            "Usual cause: one radius.\n"
-            "Fix: (a, b, c) along the axes of the marker; lj.bodies.rolling_sphere for a sphere."
-        )
+    fix = "(a, b, c) along the axes of the marker; lj.bodies.rolling_sphere for a sphere"
+    must(np.shape(half_axes) == (3,), "lj.bodies.rolling_ellipsoid takes three half axes", half_axes, fix, "one radius")
     for half_axis in half_axes:
         check_quantity("a half axis", "lj.bodies.rolling_ellipsoid", half_axis, above_zero=True)
     return _contact(Touching(stone, floor, "ellipsoid", tuple(half_axes)))

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax.refusals import installed
+
 # Okabe & Ito's colours: distinct to colour-blind readers and in grey print, with a marker and dash each.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 1)))
@@ -48,13 +50,7 @@ def _png(fig):
 
 def import_matplotlib():
     """Import matplotlib, or say how to get it."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ImportError(
-            'plots need matplotlib, which is an optional extra.\nFix: pip install "lagjax[plot]"'
-        ) from error
-    return matplotlib
+    return installed("matplotlib", "this plot", "plot")
 
 
 @contextmanager

@@ -25,6 +25,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from lagjax.refusals import must
+
 # Pieces along the edge of a cube and the length of a cylinder; sides of a cylinder; circles of latitude of a sphere.
 PIECES, SIDES, BELTS = 3, 20, 10
 # Sectors that are light and dark by turns, so that turning is seen.
@@ -53,8 +55,8 @@ def surface(vertices: ArrayLike, faces: Sequence[Sequence[int]]) -> Faces:
     **Raises:** `ValueError` for vertices that are not finite points of space, and faces that are not of their indices.
     """
     points = np.asarray(vertices, float)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
-        raise ValueError(f"vertices must be finite points of space, (n, 3), and have the shape {points.shape}.")
+    well = points.ndim == 2 and points.shape[1:] == (3,) and np.all(np.isfinite(points))
+    must(well, "vertices must be finite points of space, (n, 3)", points)
     corners = [np.asarray(face) for face in faces]
     for face in corners:
         whole = face.ndim == 1 and len(face) >= 3 and np.issubdtype(face.dtype, np.integer)
@@ -257,11 +259,8 @@ class Shape:
     level: Callable | None = None
 
     def __post_init__(self):
-        if self.color is not None and not (isinstance(self.color, str) and COLOUR.fullmatch(self.color)):
-            raise ValueError(
-                f"a color must be six hexadecimal digits, and is {self.color!r}.\n"
-                'Fix: color="#D55E00", or leave it out.'
-            )
+        well = self.color is None or isinstance(self.color, str) and COLOUR.fullmatch(self.color)
+        must(well, "a color must be six hexadecimal digits", self.color, 'color="#D55E00", or leave it out')
 
     def __repr__(self):
         names = dict.fromkeys("the ground" if anchor.body is None else f"'{anchor.body}'" for anchor in self.anchors)
@@ -271,8 +270,7 @@ class Shape:
         """The same with numbers in the place of functions of params."""
         anchors = tuple(Anchor(a.body, _three(a.point, params, "a point"), a.axes) for a in self.anchors)
         size = _three(self.size, params, "the size")
-        if not np.all(size >= 0):
-            raise ValueError(f"the size of a shape is negative: {size.tolist()}.\nFix: lengths from zero on.")
+        must(np.all(size >= 0), "the size of a shape must be lengths from zero on", size)
         level = None if self.level is None else partial(self.level, params=params)
         return Shape(self.kind, anchors, self.surface, size, self.color, level)
 
@@ -312,8 +310,7 @@ class Drawing(NamedTuple):
 
 def _three(x: Any, params: PyTree, what: str) -> np.ndarray:
     found = np.asarray(x(params) if callable(x) else x, float)
-    if found.shape != (3,) or not np.all(np.isfinite(found)):
-        raise ValueError(f"{what} of a shape must be three finite numbers, and is {found.tolist()}.")
+    must(found.shape == (3,) and np.all(np.isfinite(found)), f"{what} of a shape must be three finite numbers", found)
     return found
 
 

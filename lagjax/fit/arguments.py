@@ -16,6 +16,7 @@ from lagjax.fit.unknowns import FreeNumbers, find, leaf_name, starts
 from lagjax.integrate import Crossing, traced_guard, traced_phases
 from lagjax.jaxtools import is_traced, numpy_of
 from lagjax.mechanics import listed
+from lagjax.refusals import must_be_among, must_name
 from lagjax.system import OF_STATE, Call, Hybrid, State, System, check_system, model_of, traced_call, traced_system
 
 # Arguments of `integrate` that a fit sets itself.
@@ -59,8 +60,7 @@ def problem_of(
     records = [records] if isinstance(records, Record) else list(records)
     if not records or not all(isinstance(record, Record) for record in records):
         raise TypeError("records must be a lj.Record or a list of them.\nFix: lj.Record(t, q=measured).")
-    if loss not in LOSSES:
-        raise ValueError(f"loss must be {listed(list(LOSSES))}, not {loss!r}.")
+    must_be_among(LOSSES, loss, "loss")
     if SET_BY_FIT & set(options):
         raise ValueError(f"{listed(sorted(SET_BY_FIT & set(options)))} cannot be given: a fit sets it itself.")
     _check_kinds(records, observe, options)
@@ -136,9 +136,8 @@ def _overrides(records: Sequence[Record], windows: Windows, found: FreeNumbers):
     known = {leaf_name(path): x for path, x in jtu.tree_leaves_with_path(found.params)}
     fitted = {name.partition("[")[0] for name in found.names}
     values = {}
+    must_name(names, known, "a record sets", "entry of params")
     for name in names:
-        if name not in known:
-            raise ValueError(f"a record sets '{name}', which is not in params: {listed(list(known))}.")
         if name in fitted:
             raise ValueError(
                 f"a record sets '{name}', which the fit is to find.\nFix: leave it out of free=, or out of the record."

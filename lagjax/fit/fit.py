@@ -48,6 +48,7 @@ from lagjax.integrate import described_system, integrate, reported, same_system
 from lagjax.jaxtools import is_traced, jitted, kinds, numpy_of, once
 from lagjax.mechanics import listed
 from lagjax.numerics import Unknowns
+from lagjax.refusals import must_be
 from lagjax.system import Hybrid, System, UnknownSystem
 
 # Measurements per unknown in the first part of a record, which doubles stage by stage; the largest number of stages.
@@ -206,11 +207,9 @@ def _check_optimiser(optimiser: Any, options: dict[str, Any]):
             "Fix: loss = lj.fit_loss(system, records, params, window=1.0, joined=False), a function whose slope "
             "jax.grad(loss)(unknowns) any optimiser takes: the recipe in docs/learned.md, 'Training'."
         )
-    if optimiser is not None and not isinstance(optimiser, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
-        raise TypeError(
-            "optimiser must be one of optimistix's least-squares solvers or minimisers, not "
-            f"{optimiser!r:.60}.\nFix: leave it out; or optimistix.BFGS(1e-6, 1e-6); lj.fit_loss for all others."
-        )
+    claim = "optimiser must be one of optimistix's least-squares solvers or minimisers"
+    fix = "leave it out; or optimistix.BFGS(1e-6, 1e-6); lj.fit_loss for all others"
+    must_be(optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser | None, optimiser, claim, fix)
 
 
 def _course(problem: FitProblem, grow: bool, joined: bool, scattered: Array, try_all: bool) -> Course:

@@ -38,6 +38,7 @@ from lagjax.integrate import integrate
 from lagjax.jaxtools import compiled, filled_up
 from lagjax.mechanics import listed
 from lagjax.numerics import Unknowns
+from lagjax.refusals import must, must_be, must_be_whole, must_name, must_return
 
 # A number is determined if the undetermined directions hold no larger share than this of its squared slopes.
 NEGLIGIBLE_SHARE = 1e-8
@@ -75,8 +76,7 @@ class Candidate(NamedTuple):
 
     def at_best(self, count: int) -> tuple[Float[np.ndarray, " k"], float]:
         """The best `count` times to measure at, each once, and the standard deviation after these alone."""
-        if not 1 <= count <= len(self.t):
-            raise ValueError(f"'{self.name}' has {len(self.t)} times, and the best {count} of them were asked for.")
+        must_be_whole(count, f"the number of best times of '{self.name}'", most=len(self.t), fix="at_best(1)")
         chosen, sd = _exchange(self, count)
         return self.t[chosen], sd
 
@@ -342,12 +342,8 @@ def _direction(problem: FitProblem, shrink: str | Callable):
         def number(x: Array):
             return jnp.asarray(shrink(problem.found.into(x)))
 
-        shape = jax.eval_shape(number, x).shape
-        if shape != ():
-            raise ValueError(
-                f"shrink(params) must be a single number, not an array of shape {shape}.\n"
-                'Fix: shrink=lambda params: params["g"] / params["l"].'
-            )
+        shape, fix = jax.eval_shape(number, x), 'shrink=lambda params: params["g"] / params["l"]'
+        must_return(shape.shape == (), "shrink(params)", "a single number", shape, fix)
         name = getattr(shrink, "__name__", "shrink")
         direction = np.asarray(jax.grad(number)(x))
         if not np.all(np.isfinite(direction)) or not np.any(direction):
@@ -356,11 +352,8 @@ def _direction(problem: FitProblem, shrink: str | Callable):
         return "shrink(params)" if name == "<lambda>" else name, direction
     if not names:
         raise ValueError(f"shrink names {shrink!r}, but no parameter is fitted.\nFix: free=[{shrink!r}].")
-    if shrink not in names:
-        raise ValueError(
-            f"shrink names {shrink!r}, which is not among the fitted parameters: {listed(list(names))}.\n"
-            "Fix: one of these names, or a function of params; parameters left out of free= count as known."
-        )
+    fix = "shrink='{}', or a function of params; parameters left out of free= count as known"
+    must_name(shrink, names, "shrink names", "fitted parameter", fix)
     return f"'{shrink}'", np.eye(len(names))[names.index(shrink)]
 
 
@@ -373,13 +366,10 @@ def _candidate_runs(
     problem_for: Callable,
 ):
     """Candidates that are other runs, each with its own unknown start."""
-    if not candidates:
-        raise ValueError("candidates is empty.\nFix: leave it out, or {'a longer run': lj.Record(...)}.")
-    wrong = [name for name, record in candidates.items() if not isinstance(record, Record)]
-    if wrong:
-        raise TypeError(f"candidate '{wrong[0]}' must be a lj.Record.\nFix: lj.Record(t, q=np.zeros(len(t)), q0=...).")
+    must(candidates, "candidates must hold a record", candidates, "leave it out, or {'a longer run': lj.Record(...)}")
     forms: dict[Any, list[str]] = {}
     for name, record in candidates.items():
+        must_be(Record, record, f"candidate '{name}' must be a lj.Record", "lj.Record(t, q=np.zeros(len(t)), q0=...)")
         if (record.sigma is not None) != problem.absolute:
             have = "no sigma, and the records have one" if problem.absolute else "a sigma, and the records have none"
             raise ValueError(f"candidate '{name}' has {have}.\nFix: give it to all, or none.")

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from lagjax.jaxtools import filled_up, is_traced, numpy_of
+from lagjax.refusals import must, must_be_finite, must_have_values
 
 # The kinds of measurement: `end` once per run, the others at each of its times.
 KINDS = ("q", "v", "multipliers", "observed", "end")
@@ -75,8 +76,7 @@ class Record(eqx.Module):
         params: Mapping[str, ArrayLike] | None = None,
         sigma: PyTree = None,
     ):
-        if is_traced(t):
-            raise TypeError("the times of a record must be numbers, not traced: they determine its shape.")
+        must_have_values(t, "the times of a record determine its shape", "times that are numbers")
         self.t = _times(t)
         given = zip(KINDS, (q, v, multipliers, observed, end))
         # Sorted as JAX sorts dictionaries: residuals are in this order.
@@ -148,10 +148,8 @@ def _held(hold: Any):
 
 def _times(t: ArrayLike):
     t = np.asarray(t, np.result_type(np.asarray(t).dtype, np.float32))
-    if t.ndim != 1 or len(t) < 2:
-        raise ValueError(f"the times of a record must be a vector of two or more, not of shape {t.shape}.")
-    if not np.all(np.isfinite(t)):
-        raise ValueError("the times of a record contain NaN or infinity.\nFix: drop these samples.")
+    must(t.ndim == 1 and len(t) >= 2, "the times of a record must be a vector of two or more", t)
+    must_be_finite(t, "the times of a record", "drop these samples")
     late = np.flatnonzero(np.diff(t) <= 0)
     if late.size:
         i = int(late[0])
@@ -231,8 +229,7 @@ def cut(records: Sequence[Record], window: float | None, dtype: Any) -> Windows:
     pieces = []
     for r, record in enumerate(records):
         t, span = record.t, record.t[-1] - record.t[0]
-        if window is not None and not 0 < window:
-            raise ValueError(f"window must be a positive length of time, not {window}.")
+        must(window is None or window > 0, "window must be a positive length of time", window)
         if window is not None and window < 2 * np.max(np.diff(t)):
             raise ValueError(
                 f"window = {window:.6g} is shorter than two intervals of a record, of {np.max(np.diff(t)):.6g}.\n"

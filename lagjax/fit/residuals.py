@@ -24,8 +24,8 @@ from lagjax.fit.records import PADDING, Windows, channel_name
 from lagjax.fit.unknowns import FreeNumbers, Starts, leaf_name
 from lagjax.integrate import Trajectory, ended_well, integrate
 from lagjax.jaxtools import compiled
-from lagjax.mechanics import listed
 from lagjax.numerics import Slopes, Unknowns, WindowedEquations
+from lagjax.refusals import must_name
 from lagjax.system import model_of
 
 # The residual of a sample that the motion does not reach, in spreads of its data.
@@ -336,12 +336,9 @@ def check_predicted(problem: FitProblem):
 
 def _check_match(kind: str, predicted: Any, measured: Any, axes: int, path: tuple[Any, ...] = ()):
     if isinstance(measured, dict) and isinstance(predicted, dict):
+        fix = f"the motion's names, {kind}={{'{{}}': ...}}"
+        must_name(measured, predicted, f"what was measured as {kind} has", "name of the motion", fix)
         for name, part in measured.items():
-            if name not in predicted:
-                raise ValueError(
-                    f"'{name}' was measured as {kind}, but the motion has no such name: {listed(list(predicted))}.\n"
-                    f"Fix: use the motion's names: {kind}={{{list(predicted)[0]!r}: ...}}."
-                )
             _check_match(kind, predicted[name], part, axes, (*path, jtu.DictKey(name)))
         return
     structure, wanted = jtu.tree_structure(predicted), jtu.tree_structure(measured)

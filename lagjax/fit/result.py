@@ -29,6 +29,7 @@ from lagjax.integrate import RESULTS, Report, Trajectory, integrate
 from lagjax.jaxtools import compiled, is_traced, numpy_of
 from lagjax.mechanics import listed
 from lagjax.numerics import Unknowns
+from lagjax.refusals import must_have_values
 from lagjax.system import State, UnknownSystem, coordinates, signature
 
 
@@ -396,8 +397,7 @@ class Fit:
 
         **Raises:** `ValueError` for joined windows, whose starts are not free; `TypeError` if the fit is traced.
         """
-        if self._traced:
-            raise TypeError("laplace() needs numbers, but this fit is traced.\nFix: call it outside of the program.")
+        must_have_values((self.cost, self.unknowns), "laplace() needs numbers")
         evaluation = self._evaluated()
         priors = np.isfinite(self.problem.found.sd).sum()
         without_seams = self.known().sum() + priors - sum(np.sum(d) for d in evaluation.determined)
@@ -428,8 +428,7 @@ class Fit:
 
         **Raises:** `TypeError` for values in `params` that are not data, by name; `OSError` if there is no such folder.
         """
-        if is_traced(self):
-            raise TypeError("this fit is being traced and has no numbers yet.\nFix: save it outside of the program.")
+        must_have_values(self, "a fit is saved by its values", "save it outside of the program")
         problem = self.problem
         # Without phases, `first` is the system itself.
         roles = {id(problem.first): "first", id(problem.system): "system", id(problem.unflatten): "unflatten"}

@@ -54,9 +54,10 @@ from lagjax.fit.next_measurement import (
 from lagjax.fit.records import Record
 from lagjax.fit.residuals import WHOLE, FitProblem, check_motion, over_windows, window_part
 from lagjax.fit.search import UNSEEN, evaluate
-from lagjax.jaxtools import compiled, is_traced
+from lagjax.jaxtools import compiled
 from lagjax.mechanics import listed
 from lagjax.numerics import Unknowns, null_space
+from lagjax.refusals import must_have_values
 from lagjax.system import Hybrid, System, coordinates
 
 # A combination is written as a product of powers (m/M, k/m², but not m^0.37 M^-1.2) if its scaled exponents are
@@ -528,11 +529,8 @@ def identifiability(
         raise ValueError('candidates= needs shrink=, the number that they are compared by.\nFix: shrink="g".')
     at = None if shrink is None else survey(problem, problem.start)
     evaluation = evaluate(problem, problem.start, WHOLE) if at is None else at.evaluation
-    if is_traced(evaluation):
-        raise TypeError(
-            "identifiability needs the values of its arguments, and they are being traced.\n"
-            "Fix: call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled only once."
-        )
+    fix = "call it in a Python loop, not in jit, vmap or lj.sweep: it is compiled only once"
+    must_have_values(evaluation, "identifiability needs the values of its arguments", fix)
     check_motion(problem, evaluation.well, problem.start)
     following = None
     if at is not None:

@@ -43,6 +43,7 @@ from lagjax.integrate import integrate
 from lagjax.jaxtools import at_once, compiled, is_traced, kinds, numpy_of, once, stop_gradient
 from lagjax.mechanics import departures, equations_of, free_coordinates, listed, with_first_order, within
 from lagjax.numerics import last_step, newton, null_space
+from lagjax.refusals import must
 from lagjax.system import Model, State, System, constraints, coordinates, model_of, traced_system, with_rates
 
 # The standard deviation of a weak prior, relative to the root mean square of the guesses of a network's weights. With
@@ -181,8 +182,7 @@ def find(
 
     low, high = spread(bounds, (-np.inf, np.inf), "bounds")
     mean, sd = spread({name: pair for name, pair in priors.items() if pair is not None}, (0.0, np.inf), "priors")
-    if np.any(sd <= 0):
-        raise ValueError('the standard deviation of a prior must be positive.\nFix: priors={"g": (9.81, 0.01)}.')
+    must(np.all(sd > 0), "the standard deviation of a prior must be positive", sd, 'priors={"g": (9.81, 0.01)}')
     # Which network each number belongs to, counted from 1; 0 for one with a prior of its own, or with None for it.
     networks = _networks(params, chosen) if error else []
     of = spread({name: (i + 1, None) for i, name in enumerate(networks)}, (0, 0), "priors")[0]
@@ -243,9 +243,9 @@ def _matching(
 
 
 def _check_pair(name: str, pair: Any, what: str):
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
-        raise ValueError(f"{what} of '{name}' must be a pair, not {pair!r}.\nFix: {what}={example}.")
+    example = '{"m": (0.0, None)}' if what == "bounds" else '{"g": (9.81, 0.01)}, mean and standard deviation'
+    well = isinstance(pair, tuple | list) and len(pair) == 2
+    must(well, f"{what} of '{name}' must be a pair", pair, f"{what}={example}")
 
 
 def _check_start(found: FreeNumbers, low: np.ndarray, high: np.ndarray):

@@ -25,6 +25,7 @@ from lagjax.integrate.trajectory import AccuracyWarning, Trajectory
 from lagjax.jaxtools import at_once, compiled, is_traced, numpy_of, once
 from lagjax.mechanics import departures
 from lagjax.numerics import EqualSteps
+from lagjax.refusals import must, must_be, must_be_among, must_be_finite, must_be_whole, must_not_meet
 from lagjax.system import Hybrid, Model, State, System, coordinates, warn
 
 # From here on, with a network in L, Tsit5 is the default, with outputs inside its steps. Evaluations at rtol 1e-5 with
@@ -33,8 +34,7 @@ from lagjax.system import Hybrid, Model, State, System, coordinates, warn
 LOOSE = 1e-6
 # Tolerances that each dtype reaches with a margin.
 DEFAULT_TOLERANCE = {np.dtype("float64"): 1e-9, np.dtype("float32"): 1e-5}
-# The prefix with which a user writes a method, by the package that defines it.
-PACKAGES = {"diffrax": "diffrax.", "lagjax": "lj."}
+
 # Steps are counted in 32 bits where x64 is off.
 MOST_STEPS = 2**31 - 1
 # The least span of a motion in round-offs of its times: a step ends at some of the times that can be told apart.
@@ -47,18 +47,13 @@ def check_method(method: Any):
     """Raise unless `method` is None or an instance of a diffrax solver for a whole state."""
     if method is None or isinstance(method, EqualSteps):
         return
-    if isinstance(method, type) and issubclass(method, diffrax.AbstractSolver | EqualSteps):
-        raise TypeError(
-            f"method must be a solver instance, and {method.__name__} is the class.\n"
-            "Usual cause: missing brackets.\n"
-            f"Fix: method={PACKAGES.get(method.__module__.split('.')[0], '')}{method.__name__}()."
-        )
-    if not isinstance(method, diffrax.AbstractSolver):
-        raise TypeError(
-            f"method must be a diffrax solver, not {type(method).__name__}.\n"
-            "Usual cause: a method given by its name, as in SciPy.\n"
-            "Fix: method=lj.Dopri8(), any of diffrax's, or leave it out."
-        )
+    must_be(
+        diffrax.AbstractSolver | EqualSteps,
+        method,
+        "method must be a diffrax solver",
+        "method=lj.Dopri8(), any of diffrax's, or leave it out",
+        "a method given by its name, as in SciPy",
+    )
     if method.term_structure is not diffrax.AbstractTerm:
         raise TypeError(
             f"{type(method).__name__} needs a vector field of a special form, and the accelerations of a general "
@@ -82,43 +77,28 @@ def check_equal_steps(method: EqualSteps, dt0: Any, system: System | Hybrid, **o
             "Fix: leave method out; or events=, which are found inside the steps, and may end the motion."
         )
     for name, given in others.items():
-        if given is not None:
-            raise ValueError(
-                f"{name} has no meaning for lj.{method.label}, whose steps have equal length throughout, and end at "
-                f"outputs alone.\nFix: leave {name} out; or method=lj.Dopri8()."
-            )
+        why = "its steps have equal length throughout, and end at outputs alone"
+        must_not_meet({name: given, f"lj.{method.label}": method}, why, f"leave {name} out; or method=lj.Dopri8()")
 
 
 def check_jumps(jumps: Any) -> str:
     """Return `jumps`; raise unless it is one of its two values."""
-    if jumps not in ("found", "ignored"):
-        raise ValueError(
-            f"jumps must be 'found' or 'ignored', not {jumps!r:.60}.\n"
-            "Usual cause: times of jumps, which are jump_ts=.\n"
-            'Fix: leave jumps out (they are found), or jumps="ignored".'
-        )
-    return jumps
+    fix = 'leave jumps out (they are found), or jumps="ignored"'
+    return must_be_among(("found", "ignored"), jumps, "jumps", fix, "times of jumps, which are jump_ts=")
 
 
 def check_outputs(outputs: Any) -> str | None:
     """Return `outputs`; raise unless it is None or one of two words."""
-    if not (outputs is None or isinstance(outputs, str) and outputs in ("exact", "interpolated")):
-        raise ValueError(
-            f"outputs must be 'exact' or 'interpolated', not {outputs!r:.60}.\n"
-            "Usual cause: the times of outputs, which are ts=.\n"
-            'Fix: outputs="exact" (they are ends of steps), outputs="interpolated", or leave it out.'
-        )
-    return outputs
+    fix = 'outputs="exact" (they are ends of steps), outputs="interpolated", or leave it out'
+    words = ("exact", "interpolated", None)
+    return must_be_among(words, outputs, "outputs", fix, "the times of outputs, which are ts=")
 
 
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
     """Raise if an adjoint cannot differentiate the motion; `recorded`: whether lagjax can record its steps."""
-    if adjoint is not None and not isinstance(adjoint, diffrax.AbstractAdjoint | Replay):
-        raise TypeError(
-            f"adjoint must be lj.Replay() or an adjoint of diffrax, not {_kind(adjoint)}.\n"
-            "Usual cause: missing brackets, or an adjoint given by its name.\n"
-            "Fix: leave adjoint out (both modes then work), or adjoint=diffrax.RecursiveCheckpointAdjoint()."
-        )
+    fix = "leave adjoint out (both modes then work), or adjoint=diffrax.RecursiveCheckpointAdjoint()"
+    kinds = diffrax.AbstractAdjoint | Replay | None
+    must_be(kinds, adjoint, "adjoint must be lj.Replay() or an adjoint of diffrax", fix, "an adjoint given by its name")
     if isinstance(adjoint, Replay) and adjoint.memory is not None and not recorded:
         raise ValueError(
             "lj.Replay(memory=...) limits a record of steps, and none is kept with a stepsize_controller (except "
@@ -140,32 +120,15 @@ def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
 
 def check_max_steps(max_steps: Any):
     """Raise unless max_steps is None or a positive whole number."""
-    if max_steps is None or isinstance(max_steps, int | np.integer) and 0 < max_steps <= MOST_STEPS:
-        return
-    if isinstance(max_steps, int | np.integer) and max_steps > MOST_STEPS:
-        raise ValueError(
-            f"max_steps = {max_steps} is more than can be counted: the steps are counted up to {MOST_STEPS:,}.\n"
-            "Fix: max_steps=None, for no limit."
-        )
-    raise ValueError(
-        f"max_steps must be a whole number above zero, not {max_steps!r}.\n"
-        "Usual cause: 1e6, which is a float.\n"
-        "Fix: max_steps=10**6, or leave it out."
-    )
-
-
-def _kind(thing):
-    return f"the class {thing.__name__}" if isinstance(thing, type) else type(thing).__name__
+    if max_steps is not None:
+        must_be_whole(max_steps, "max_steps", most=MOST_STEPS, fix="max_steps=10**6, or None for no limit")
 
 
 def check_drift(drift: Any, constrained: bool) -> str:
     """Return the drift control to use; raise if it is unknown. `constrained`: whether there are constraints."""
     if drift is None:
         return "project" if constrained else "none"
-    if drift not in ("project", "baumgarte", "none"):
-        raise ValueError(
-            f'drift must be "project", "baumgarte" or "none", not {drift!r}.\nFix: leave it out, or drift="project".'
-        )
+    must_be_among(("project", "baumgarte", "none"), drift, "drift", 'leave it out, or drift="project"')
     return drift if constrained else "none"
 
 
@@ -173,21 +136,15 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
     """Raise if the user's stepsize_controller is no controller, or max_step or jump_ts are given beside it."""
     if controller is None:
         return
-    if not isinstance(controller, diffrax.AbstractStepSizeController):
-        raise TypeError(
-            f"stepsize_controller must be a controller of diffrax, not {_kind(controller)}.\n"
-            "Usual cause: missing brackets, or a controller given by its name.\n"
-            "Fix: leave it out, or stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9)."
-        )
+    fix = "leave it out, or stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9)"
+    claim = "stepsize_controller must be a controller of diffrax"
+    must_be(diffrax.AbstractStepSizeController, controller, claim, fix, "a controller given by its name")
     for name, given, fix in (
         ("max_step", max_step, "stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9, dtmax=0.1)"),
         ("jump_ts", jump_ts, "stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)"),
     ):
-        if given is not None:
-            raise ValueError(
-                f"{name} limits the steps that lagjax chooses, and stepsize_controller replaces that choice.\n"
-                f"Fix: leave stepsize_controller out, or {fix}."
-            )
+        why = "the one limits the steps that lagjax chooses, and the other replaces that choice"
+        must_not_meet({name: given, "stepsize_controller": controller}, why, f"leave stepsize_controller out, or {fix}")
 
 
 def vector_of_times(ts: Any):
@@ -213,8 +170,7 @@ def times(ts: Any, dtype: np.dtype):
     """Return a vector of times in `dtype`; raise unless it increases or decreases throughout."""
     ts = ts.astype(dtype)
     if not is_traced(ts):
-        if not np.all(np.isfinite(ts)):
-            raise ValueError("ts contains NaN or infinity.\nFix: give finite times.")
+        must_be_finite(ts, "ts", "give finite times")
         backward = bool(ts[-1] < ts[0])
         wrong = ts[1:] >= ts[:-1] if backward else ts[1:] <= ts[:-1]
         if wrong.any():
@@ -241,13 +197,10 @@ def step_length(value: Any, name: str, dtype: np.dtype):
     """Return `dt0` or `max_step` as a number of `dtype`, or None if not given; raise unless it is positive."""
     if value is None:
         return None
-    if not is_traced(value) and not (_is_number(value) and float(value) > 0):
-        fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
-        raise ValueError(
-            f"{name} must be one positive number, not {value!r}.\n"
-            "Usual cause: a negative step where ts decreases; it is a length in both directions.\n"
-            f"Fix: leave {name} out{fixed}."
-        )
+    fixed = ", or with fixed steps dt0=1e-3 for example" if name == "dt0" else ", or max_step=0.1 for example"
+    cause = "a negative step where ts decreases; it is a length in both directions"
+    well = is_traced(value) or _is_number(value) and float(value) > 0
+    must(well, f"{name} must be one positive number", value, f"leave {name} out{fixed}", cause)
     return numpy_of(value).asarray(value, dtype)
 
 
@@ -257,13 +210,10 @@ def jumps(jump_ts: Any, dtype: np.dtype):
         return None
     jump_ts = jnp.stack([*jump_ts]) if isinstance(jump_ts, (list, tuple)) and is_traced(jump_ts) else jump_ts
     kind, shape = (jump_ts if hasattr(jump_ts, "dtype") else np.asarray(jump_ts)).dtype, np.shape(jump_ts)
-    if len(shape) > 1 or not np.issubdtype(kind, np.number) or np.issubdtype(kind, np.complexfloating):
-        raise ValueError(
-            f"jump_ts must be a vector of times, and has dtype {kind} and shape {shape}.\n"
-            "Fix: jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink."
-        )
-    if not is_traced(jump_ts) and not np.all(np.isfinite(jump_ts)):
-        raise ValueError("jump_ts contains NaN or infinity.\nFix: give finite times.")
+    well = len(shape) < 2 and np.issubdtype(kind, np.number) and not np.issubdtype(kind, np.complexfloating)
+    fix = "jump_ts=jnp.array([50.25, 50.35]), the times at which the force jumps or has a kink"
+    must(well, "jump_ts must be a vector of times", jump_ts, fix)
+    must_be_finite(jump_ts, "jump_ts", "give finite times")
     return jnp.atleast_1d(jnp.asarray(jump_ts, dtype)) if np.prod(shape) else None
 
 
@@ -278,12 +228,8 @@ def tolerance(value: Any, name: str, dtype: np.dtype):
     if isinstance(value, (tuple, list)) and is_traced(value):
         value = jnp.stack([jnp.asarray(x, dtype) for x in value])
     is_text = isinstance(value, str) or not isinstance(value, jax.Array) and np.asarray(value).dtype.kind not in "fiu"
-    if is_text or np.ndim(value) and np.shape(value) != (2,):
-        actual = f"is {value!r:.40}" if is_text else f"has shape {np.shape(value)}"
-        raise ValueError(
-            f"{name} must be one number, or two: for coordinates and for velocities. It {actual}.\n"
-            f"Fix: {name}=1e-9, or {name}=(1e-9, 1e-6)."
-        )
+    well, claim = not is_text and np.shape(value) in ((), (2,)), "must be one number, or two, one for velocities"
+    must(well, f"{name} {claim}", value, f"{name}=1e-9, or {name}=(1e-9, 1e-6)")
     if is_traced(value):
         return jnp.broadcast_to(jnp.asarray(value, dtype), 2)
     return _tolerance(value if isinstance(value, float) else tuple(np.asarray(value, float).flat), name, dtype)
@@ -310,16 +256,20 @@ def _check_tolerance(value: Any, name: str, dtype: np.dtype):
             "Fix: a finite tolerance; or, for steps of a fixed length, "
             "stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01."
         )
-    if not value >= 0:
-        raise ValueError(f"{name} must be a number >= 0, not {value}.\nFix: {name}=1e-9, or leave it out.")
-    floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
-    if name == "rtol" and value < floor:
-        single = dtype == np.dtype("float32")
-        cause = "Usual cause: JAX works in float32 unless told otherwise.\n" if single else ""
+    must(value >= 0, f"{name} must be a number >= 0", value, f"{name}=1e-9, or leave it out")
+    if name == "rtol":
+        check_reach(value, name, dtype)
+
+
+def check_reach(value: float, name: str, dtype: np.dtype):
+    """Raise for a relative tolerance that a dtype cannot reach."""
+    floor, single = ROUND_OFFS * float(jnp.finfo(dtype).eps), dtype == np.dtype("float32")
+    if value < floor:
+        cause = "JAX works in float32 unless told otherwise" if single else "a wrong exponent"
         remedy = 'jax.config.update("jax_enable_x64", True) before the first array, or ' if single else ""
         raise ValueError(
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
-            f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
+            f"Usual cause: {cause}.\nFix: {remedy}{name}={10 * floor:.0e} or more."
         )
 
 

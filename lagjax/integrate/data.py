@@ -13,11 +13,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import PyTree
 
 from lagjax.files import Writer, npz
 from lagjax.integrate.results import RESULTS, angle_mask, in_words
+from lagjax.refusals import installed, must_have_values
 from lagjax.system import UnknownSystem, middle_state, signature
 
 # Fields that are arrays or trees of arrays, the same in the trajectory and in the file.
@@ -26,7 +26,8 @@ PLAIN = "t", "q", "v", "multipliers", "stats", "scaled_error", "tolerance"
 
 def save(trajectory, path: str | os.PathLike) -> None:
     """Write a trajectory into a file: see `Trajectory.save`."""
-    _check_known(trajectory)
+    fix = "return it from the traced function, and save it then"
+    must_have_values(trajectory, "a trajectory is saved by its values", fix)
     writer, known = Writer(), described(trajectory)
     nodes = {name: writer.down(x, name) for name, x in parts(trajectory, result_in_names).items()}
     nodes["system"] = writer.down(_fields(known), "system")
@@ -61,14 +62,6 @@ def described(trajectory) -> UnknownSystem:
     return UnknownSystem(repr(system), angles, signature(one.any_system, state), tuple(state))
 
 
-def _check_known(trajectory):
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves(trajectory)):
-        raise TypeError(
-            "this trajectory is being traced, and has no numbers yet.\n"
-            "Fix: return it from the traced function, and save it then."
-        )
-
-
 def _fields(module) -> dict:
     """The fields of a module, by name."""
     return {name: getattr(module, name) for name in module.__dataclass_fields__}
@@ -90,15 +83,6 @@ MODES = {
 }
 
 
-def import_xarray():
-    """Import xarray, or say how to get it."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
-    return xarray
-
-
 def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
     """Return a trajectory, or a batch of them, as an `xarray.Dataset`.
 
@@ -107,7 +91,7 @@ def dataset(trajectory, dims: Sequence[str] | None = None, under: str = ""):
 
     **Raises:** `ImportError` without xarray; `ValueError` if there are not as many names as axes.
     """
-    xarray = import_xarray()
+    xarray = installed("xarray", "this", "data")
     lead, variables = dims_of(trajectory, dims), {}
     t, coords = f"{under}t", {}
     times = np.asarray(trajectory.t)

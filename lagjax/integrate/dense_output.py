@@ -27,6 +27,7 @@ from lagjax.integrate.settings import Settings, patient
 from lagjax.integrate.stepping import WHOLE_STEPS, Forced, rounded, span_of
 from lagjax.jaxtools import compiled, filled_up, is_eager, is_traced, numpy_of, to_jax
 from lagjax.mechanics import accelerations
+from lagjax.refusals import must, must_be_single
 from lagjax.system import InModes, System, given_in
 
 # Controllers that can begin at any time; others plan the steps of the whole motion.
@@ -312,11 +313,8 @@ def _of_length_zero(system: System, params: PyTree, node: Snapshot, t):
 
 
 def _check_can_be_continued(trajectory):
-    if trajectory.in_phases and trajectory.t.ndim > 1:
-        raise ValueError(
-            f"this is a batch of motions in phases, of shape {trajectory.t.shape[:-1]}: at(t) needs one of them.\n"
-            "Fix: jax.tree.map(lambda x: x[0], traj).at(t)"
-        )
+    if trajectory.in_phases:
+        must_be_single(trajectory.t.shape[:-1], "this motion in phases", "{traj}.at(t)")
     asked = trajectory.asked
     instead = "Fix: give these times to lj.integrate as ts."
     if asked.drift == "baumgarte" or asked.drift == "none" and _has_constraints(trajectory.system):
@@ -350,8 +348,8 @@ def _check_ended(trajectory, t):
 
 def _times(t, dtype: np.dtype):
     given, t = t, numpy_of(t).asarray(t)
-    if not (jnp.issubdtype(t.dtype, jnp.floating) or jnp.issubdtype(t.dtype, jnp.integer)):
-        raise TypeError(f"t must be a time or an array of times, not {given!r:.60}.\nFix: traj.at(0.5).")
+    real = jnp.issubdtype(t.dtype, jnp.floating) or jnp.issubdtype(t.dtype, jnp.integer)
+    must(real, "t must be a time or an array of times", given, "traj.at(0.5)", error=TypeError)
     return t.astype(dtype)
 
 

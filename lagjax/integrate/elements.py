@@ -32,6 +32,7 @@ from lagjax.integrate.laws import (
 )
 from lagjax.integrate.meeting import Meeting, Met
 from lagjax.jaxtools import compiled, depends, is_linear, varies, without_init
+from lagjax.refusals import must_differ, must_name, must_return
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -150,8 +151,7 @@ class ElementLaws:
         check_linear(sliding, *self.start)
         key = f"{name} friction" if own else name
         _check_name(key, self.plain)
-        if own and key in self.elements:
-            raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
+        must_differ([*[key] * own, *self.elements], f"an element and the friction of '{name}'", "another name for it")
         plane = jnp.shape(sliding.program.value) == (*shape, 2)
         both = source in self.plain.constraints
         if isinstance(normal, Traced) and not depends_on(normal, *OF_STATE[:-1]):
@@ -173,12 +173,8 @@ class ElementLaws:
         if not isinstance(normal, str):
             return "", self.traced(name, "normal", normal, OF_STATE)
         known = [*self.plain.constraints, *self.gaps]
-        if normal not in known:
-            raise ValueError(
-                f"normal='{normal}' of element '{name}' is no constraint and no contact; there "
-                f"{'are ' + ', '.join(map(repr, known)) if known else 'are none'}.\n"
-                "Fix: its name, a number, or a function of (t, q, v, params)."
-            )
+        fix = "normal='{}', a number, or a function of (t, q, v, params)"
+        must_name(normal, known, f"normal of element '{name}' names", "constraint or contact", fix)
         return normal, None
 
     def compliant(self) -> tuple[Compliant, ...]:
@@ -236,44 +232,30 @@ def _check_slope(name: str, gap: Callable, t: Array, q: PyTree, v: PyTree, param
 
 
 def _check_sliding(shape: tuple[int, ...], call: Call, value):
-    found = jnp.shape(value)
-    if found == shape or found == (*shape, 2):
-        return
-    raise ValueError(
-        f"{call} must return {f'shape {shape}' if shape else 'a number'}, as its normal force, or {(*shape, 2)} for "
-        f"sliding in a plane, and returned shape {found}.\n"
-        "Usual cause: the velocity of a point in space, or several sliding velocities with one normal force.\n"
-        "Fix: its components along the contact; jnp.full(k, N) for k sliding velocities with N each."
+    wanted = (
+        f"{f'shape {shape}' if shape else 'a number'}, as its normal force, or {(*shape, 2)} for sliding in a plane"
     )
+    cause = "the velocity of a point in space, or several sliding velocities with one normal force"
+    fix = "its components along the contact; jnp.full(k, N) for k sliding velocities with N each"
+    must_return(jnp.shape(value) in (shape, (*shape, 2)), call, wanted, value, fix, cause)
 
 
 def _check_name(name: str, plain: System):
-    if name in plain.constraints:
-        raise ValueError(
-            f"'{name}' is the name of an element and of a constraint, whose multipliers would have one name.\n"
-            "Fix: another name for one of them; a contact that always holds is a lj.Holonomic and no element."
-        )
+    fix = "another name for one of them; a contact that always holds is a lj.Holonomic and no element"
+    must_differ([name, *plain.constraints], "an element and a constraint, and the multipliers of both,", fix)
 
 
 def _check_output(call: Call, value, like: Array):
     found = getattr(value, "shape", () if isinstance(value, float | int) else None)
-    if found != like.shape:
-        raise ValueError(
-            f"{call} must return its output in the shape of its entry in q0, {like.shape}, and returned "
-            f"{f'a {type(value).__name__}' if found is None else f'shape {found}'}.\n"
-            "Usual cause: several outputs of one controller, or a missing return.\n"
-            "Fix: an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each."
-        )
+    fix = "an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each"
+    wanted = f"its output in the shape of its entry in q0, {like.shape}"
+    must_return(found == like.shape, call, wanted, value, fix, "several outputs of one controller, or a missing return")
 
 
 def _check(call: Call, value, shape: tuple | None):
-    found = jnp.shape(value)
-    if shape is not None and found != shape or len(found) > 1:
-        raise ValueError(
-            f"{call} must return {'a number or a vector' if shape is None else 'a number'}, and returned shape {found}."
-            "\nUsual cause: the velocity of a point in space.\n"
-            "Fix: its component along the contact."
-        )
+    found, wanted = jnp.shape(value), "a number or a vector" if shape is None else "a number"
+    holds = shape in (None, found) and len(found) < 2
+    must_return(holds, call, wanted, value, "its component along the contact", "the velocity of a point in space")
 
 
 class Masked(eqx.Module):

@@ -17,6 +17,7 @@ from lagjax.integrate.solve.phases import backward_trajectory_of, traced_phases
 from lagjax.integrate.solve.programs import trajectory_of
 from lagjax.integrate.trajectory import OF_PHASES, HybridTrajectory, Switches, Trajectory
 from lagjax.jaxtools import is_array, without_init
+from lagjax.refusals import must_be
 from lagjax.system import SYSTEMS, Hybrid, State, System, UnknownSystem, differences, signature
 
 
@@ -170,10 +171,7 @@ def trajectory_from(found: dict, kept: System | Hybrid | UnknownSystem) -> Traje
 
 def check_is_system(system: Any) -> None:
     """Raise if what the user passes again is no system."""
-    if not isinstance(system, SYSTEMS):
-        raise TypeError(
-            f"system must be a lj.System, not {type(system).__name__}.\nFix: lj.load_trajectory(path, system=system)."
-        )
+    must_be(SYSTEMS, system, "system must be a lj.System", "lj.load_trajectory(path, system=system)")
 
 
 def same_system(system: System, known: UnknownSystem, path: str | os.PathLike) -> System | Hybrid:

@@ -23,7 +23,8 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.display import Animation, Drawing, InSpace, Shape, Still, plots, poses_in_q, stills_in_space
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import Generator, NoetherCharge, conserved_momenta, conserves_jacobi_integral
-from lagjax.system import Call, Traced, UnknownSystem, check_arguments, check_system, coordinates, is_traced
+from lagjax.refusals import must, must_be_function, must_have_values, must_return
+from lagjax.system import Call, Traced, UnknownSystem, check_arguments, check_system, coordinates
 
 # States whose poses are computed together.
 BLOCK = 256
@@ -217,11 +218,8 @@ def draw(
     that are not points, and bodies whose pose is not known.
     """
     check_system(system, phases=True, elements=True)
-    if is_traced((q, params, t)):
-        raise TypeError(
-            "a picture needs numbers, and this state is being traced.\n"
-            "Usual cause: lj.draw inside of jax.jit, jax.vmap or jax.grad.\nFix: draw what the function returns."
-        )
+    fix = "draw what the function returns"
+    must_have_values((q, params, t), "a picture needs numbers", fix, "lj.draw inside of jax.jit, jax.vmap or jax.grad")
     given = coordinates.state(t, q, q, params)
     return still(subject_of(what, system, given.params), given.t, given.q, frames, view)
 
@@ -298,11 +296,8 @@ def changes(trajectory, charges: Any) -> dict[str, np.ndarray]:
     for name in functions:
         value, size = values[name]
         value, size = np.asarray(value), np.asarray(size)
-        if value.ndim != 1:
-            raise ValueError(
-                f"charge '{name}' must be one number, but has shape {value.shape[1:]}.\n"
-                "Usual cause: the momentum of all coordinates, with the structure of q.\nFix: return one entry of it."
-            )
+        cause, fix = "the momentum of all coordinates, with the structure of q", "return one entry of it"
+        must_return(value.ndim == 1, f"charge '{name}'", "one number", value[0], fix, cause)
         scale = max(np.nanmax(size), np.nanmax(np.abs(value)))
         found[name] = (value - value[0]) / (scale if scale > 0 else 1.0)
     return found
@@ -328,16 +323,10 @@ def _by_name(charges: Any) -> dict[str, Callable]:
     elif callable(charges):
         found = {getattr(charges, "__name__", "charge"): charges}
     else:
-        raise TypeError(
-            f"charges must be True, or functions by name, not {type(charges).__name__}.\n"
-            'Fix: charges={"L_z": lj.noether_charge(system, lj.Generator.rotation("z"))}.'
-        )
+        fix = 'charges={"L_z": lj.noether_charge(system, lj.Generator.rotation("z"))}'
+        must(False, "charges must be True, or functions by name", charges, fix, error=TypeError)
     for name, charge in found.items():
-        if not callable(charge):
-            raise TypeError(
-                f"charge '{name}' must be a function of (t, q, v, params), not {type(charge).__name__}.\n"
-                "Fix: pass the function itself, not its value."
-            )
+        must_be_function(charge, f"charge '{name}'", "(t, q, v, params)", "pass the function itself, not its value")
     return found
 
 

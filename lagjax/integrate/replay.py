@@ -61,6 +61,7 @@ from lagjax.jaxtools import (
     split,
 )
 from lagjax.numerics import ExplicitRungeKutta, Nystrom, evaluations_a_step
+from lagjax.refusals import must
 
 # Up to so many operations of a step pulled back, each stage gets a copy of the right-hand side instead of a loop. What
 # is not one machine function goes through memory at each turn of a loop, large matrices and their cotangents included:
@@ -412,10 +413,8 @@ class Replay:
     bent: bool = False
 
     def __post_init__(self):
-        if self.memory is not None and not (isinstance(self.memory, int | float) and self.memory > 0):
-            raise ValueError(
-                f"memory must be a positive number of bytes, not {self.memory!r:.40}.\nFix: lj.Replay(memory=50e6)."
-            )
+        well = self.memory is None or isinstance(self.memory, int | float) and self.memory > 0
+        must(well, "memory must be a positive number of bytes", self.memory, "lj.Replay(memory=50e6)")
 
 
 def replayed(problem: StepProblem, max_steps: int | None, checked: bool, adjoint: Replay) -> Recorded:

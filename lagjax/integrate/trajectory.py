@@ -38,6 +38,7 @@ from lagjax.integrate.results import (
 from lagjax.integrate.stepping import rounded
 from lagjax.jaxtools import compiled, is_traced, jitted, numpy_of
 from lagjax.mechanics import what_changes_jacobi_integral, worst_residual
+from lagjax.refusals import must_be_single
 from lagjax.system import Hybrid, InModes, Model, System, UnknownSystem, known_system, model_of
 
 # A line through fewer outputs says nothing of a drift.
@@ -294,11 +295,7 @@ class Trajectory(eqx.Module):
         return found + of_events
 
     def _check_alone(self, call: str):
-        if self.t.ndim != 1:
-            raise ValueError(
-                f"this trajectory is a batch of shape {self.t.shape[:-1]}: draw one lane of it.\n"
-                f"Fix: jax.tree.map(lambda x: x[0], traj).{call}"
-            )
+        must_be_single(self.t.shape[:-1], "this trajectory", f"{{traj}}.{call}")
 
     def __repr__(self):
         if is_traced(self):

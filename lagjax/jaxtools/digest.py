@@ -81,7 +81,7 @@ def digest_of(parts: Iterable[tuple[Any, bool]], around: bytes | None = None) ->
         writer.add(b"surroundings", surroundings())
     else:
         writer.add(b"around", around)
-        writer.all(b"context", [x for x in trace_context() if _can_be_written(x)])
+        writer.all(b"context", filter(_can_be_written, _context()))
     try:
         for part, of_user in parts:
             writer.of_user = of_user
@@ -326,11 +326,9 @@ def surroundings() -> bytes:
     """The digest of what tracing and compiling depend on besides the program itself: here and now."""
     writer = _Writer()
     config: Any = jax.config
-    if trace_context is None:
-        raise NotKept("this JAX does not say what tracing depends on")
     # A new thread is in no context. Those of whoever made one come last, in the order of imports.
     with ThreadPoolExecutor(1) as thread:
-        here, outside = trace_context(), thread.submit(trace_context).result()
+        here, outside = _context(), thread.submit(_context).result()
     written = [_can_be_written(x) for x in here]
     if len(here) != len(outside) or not all(x is y or known for x, y, known in zip(here, outside, written)):
         raise NotKept("it is in a context of JAX's")
@@ -343,6 +341,12 @@ def surroundings() -> bytes:
     writer.write((environment, [x for x in sys.argv if x.startswith("--xla")]))
     writer.write((is_plain(), versions(), source(), machine(), *devices()))
     return writer.hash.digest()
+
+
+def _context() -> tuple:
+    if trace_context is None:
+        raise NotKept("this JAX does not say what tracing depends on")
+    return trace_context()
 
 
 def _can_be_written(x: Any) -> bool:

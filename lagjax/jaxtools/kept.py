@@ -54,7 +54,7 @@ except ImportError:
     pass
 
 # The versions of jax and jaxlib with which the tests of this module were run.
-TRIED = {"0.10.2"}
+TRIED = {"0.10.1", "0.10.2", "0.11.2", "0.12.0.1"}
 # What a version of JAX without these parts raises, and XLA for an executable that it does not take.
 REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
 # What an executable may call: JAX's own LAPACK. Anything else may be there in one process and not in the next.
@@ -173,6 +173,14 @@ class KeptProgram:
         """The program of arrays, or shapes, of this kind, compiled here."""
         return self._made(self._place(arrays), arrays)
 
+    def traced_for(self, arrays: list) -> Ready:
+        """What is known of the program of arrays, or shapes, of this kind, without compiling it: it has no call."""
+        return self._described(self._jit.trace(arrays))
+
+    def _described(self, traced: Any) -> Ready:
+        outputs = [ShapedArray(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.jaxpr.out_avals]
+        return Ready(_without_call, self._structure, outputs, self._said.facts(traced.jaxpr))
+
     def _place(self, arrays: list) -> tuple[Path, str] | None:
         """The folder and the digest of the program; None if it is not kept."""
         where = folder.place()
@@ -193,9 +201,7 @@ class KeptProgram:
         before = HAPPENED.copy()
         traced = self._jit.trace(arrays)
         compiled = traced.lower().compile()
-        facts = self._said.facts(traced.jaxpr)
-        outputs = [ShapedArray(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.jaxpr.out_avals]
-        made = Ready(compiled, self._structure, outputs, facts, compiled)
+        made = self._described(traced)._replace(call=compiled, compiled=compiled)
         if HAPPENED != before:
             TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
         elif place is not None:
@@ -234,6 +240,10 @@ class KeptProgram:
                 TALLY.not_kept[f"{type(error).__name__}: {str(error)[:200]}"] += 1
 
         LATER.do(write)
+
+
+def _without_call(arrays: list) -> list:
+    raise AssertionError("this program was traced only, and is not compiled")
 
 
 class Unusable(Exception):

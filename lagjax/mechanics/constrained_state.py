@@ -50,6 +50,7 @@ from lagjax.mechanics.equations import Equations, equations_of
 from lagjax.mechanics.lagrangian import mass_and_forcing, resolved, with_first_order
 from lagjax.mechanics.saddle_point import Dense, ForwardDynamics, displacement_map, examined
 from lagjax.numerics import DEPENDENT_BELOW, dense, independent_rows, largest, last_step, newton
+from lagjax.refusals import must_be_among, must_name
 from lagjax.system import (
     Holonomic,
     InModes,
@@ -306,10 +307,7 @@ def free_coordinates(q: PyTree, hold, argument: str = "hold") -> np.ndarray:
     held = np.array([bool(hold & whole) for whole in known])
     unknown = hold.difference(*known)
     if unknown:
-        raise ValueError(
-            f"{argument} names {listed(sorted(map(str, unknown)))}, but the coordinates are {listed(names)}.\n"
-            "Fix: hold the coordinates by these names."
-        )
+        must_name(sorted(map(str, unknown)), names, f"{argument} names", "coordinate", f"{argument}='{{}}'")
     return ~held
 
 
@@ -573,10 +571,7 @@ def constraint_residual(
 
     **Raises:** `ValueError` for another level, or a constraint that returns neither scalar nor vector.
     """
-    if level not in ("constraint", "velocity"):
-        raise ValueError(
-            f'level must be "constraint" or "velocity", not {level!r}.\nFix: leave it out, or level="velocity".'
-        )
+    must_be_among(("constraint", "velocity"), level, "level", 'leave it out, or level="velocity"')
     model, s = prepare(system, t, q, v, params)
     return _constraint_residual(model, s, level)
 

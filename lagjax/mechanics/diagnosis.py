@@ -14,7 +14,7 @@ Source: Golub & Van Loan, *Matrix Computations*, §8.1.5 (the law of inertia).
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from jaxtyping import Array, PyTree
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import balance_matrix, is_determined, of_states, with_first_order
 from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, examined, missed
+from lagjax.refusals import listed
 from lagjax.system import Model, State, constraints, coordinates
 
 # An eigenvalue counts as below zero beyond so many round-offs of the largest.
@@ -66,7 +67,7 @@ def indefinite_mass(model: Model, start: State, end: State) -> IndefiniteMass | 
     return IndefiniteMass(cause, fix, found is not None)
 
 
-def indefinite_in_words(mass: Array, rows: Array, names: Callable[[], list[str]], again: bool = False) -> str | None:
+def indefinite_in_words(mass: Any, rows: Any, names: Callable[[], list[str]], again: bool = False) -> str | None:
     """Say of M and A at one state that an eigenvalue is below zero; None where none is, or M is not finite.
 
     `names()`: those of the coordinates. `again`: M was definite at another state or with other parameters, and is
@@ -326,14 +327,6 @@ def dependencies(jacobian: Array, independent: Array, names: Sequence[str]) -> l
         share = np.abs(np.linalg.lstsq(rows[chosen].T, rows[i], rcond=None)[0])
         groups.append((names[i], *(names[j] for j in chosen[share > SHARE])))
     return groups
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names in quotes, joined by commas and "and"."""
-    quoted = [f"'{name}'" for name in names]
-    if not quoted:
-        return "none"
-    return quoted[0] if len(quoted) == 1 else ", ".join(quoted[:-1]) + f" and {quoted[-1]}"
 
 
 def _equilibrate(matrix: Array):

@@ -40,6 +40,7 @@ from lagjax.jaxtools import compiled, is_traced, shape_of
 from lagjax.mechanics.constrained_state import accelerations_at
 from lagjax.mechanics.diagnosis import listed
 from lagjax.mechanics.lagrangian import applied_force
+from lagjax.refusals import must, must_be_function, must_name, must_return
 from lagjax.system import (
     OF_POSITION,
     Call,
@@ -141,11 +142,8 @@ class Generator(eqx.Module):
         for role, function in (("delta", delta), ("time", time), ("gauge", gauge)):
             if role == "time" and isinstance(function, numbers.Real):
                 continue
-            if function is not None and not callable(function):
-                raise TypeError(
-                    f"{role} of a generator must be a function of (t, q, params), not {type(function).__name__}.\n"
-                    f"Fix: {role}=lambda t, q, params: {'q' if role == 'delta' else 't'}."
-                )
+            fix = f"{role}=lambda t, q, params: {'q' if role == 'delta' else 't'}"
+            must_be_function(function, f"{role} of a generator", "(t, q, params)", fix, optional=True)
         if delta is None and time is None and gauge is None:
             raise TypeError(
                 "a generator must move something.\n"
@@ -181,11 +179,9 @@ class Generator(eqx.Module):
                 value = shape_of(function, s.t, s.q, s.params)
             if role == "delta":
                 _check_displacement(call, value, s.q)
-            elif np.shape(value) != ():
-                raise ValueError(
-                    f"{call} must return one number, and returned shape {np.shape(value)}.\n"
-                    "Usual cause: a missing sum over coordinates.\nFix: jnp.sum(...)."
-                )
+            else:
+                cause = "a missing sum over coordinates"
+                must_return(np.shape(value) == (), call, "one number", value, "jnp.sum(...)", cause)
 
     @staticmethod
     def shift(by) -> "Generator":
@@ -245,11 +241,8 @@ def as_generator(given) -> Generator:
     """Return a generator as it is, and make one of a function that moves the coordinates."""
     if isinstance(given, Generator):
         return given
-    if not callable(given):
-        raise TypeError(
-            f"a generator is a lj.Generator or a function of (t, q, params), not {type(given).__name__}.\n"
-            'Fix: lambda t, q, params: {"x": 1.0, "y": 0.0}, or lj.Generator.shift("x").'
-        )
+    fix = 'lambda t, q, params: {"x": 1.0, "y": 0.0}, or lj.Generator.shift("x")'
+    must_be_function(given, "a generator", "(t, q, params), or a lj.Generator", fix)
     return Generator(given)
 
 
@@ -348,9 +341,7 @@ def places_of(name: str, q: PyTree) -> list[int]:
     if not found and name in leaf_names(q):
         found = [i for i, other in enumerate(known) if other.startswith(f"{name}[")]
     if not found:
-        raise ValueError(
-            f"there is no coordinate '{name}'; the coordinates are {listed(known)}.\nFix: name one of these."
-        )
+        must_name([name], known, "a generator names", "coordinate")
     return found
 
 
@@ -367,11 +358,9 @@ def _points(q: PyTree):
 
 def _vector(axis) -> np.ndarray:
     if isinstance(axis, str):
-        if axis not in AXES:
-            raise ValueError(f'an axis is "x", "y", "z" or a vector, not "{axis}".\nFix: "z", or (0.0, 0.0, 1.0).')
+        must(axis in AXES, "an axis must be 'x', 'y', 'z' or a vector", axis, '"z", or (0.0, 0.0, 1.0)')
         return np.eye(3)[AXES.index(axis)]
-    if np.shape(axis) not in ((2,), (3,)):
-        raise ValueError(f'an axis is "x", "y", "z" or a vector, not {axis!r}.\nFix: "z", or (0.0, 0.0, 1.0).')
+    must(np.shape(axis) in ((2,), (3,)), "an axis must be 'x', 'y', 'z' or a vector", axis, '"z", or (0.0, 0.0, 1.0)')
     return _array((*axis, 0.0)[:3])
 
 

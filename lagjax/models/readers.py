@@ -18,7 +18,6 @@ import codecs
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 
 import numpy as np
@@ -41,6 +40,7 @@ from lagjax.models.links_and_joints import (
     unmoved,
 )
 from lagjax.models.robot_model import BEFORE_TEXT, NotTaken, RobotModel, file_of
+from lagjax.refusals import installed, must_be_among, must_name
 
 # What an element may have inside, and in which words what the model leaves out is listed; "" where nothing is.
 LEFT_OUT = {
@@ -179,8 +179,7 @@ def read_urdf(source, base: str = "fixed", gravity=(0.0, 0.0, -9.81)) -> RobotMo
 
     Source: the URDF specification, `wiki.ros.org/urdf/XML`.
     """
-    if base not in ("fixed", "free"):
-        raise ValueError(f'base= must be "fixed" or "free", and is {base!r}.')
+    must_be_among(("fixed", "free"), base, "base")
     path = file_of(source, "lj.read_urdf")
     robot = _parsed(source, "the text") if path is None else _parsed(path.read_bytes(), path.name)
     not_taken = robot.left_out()
@@ -286,10 +285,7 @@ def _link(x: XMLElement, not_taken: list[NotTaken]) -> RobotLink:
 
 def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]) -> RobotJoint:
     name, line, kind = x.text("name"), f"line {x.line}", x.text("type")
-    if kind not in TYPES:
-        raise ValueError(
-            f"line {x.line}: type='{kind}' of {x.called} is not supported.\nFix: one of {', '.join(sorted(TYPES))}."
-        )
+    must_name(kind, sorted(TYPES), f"{line}: type= of {x.called} is", "type that is supported")
     if (mimic := x.one("mimic")) is not None:
         raise ValueError(
             f"line {mimic.line}: <mimic> of {x.called} is not supported: without it the joint would move freely.\n"
@@ -299,8 +295,7 @@ def _joint(x: XMLElement, links: dict[str, RobotLink], not_taken: list[NotTaken]
     not_taken += x.left_out(name)
     ends = [x.needed(tag).text("link") for tag in ("parent", "child")]
     for tag, end in zip(("parent", "child"), ends):
-        if end not in links:
-            raise ValueError(f"line {x.needed(tag).line}: {x.called} names a link '{end}', which is not there.")
+        must_name(end, links, f"line {x.needed(tag).line}: {x.called} names", "link")
     if ends[0] == ends[1]:
         raise ValueError(f"line {x.line}: {x.called} joins '{ends[0]}' to itself.")
     given = x.one("axis")
@@ -387,15 +382,6 @@ WHOLE = {"box": (2.0, 2.0, 2.0), "cylinder": (1.0, 2.0, 0.0), "capsule": (1.0, 2
 COUNT = {"sphere": 1, "cylinder": 2, "capsule": 2}
 
 
-def mujoco_itself() -> Any:
-    """Import MuJoCo, or say how to get it."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ImportError("lj.read_mjcf needs MuJoCo.\nFix: pip install 'lagjax[models]'.") from error
-    return mujoco
-
-
 def read_mjcf(source: str | Path) -> RobotModel:
     """Read a mechanism from an MJCF file, which MuJoCo compiles (extra `models`).
 
@@ -425,7 +411,7 @@ def read_mjcf(source: str | Path) -> RobotModel:
 
     Source: the MJCF reference, `mujoco.readthedocs.io/en/stable/XMLreference.html`.
     """
-    path, mujoco = file_of(source, "lj.read_mjcf"), mujoco_itself()
+    path, mujoco = file_of(source, "lj.read_mjcf"), installed("mujoco", "lj.read_mjcf", "models")
     try:
         spec = (
             mujoco.MjSpec.from_string(str(source).lstrip(BEFORE_TEXT))

@@ -54,6 +54,7 @@ from lagjax.models.links_and_joints import (
     rate_squared,
     unmoved,
 )
+from lagjax.refusals import must, must_be, must_differ, must_name
 from lagjax.shapes import axis, line
 from lagjax.system import Holonomic, System
 
@@ -114,10 +115,8 @@ class RobotModel:
            not_taken: Iterable[NotTaken]) -> "RobotModel":  # fmt: skip
         """The model of a tree; shapes come in the frames of the file's links."""
         field = np.asarray(gravity, float)
-        if field.shape != (3,) or not np.all(np.isfinite(field)):
-            raise ValueError(
-                f"gravity must be three finite numbers, and is {gravity}.\nFix: gravity=(0.0, 0.0, -9.81)."
-            )
+        well = field.shape == (3,) and np.all(np.isfinite(field))
+        must(well, "gravity must be three finite numbers", gravity, "gravity=(0.0, 0.0, -9.81)")
         placed = tuple(_on_body(shape, merged) for shape in shapes)
         if not merged.joints:
             raise ValueError(
@@ -174,8 +173,7 @@ class RobotModel:
 
     def at(self, link: str, point: ArrayLike = (0.0, 0.0, 0.0), axis: ArrayLike = (0.0, 0.0, 1.0)) -> Marker:
         """A place on a link of the file, in its frame there, for loads and further joints: a `lj.bodies.Marker`."""
-        if link not in self.frames:
-            raise ValueError(f"there is no link '{link}'.\nFix: one of {', '.join(self.frames)}.")
+        must_name(link, self.frames, "a place is asked for on", "link")
         head, frame = self.frames[link]
         return self._marker(head, Placement(frame.point(point), frame.axes), axis)
 
@@ -184,9 +182,8 @@ class RobotModel:
         for x in self._between.values():
             if [y.name for y in x.joints] == [joint]:
                 return x.a, x.b
-        if joint in self.joints:
-            raise ValueError(f"the joint '{joint}' has a massless link at one end, and no place on a body there.")
-        raise ValueError(f"there is no joint '{joint}'.\nFix: one of {', '.join(self.joints)}.")
+        must_name(joint, self.joints, "places are asked for of", "joint")
+        raise ValueError(f"the joint '{joint}' has a massless link at one end, and no place on a body there.")
 
     def system(self, loads: Iterable[Load] = (), joints: Mapping | None = None, **others) -> System:
         """Return the system of its bodies: q and v are dicts of `lj.bodies.Pose` by body, joints are constraints.
@@ -203,8 +200,7 @@ class RobotModel:
                 name = name if len(x.joints) == 1 else made_up(name, own.keys() | self.joints.keys() | loops.keys())
                 own[name] = EQUATIONS[x.kind](x.a, x.b)
         own |= loops
-        if both := own.keys() & (joints or {}).keys():
-            raise ValueError(f"the file has a joint '{sorted(both)[0]}' already.\nFix: another name.")
+        must_differ([*own, *(joints or {})], "a joint of the file and another one", "another name")
         bodies, lagrangian = list(self.bodies.values()), others.pop("lagrangian", None)
         if any(joint.armature for joint in self.joints.values()):
             lagrangian = partial(self._with_rotors, lagrangian)
@@ -431,9 +427,8 @@ def _given(default: dict, given: Mapping | None) -> dict:
 
         return shape
 
+    must_name(given or {}, default, "a position or rate is given of", "joint")
     for name, value in (given or {}).items():
-        if name not in default:
-            raise ValueError(f"there is no joint '{name}'.\nFix: one of {', '.join(default)}.")
         default[name] = jax.tree.map(shaped(name), default[name], value)
     return default
 
@@ -473,8 +468,7 @@ def file_of(source: str | Path, user: str) -> Path | None:
                 f"Fix: {user}(path), and the file in UTF-8."
             ) from error
         return None
-    if not isinstance(source, (str, Path)):
-        raise TypeError(f"{user} takes the path of a file or its text, not {type(source).__name__}.")
+    must_be(str | Path, source, f"{user} takes the path of a file or its text", f'{user}("/path/to/the/file")')
     path = Path(source).expanduser()
     if not is_file(path):
         shown = str(source) if len(str(source)) <= LONGEST_SHOWN else str(source)[:LONGEST_SHOWN] + "..."

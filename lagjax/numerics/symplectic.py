@@ -44,6 +44,8 @@ import equinox as eqx
 import numpy as np
 from numpy.polynomial import Polynomial, legendre
 
+from lagjax.refusals import must_be_among, must_be_function, must_be_whole
+
 # With more stages the coefficients of Lagrange's polynomials lose digits.
 MOST_STAGES = 8
 
@@ -64,12 +66,9 @@ class EqualSteps(eqx.Module):
 
 def check_pace(method: EqualSteps):
     """Raise unless the pace is None or a function."""
-    if method.pace is not None and not callable(method.pace):
-        raise TypeError(
-            f"pace must be a function of (t, q, params), not {type(method.pace).__name__}.\n"
-            "Usual cause: a length, which is dt0 of lj.integrate.\n"
-            f"Fix: lj.{type(method).__name__}(pace=lambda t, q, params: jnp.sum(q**2) ** 0.75)."
-        )
+    fix = f"lj.{type(method).__name__}(pace=lambda t, q, params: jnp.sum(q**2) ** 0.75)"
+    cause = "a length, which is dt0 of lj.integrate"
+    must_be_function(method.pace, "pace", "(t, q, params)", fix, cause, optional=True)
 
 
 class Gauss(EqualSteps):
@@ -113,11 +112,7 @@ class Gauss(EqualSteps):
 
     def __check_init__(self):
         check_pace(self)
-        if not (isinstance(self.stages, int) and 1 <= self.stages <= MOST_STAGES):
-            raise ValueError(
-                f"stages must be a whole number from 1 to {MOST_STAGES}, not {self.stages!r}: the order is twice "
-                "that.\nFix: lj.Gauss(3) for order 6."
-            )
+        must_be_whole(self.stages, "stages", most=MOST_STAGES, fix="lj.Gauss(3) for order 6: it is twice the stages")
 
     def error_order(self, terms: Any = None) -> int:
         """The order."""
@@ -254,8 +249,7 @@ class Splitting(EqualSteps):
 
     def __check_init__(self):
         check_pace(self)
-        if self.order not in ORDERS:
-            raise ValueError(f"order must be one of {ORDERS}, not {self.order!r}.\nFix: lj.Splitting(4).")
+        must_be_among(ORDERS, self.order, "order", "lj.Splitting(4)")
 
     def error_order(self, terms: Any = None) -> int:
         """The order."""

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools import depends, is_linear, kinds, length, numpy_of, once, remembered, varies, without_repeats
+from lagjax.refusals import must_be_like, must_return, shown
 from lagjax.system import coordinates
 from lagjax.system.constraints import Held, Holonomic, Nonholonomic
 from lagjax.system.coordinates import State
@@ -59,15 +60,7 @@ def check_system(system: Any, *others: Any, phases: bool = False, states: bool =
             f"Fix: hybrid.systems[{len(system.names) - 1}] for '{system.names[-1]}'; print(hybrid) shows how "
             "the phases follow each other."
         )
-    raise TypeError(f"the first argument must be a lj.System, not {_describe(system)}.\n{_remedy(system, others)}")
-
-
-def _describe(thing):
-    if isinstance(thing, type):
-        return f"the class {thing.__name__}"
-    if callable(thing) and hasattr(thing, "__name__"):
-        return "a function" if thing.__name__ == "<lambda>" else f"the function '{thing.__name__}'"
-    return "None" if thing is None else f"a {type(thing).__name__}"
+    raise TypeError(f"the first argument must be a lj.System, not {shown(system)}.\n{_remedy(system, others)}")
 
 
 def _remedy(system, others):
@@ -161,13 +154,10 @@ def check_rate(call: Call, rate: Any, of: Array):
     """Raise where the rate of a state is not like the state."""
     shape, dtype = getattr(rate, "shape", None), getattr(rate, "dtype", None)
     number = isinstance(rate, float) and not isinstance(rate, bool)
-    if not (number and not of.shape or shape == of.shape and np.issubdtype(dtype, np.floating)):
-        got = f"shape {shape}, {dtype}" if shape is not None else f"a {type(rate).__name__}"
-        raise ValueError(
-            f"{call} must return real numbers like the state, of shape {of.shape}, and returned {got}.\n"
-            "Usual cause: an array of one entry for a number, a missing return, or several rates in one function.\n"
-            "Fix: the rate of this state alone, in the shape of its start value in q0."
-        )
+    holds = number and not of.shape or shape == of.shape and np.issubdtype(dtype, np.floating)
+    cause = "an array of one entry for a number, a missing return, or several rates in one function"
+    fix = "the rate of this state alone, in the shape of its start value in q0"
+    must_return(holds, call, f"real numbers like the state, of shape {of.shape}", rate, fix, cause)
 
 
 def check_use(system: System):
@@ -357,20 +347,9 @@ def _is_complex(dtype: DTypeLike):
 
 
 def _check_force(call: Call, force: PyTree, q: PyTree, what: str = "force"):
-    expected = jax.tree.map(jnp.shape, q)
-    if force is None:
-        raise ValueError(
-            f"{call} must return one {what} per coordinate, like q, and returned None.\n"
-            "Usual cause: a function without return.\n"
-            f"Fix: return the structure of q, with 0.0 where there is no {what}."
-        )
-    if jax.tree.map(jnp.shape, force) != expected:
-        raise ValueError(
-            f"{call} must return one {what} per coordinate, like q.\n"
-            f"  q has shapes {expected}\n  the {what} has {jax.tree.map(jnp.shape, force)}\n"
-            f"Usual cause: a {what} for only one of the coordinates.\n"
-            f"Fix: return the structure of q, with 0.0 where there is no {what}."
-        )
+    cause = "a function without return" if force is None else f"a {what} for only one of the coordinates"
+    fix = f"return the structure of q, with 0.0 where there is no {what}"
+    must_be_like(force, q, f"what {call} returns, one {what} per coordinate,", "q", fix, cause)
 
 
 def _check_linear(model: Model, s: State):
@@ -392,22 +371,10 @@ def _check_linear(model: Model, s: State):
 
 def _check_constraint(call: Call, value):
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-    if shape is None or len(shape) > 1:
-        got = f"an array of shape {shape}" if shape is not None else f"a {type(value).__name__}"
-        raise ValueError(
-            f"{call} must return a scalar or a vector, and returned {got}.\n"
-            "Usual cause: several equations in a tuple or a matrix, or a function without return.\n"
-            "Fix: return jnp.stack([...]) of the equations, or give each a name of its own."
-        )
-    if 0 in shape:
-        raise ValueError(
-            f"{call} must return a scalar or a vector, and returned no equation at all, shape {shape}.\n"
-            "Usual cause: an empty list of joints.\n"
-            "Fix: leave the constraint out where it has none."
-        )
-    if not jnp.issubdtype(dtype, jnp.floating):
-        raise ValueError(
-            f"{call} must return real numbers that vanish where it holds, and returned {dtype}.\n"
-            "Usual cause: an equation in place of its residual, x**2 + y**2 == l**2.\n"
-            "Fix: return x**2 + y**2 - l**2."
-        )
+    cause = "several equations in a tuple or a matrix, or a function without return"
+    fix = "return jnp.stack([...]) of the equations, or give each a name of its own"
+    must_return(shape is not None and len(shape) <= 1, call, "a scalar or a vector", value, fix, cause)
+    wanted, fix = "a scalar or a vector with at least one equation", "leave the constraint out where it has none"
+    must_return(0 not in (shape or ()), call, wanted, value, fix, "an empty list of joints")
+    cause, fix = "an equation in place of its residual, x**2 + y**2 == l**2", "return x**2 + y**2 - l**2"
+    must_return(jnp.issubdtype(dtype, jnp.floating), call, "real numbers that vanish where it holds", value, fix, cause)

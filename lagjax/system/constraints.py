@@ -37,6 +37,15 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from lagjax.refusals import (
+    must,
+    must_be,
+    must_be_among,
+    must_be_finite,
+    must_be_function,
+    must_be_whole,
+    must_go_together,
+)
 from lagjax.system.traced import OF_POSITION, OF_STATE, vectors
 
 
@@ -60,7 +69,7 @@ class Holonomic(eqx.Module):
     of_positions: ClassVar[bool] = True
 
     def __check_init__(self):
-        _check_callable(self.g, "Holonomic", "g(t, q, params)")
+        must_be_function(self.g, "g of lj.Holonomic(g)", "(t, q, params)", "lj.Holonomic(g), with def g(t, q, params)")
 
     @property
     def function(self) -> Callable:
@@ -93,7 +102,8 @@ class Nonholonomic(eqx.Module):
     of_positions: ClassVar[bool] = False
 
     def __check_init__(self):
-        _check_callable(self.phi, "Nonholonomic", "phi(t, q, v, params)")
+        fix = "lj.Nonholonomic(phi), with def phi(t, q, v, params)"
+        must_be_function(self.phi, "phi of lj.Nonholonomic(phi)", "(t, q, v, params)", fix)
 
     @property
     def function(self) -> Callable:
@@ -112,14 +122,6 @@ class ConstraintRows(NamedTuple):
 
     jacobian: Float[Array, "m n"]
     gamma: Float[Array, " m"]
-
-
-def _check_callable(function: Callable, kind, signature: str):
-    if not callable(function):
-        raise TypeError(
-            f"{kind} needs a function {signature}, not {type(function).__name__}.\n"
-            f"Fix: lj.{kind}(f), with f defined as a function of these arguments."
-        )
 
 
 def position_residual(model, t: Array, x: Array) -> Float[Array, " mh"]:
@@ -238,7 +240,7 @@ class Friction(eqx.Module):
         normal: Callable | ArrayLike | str,
         static: Callable | ArrayLike | None = None,
     ):
-        _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
+        must_be_function(sliding, "sliding", "(t, q, v, params)", 'sliding=lambda t, q, v, params: v["x"]')
         for role, number in (("coefficient", coefficient), ("static", static), ("normal", normal)):
             if not isinstance(number, str):
                 _check_not_negative(role, number)
@@ -297,7 +299,7 @@ class Contact(eqx.Module):
         static: Callable | ArrayLike | None = None,
         slower_than: ArrayLike = 1e-6,
     ):
-        _check_function("gap", gap, "(t, q, params)", 'q["y"]')
+        must_be_function(gap, "gap", "(t, q, params)", 'gap=lambda t, q, params: q["y"]')
         _check_pair(friction, sliding)
         numbers = {"restitution": restitution, "friction": friction, "static": static, "slower_than": slower_than}
         for role, number in numbers.items():
@@ -332,7 +334,7 @@ class Stop(Contact):
         restitution: Callable | ArrayLike = 0.0,
         slower_than: ArrayLike = 1e-6,
     ):
-        _check_function("coordinate", coordinate, "(t, q, params)", 'q["x"]')
+        must_be_function(coordinate, "coordinate", "(t, q, params)", 'coordinate=lambda t, q, params: q["x"]')
         if low is None and high is None:
             raise ValueError("a stop needs low, high, or both.\nFix: lj.Stop(coordinate, low=0.0, high=1.0).")
         if low is not None and high is not None and np.any(np.asarray(low) > np.asarray(high)):
@@ -399,7 +401,7 @@ class CompliantContact(eqx.Module):
         sliding: Callable | None = None,
         static: Callable | ArrayLike | None = None,
     ):
-        _check_function("gap", gap, "(t, q, params)", 'q["y"]')
+        must_be_function(gap, "gap", "(t, q, params)", 'gap=lambda t, q, params: q["y"]')
         _check_pair(friction, sliding)
         for role, number in (("damping", damping), ("friction", friction), ("static", static)):
             _check_not_negative(role, number)
@@ -448,10 +450,11 @@ class SampledControl(eqx.Module):
     offset: Callable | ArrayLike
 
     def __init__(self, controller: Callable, every: Callable | ArrayLike, offset: Callable | ArrayLike = 0.0):
-        _check_function("controller", controller, "(t, q, v, params)", '-params["gain"] * v["x"]')
+        fix = 'controller=lambda t, q, v, params: -params["gain"] * v["x"]'
+        must_be_function(controller, "controller", "(t, q, v, params)", fix)
         _check_above_zero("every", every, "a rate, 1 / every, in place of the time between two instants")
-        if not (callable(offset) or isinstance(offset, Tracer) or np.all(np.isfinite(np.asarray(offset)))):
-            raise ValueError(f"offset = {offset} is no time.\nFix: offset=0.0, the first instant.")
+        if not callable(offset):
+            must_be_finite(offset, "offset", "offset=0.0, the first instant")
         self.controller, self.every, self.offset = controller, _number(every), _number(offset)
 
     def __repr__(self):
@@ -495,21 +498,14 @@ class Elements(Mapping):
         impacts: str = "sequential",
         most_switches: int = MOST_SWITCHES,
     ):
-        if not isinstance(elements, Mapping):
-            raise TypeError(
-                f"elements must be given by name, not as {type(elements).__name__}.\n"
-                'Fix: elements={"floor": lj.Contact(gap)}.'
-            )
+        example = 'elements={"floor": lj.Contact(gap)}'
+        must_be(Mapping, elements, "elements must be given by name", example)
         for name, element in elements.items():
-            if not isinstance(name, str) or not isinstance(element, Element):
-                raise TypeError(
-                    f"element {name!r} is a {type(element).__name__}, and must be a lj.Contact, lj.CompliantContact, "
-                    'lj.Friction or lj.SampledControl with a name.\nFix: elements={"floor": lj.Contact(gap)}.'
-                )
-        if impacts not in IMPACTS:
-            raise ValueError(f"impacts must be one of {', '.join(map(repr, IMPACTS))}, not {impacts!r}.")
-        if not (isinstance(most_switches, int) and most_switches > 0):
-            raise ValueError(f"most_switches must be a whole number above zero, not {most_switches!r}.\nFix: 100.")
+            claim = f"element {name!r} must be a lj.Contact, lj.CompliantContact, lj.Friction or lj.SampledControl"
+            must_be(Element, element, claim, example)
+            must_be(str, name, "the name of an element must be text", example)
+        must_be_among(IMPACTS, impacts, "impacts")
+        must_be_whole(most_switches, "most_switches", fix="100")
         self.by_name = dict(sorted(elements.items()))
         self.impacts, self.most_switches = impacts, most_switches
 
@@ -540,32 +536,17 @@ def _unflatten(static: tuple, children: tuple) -> Elements:
 jax.tree_util.register_pytree_node(Elements, _flatten, _unflatten)
 
 
-def _check_function(role: str, function, arguments: str, example: str):
-    if not callable(function):
-        raise TypeError(
-            f"{role} must be a function of {arguments}, not {type(function).__name__}.\n"
-            f"Fix: {role}=lambda {arguments[1:-1]}: {example}"
-        )
-
-
 def _check_pair(friction, sliding):
-    if (friction is None) != (sliding is None):
-        given, missing = ("friction", "sliding") if sliding is None else ("sliding", "friction")
-        raise ValueError(
-            f"{given} is given, but {missing} is not: friction needs a coefficient and a velocity.\n"
-            'Fix: lj.Contact(gap, friction=0.3, sliding=lambda t, q, v, params: v["x"]).'
-        )
-    if sliding is not None:
-        _check_function("sliding", sliding, "(t, q, v, params)", 'v["x"]')
+    fix = 'lj.Contact(gap, friction=0.3, sliding=lambda t, q, v, params: v["x"])'
+    must_go_together({"friction": friction, "sliding": sliding}, "friction needs a coefficient and a velocity", fix)
+    must_be_function(sliding, "sliding", "(t, q, v, params)", 'sliding=lambda t, q, v, params: v["x"]', optional=True)
 
 
 def _check_above_zero(role: str, number, cause: str):
-    if callable(number) or isinstance(number, Tracer):
-        return
-    given = np.asarray(number)
-    if not np.all(given > 0):
-        fix = np.where(given == 0, 1.0, abs(given))
-        raise ValueError(f"{role} = {number} is not above zero.\nUsual cause: {cause}.\nFix: {role}={fix}.")
+    if not (callable(number) or isinstance(number, Tracer)):
+        given = np.asarray(number)
+        fix = f"{role}={np.where(given == 0, 1.0, abs(given))}"
+        must(np.all(given > 0), f"{role} must be above zero", number, fix, cause)
 
 
 def _check_not_negative(role: str, number):

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.display import printable
 from lagjax.jaxtools import is_eager, is_traced, numpy_of, to_jax
+from lagjax.refusals import shown
 from lagjax.system.user_errors import warn
 
 SINGLE = np.dtype("float32")
@@ -276,9 +277,8 @@ def _time(t: Array):
         return np.asarray(t)
     if isinstance(t, NUMBERS) and not isinstance(t, bool) and np.ndim(t) == 0:
         return _as_array(t)
-    got = f"an array of shape {np.shape(t)}" if isinstance(t, ARRAYS) else f"a {type(t).__name__}"
     raise TypeError(
-        f"t must be one number, not {got}.\n"
+        f"t must be one number, not {shown(t)}.\n"
         "Usual cause: arguments in another order.\n"
         "Fix: (system, t, q, v, params), as t=0.0."
     )

@@ -29,6 +29,7 @@ from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from lagjax.display import by_line
 from lagjax.jaxtools import kinds, same, without_init
+from lagjax.refusals import must, must_be, must_be_function, must_be_whole, must_name
 from lagjax.system.constraints import Element, Elements, Held, Holonomic, Nonholonomic, SampledControl
 from lagjax.system.coordinates import State
 from lagjax.system.traced import OF_STATE, WITH_FORCE, Traced, takes_of
@@ -146,11 +147,8 @@ class System(eqx.Module):
         }  # fmt: skip
         for role, function in functions.items():
             takes = ", ".join(WITH_FORCE if role == "forward_dynamics" else OF_STATE)
-            if function is not None and not callable(function):
-                raise TypeError(
-                    f"{role} must be a function of ({takes}), not {type(function).__name__}.\n"
-                    f"Fix: pass the function itself, {role}=f, not its value f(...)."
-                )
+            fix = f"pass the function itself, {role}=f, not its value f(...)"
+            must_be_function(function, role, f"({takes})", fix, optional=True)
         if constraints is not None and not isinstance(constraints, Mapping):
             raise TypeError(
                 f"constraints must be given by name, not as {type(constraints).__name__}.\n"
@@ -159,30 +157,21 @@ class System(eqx.Module):
                 + ("; L is one function, return kinetic - potential." if callable(constraints) else ".")
             )
         for name, constraint in (constraints or {}).items():
-            if not isinstance(name, str):
-                raise TypeError(
-                    f'a constraint is named {name!r}, but its name must be text.\nFix: "{name}": lj.Holonomic(g).'
-                )
+            must_be(str, name, "the name of a constraint must be text", '"rod": lj.Holonomic(g)')
             if isinstance(constraint, float | int):
                 raise TypeError(
                     f"constraint '{name}' is a number.\n"
                     "Usual cause: params in the place of constraints.\n"
                     "Fix: lj.System(lagrangian); each call takes them, lj.integrate(system, q0, v0, params, ts=ts)."
                 )
-            if not isinstance(constraint, (Holonomic, Nonholonomic)):
-                raise TypeError(
-                    f"constraint '{name}' is {type(constraint).__name__}; its kind is missing.\n"
-                    f'Fix: "{name}": lj.Holonomic(g) for g(t, q, params) = 0, or '
-                    f"lj.Nonholonomic(phi) for phi(t, q, v, params) = 0."
-                )
+            fix = f'"{name}": lj.Holonomic(g), g(t, q, params) = 0, or lj.Nonholonomic(phi), phi(t, q, v, params) = 0'
+            must_be(Holonomic | Nonholonomic, constraint, f"constraint '{name}' must have a kind", fix)
         states = {} if states is None else states
         by_name = isinstance(states, Mapping) and all(isinstance(name, str) for name in states)
-        if not by_name or not all(map(callable, states.values())):
-            raise TypeError(
-                f"states must be functions by name, not {states!r:.60}.\n"
-                "Usual cause: a start value in the place of the function that is its rate.\n"
-                'Fix: states={"z": lambda t, q, v, params: ...}; its start value is q0["z"].'
-            )
+        well = by_name and all(map(callable, states.values()))
+        cause = "a start value in the place of the function that is its rate"
+        fix = 'states={"z": lambda t, q, v, params: ...}; its start value is q0["z"]'
+        must(well, "states must be functions by name", states, fix, cause, TypeError)
         self.lagrangian = lagrangian
         # JAX sorts a dict whenever it passes through a transformation; the order of equations must not depend on that.
         self.constraints = dict(sorted((constraints or {}).items()))
@@ -379,18 +368,15 @@ class Switch(eqx.Module):
         rest: str | None = None,
         slower_than: ArrayLike = 1e-6,
     ):
-        for role, name in (("phase", phase), ("to", to), ("rest", rest)):
-            if not isinstance(name, str) and not (role == "rest" and name is None):
-                raise TypeError(
-                    f"{role} must be the name of a phase, not {type(name).__name__}.\n"
-                    'Fix: lj.Switch("flying", to="rolling", when=...).'
-                )
-        for role, function in (("when", when), ("reset", reset)):
-            if not callable(function) and not (role == "reset" and function is None):
-                raise TypeError(
-                    f"{role} of the switch from '{phase}' to '{to}' must be a function of (t, q, v, params), not "
-                    f"{type(function).__name__}.\nFix: {role}=lambda t, q, v, params: ..."
-                )
+        fix = 'lj.Switch("flying", to="rolling", when=...)'
+        for role, name in (("phase", phase), ("to", to)):
+            must_be(str, name, f"{role} must be the name of a phase", fix)
+        must_be(str | None, rest, "rest must be the name of a phase", fix)
+        where = f"of the switch from '{phase}' to '{to}'"
+        must_be_function(when, f"when {where}", "(t, q, v, params)", "when=lambda t, q, v, params: ...")
+        must_be_function(
+            reset, f"reset {where}", "(t, q, v, params)", "reset=lambda t, q, v, params: ...", optional=True
+        )
         self.phase, self.to, self.when, self.rest = phase, to, when, rest
         self.slower_than = slower_than if isinstance(slower_than, jax.Array) else np.asarray(slower_than, float)
         # A guard such as `lj.guards.touches` has its impact as `reset`.
@@ -466,36 +452,24 @@ class Hybrid(eqx.Module):
         switches: Sequence[Switch | Sequence[Switch]] = (),
         most_switches: int = MOST_SWITCHES,
     ):
-        if not isinstance(phases, Mapping) or not phases:
-            raise TypeError(
-                f"phases must be given by name, not as {type(phases).__name__}.\n"
-                'Fix: lj.Hybrid(phases={"flying": system}, switches=[...]).'
-            )
+        example = 'lj.Hybrid(phases={"flying": system}, switches=[...])'
+        must(isinstance(phases, Mapping) and phases, "phases must be given by name", phases, example, error=TypeError)
         for name, system in phases.items():
-            if not isinstance(system, System):
-                raise TypeError(f"phase '{name}' is {type(system).__name__}.\nFix: \"{name}\": lj.System(lagrangian).")
-        if not (isinstance(most_switches, int) and most_switches > 0):
-            raise ValueError(f"most_switches must be a whole number above zero, not {most_switches!r}.\nFix: 100.")
+            must_be(System, system, f"phase '{name}' must be a lj.System", f'"{name}": lj.System(lagrangian)')
+        must_be_whole(most_switches, "most_switches", fix="100")
         if isinstance(switches, Switch) or not isinstance(switches, Sequence):
             raise TypeError("switches must be a list of them.\nFix: switches=[lj.Switch(...)].")
         listed = [each for item in switches for each in ([item] if isinstance(item, Switch) else item)]
         for switch in listed:
-            if not isinstance(switch, Switch):
-                raise TypeError(
-                    f"a switch must be a lj.Switch, not a {type(switch).__name__}.\n"
-                    'Fix: lj.Switch("flying", to="rolling", when=lambda t, q, v, params: ...).'
-                )
+            fix = 'lj.Switch("flying", to="rolling", when=lambda t, q, v, params: ...)'
+            must_be(Switch, switch, "a switch must be a lj.Switch", fix)
             if switch.phase == switch.to and switch.reset is None:
                 raise ValueError(
                     f"the switch {switch.in_words()} leads back to its phase and resets nothing: its guard is still "
                     "below zero there.\nFix: reset=, or another phase; to record where something happens, lj.Crossing."
                 )
-            for name in (switch.phase, switch.to, switch.rest):
-                if name is not None and name not in phases:
-                    raise ValueError(
-                        f"the switch {switch.in_words()} names a phase '{name}', which does not exist.\n"
-                        f"The phases are {', '.join(map(repr, phases))}."
-                    )
+            named = [name for name in (switch.phase, switch.to, switch.rest) if name is not None]
+            must_name(named, phases, f"the switch {switch.in_words()} names", "phase")
         self.systems, self.names = tuple(phases.values()), tuple(phases)
         self.switches, self.most_switches = tuple(listed), most_switches
         self.first = np.zeros((), np.int32)
@@ -544,11 +518,8 @@ class Hybrid(eqx.Module):
             return self
         if not isinstance(start, str):
             return replace_fields(self, first=self._number(start, argument))
-        if start not in self.names:
-            raise ValueError(
-                f"{argument}={start!r} is not a phase.\nThe phases are {', '.join(map(repr, self.names))}; motions "
-                "start in the first one by default."
-            )
+        fix = f"{argument}='{{}}'; motions start in the first one by default"
+        must_name(start, self.names, f"{argument} names", "phase", fix)
         return replace_fields(self, first=np.asarray(self.names.index(start), np.int32))
 
     def _number(self, start, argument: str):

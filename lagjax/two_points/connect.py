@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled, depends, is_eager, is_traced
 from lagjax.mechanics import describe, listed
+from lagjax.refusals import must_be_like, must_return
 from lagjax.system import (
     OF_STATE,
     Call,
@@ -192,7 +193,8 @@ def _problem(system, q_a, q_b, t_a, t_b, params, end, free_time) -> tuple[Model,
     switching = system if system.in_phases or system.elements is not None else None
     system, s = checked(system.first_phase, State(t_a, q_a, q_a, params))
     model = model_of(system, *s)
-    _check_alike(q_a, q_b)
+    fix = "give both ends all coordinates; a coordinate that is free at the end needs end=..., not a gap"
+    must_be_like(q_b, q_a, "q_b", "q_a", fix, "a coordinate left out of one end")
     other = coordinates.state(t_b, q_b, q_b, s.params)
     alone = shoots_alone(model, switching)
     if alone and end is None and (free_time or not model.holonomic.all()):
@@ -228,16 +230,6 @@ def _check_finite(model: Model, ends: dict[str, Array], times: dict[str, Array])
             f"{bad[0][0]} is {float(bad[0][1])}, and a motion goes from one finite state to another.\n"
             "Usual cause: a division by zero where the end was computed, or an output of a motion that had ended.\n"
             "Fix: a number; a coordinate that is free at the end is left to end=..., and its entry is a guess."
-        )
-
-
-def _check_alike(q_a: PyTree, q_b: PyTree):
-    shapes = [jax.tree.map(jnp.shape, q) for q in (q_a, q_b)]
-    if jax.tree.structure(q_a) != jax.tree.structure(q_b) or shapes[0] != shapes[1]:
-        raise ValueError(
-            f"q_b must have the structure and shapes of q_a.\n  q_a: {shapes[0]}\n  q_b: {shapes[1]}\n"
-            "Usual cause: a coordinate left out of one end.\n"
-            "Fix: give both ends all coordinates; a coordinate that is free at the end needs end=..., not a gap."
         )
 
 
@@ -278,12 +270,8 @@ def _depends_on_velocity(condition: Callable, t: Array, x: Array, u: Array) -> b
 
 def _check_condition(call: Call, value):
     shape = getattr(value, "shape", None)
-    if shape is None or len(shape) > 1 or 0 in shape:
-        raise ValueError(
-            f"{call} must return a scalar or a vector that vanishes at the end, and returned "
-            f"{'an array of shape ' + str(shape) if shape is not None else type(value).__name__}.\n"
-            "Fix: return jnp.stack([...]) of the conditions."
-        )
+    wanted, fix = "a scalar or a vector that vanishes at the end", "return jnp.stack([...]) of the conditions"
+    must_return(shape is not None and len(shape) <= 1 and 0 not in shape, call, wanted, value, fix)
 
 
 def _count(count: int, wanted: str, model: Model, what: str, free_time: bool = False) -> str:

@@ -1,6 +1,5 @@
 """The optimal-control problem of `steer`, checked: ends, times, controls, bounds and costs by the user's names."""
 
-import difflib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -10,7 +9,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax.mechanics import constraint_residual, listed
+from lagjax.mechanics import constraint_residual
+from lagjax.refusals import must, must_be_among, must_be_like, must_be_whole, must_have_values, must_name, must_return
 from lagjax.steps import check_names, check_read, merge_by_name
 from lagjax.system import (
     OF_STATE,
@@ -20,7 +20,6 @@ from lagjax.system import (
     System,
     check_system,
     coordinates,
-    is_traced,
     model_of,
     traced_call,
     traced_system,
@@ -82,21 +81,14 @@ def asked(
 ) -> Question:  # fmt: skip
     """The question, after all that can be wrong with it was looked for."""
     check_system(system, states=False)
-    if is_traced((controls, start, end, params, times)):
-        raise TypeError(
-            "lj.steer is called from Python alone: its solver is not a JAX program.\n"
-            "Usual cause: jit, vmap or grad around it.\n"
-            "Fix: steer first; derivatives of the motion with the plan held are those of "
-            "lj.integrate(found.system, q0, v0, found.params, ts=ts)."
-        )
-    if options[1] not in INTERPOLATIONS:
-        raise ValueError(
-            f"interpolation={options[1]!r} is none of {listed(INTERPOLATIONS)}.\n"
-            'Fix: interpolation="linear", for a control that is linear between knots.'
-        )
+    what = "lj.steer is called from Python alone, as its solver is not a JAX program"
+    again = "lj.integrate(found.system, q0, v0, found.params, ts=ts)"
+    fix = f"steer first; derivatives of the motion with the plan held are those of {again}"
+    must_have_values((controls, start, end, params, times), what, fix, "jit, vmap or grad around it")
+    fix = 'interpolation="linear", for a control that is linear between knots'
+    must_be_among(INTERPOLATIONS, options[1], "interpolation", fix)
     for name, value, least in counts:
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-            raise ValueError(f"{name}={value!r} must be a whole number of at least {least}.\nFix: leave it out.")
+        must_be_whole(value, name, least, fix="leave it out")
     t_a, t_b = _times(*times)
     start, end_function = _pair(start, "start"), end if callable(end) else None
     q_like = _example(start, system)
@@ -168,11 +160,9 @@ def _time(t, q, v, params):
 
 def _times(t_a: Any, t_b: Any) -> tuple[float, tuple[float, float]]:
     pair = t_b if isinstance(t_b, (tuple, list)) else (t_b, t_b)
-    if len(pair) != 2 or not all(np.ndim(x) == 0 and np.isfinite(x) for x in (t_a, *pair)):
-        raise ValueError(
-            f"t_b must be a time, or a pair of times between which the end is sought, not {t_b!r:.80}.\n"
-            "Fix: t_b=2.0, or t_b=(0.1, 10.0)."
-        )
+    well = len(pair) == 2 and all(np.ndim(x) == 0 and np.isfinite(x) for x in (t_a, *pair))
+    claim = "t_b must be a time, or a pair of times between which the end is sought"
+    must(well, claim, t_b, "t_b=2.0, or t_b=(0.1, 10.0)")
     low, high = (float(x) for x in pair)
     if not float(t_a) < low <= high:
         raise ValueError(
@@ -209,29 +199,22 @@ def _end(pair: tuple, like: PyTree, which: str) -> End:
             found.append(np.full(coordinates.vector(like).size, np.nan))
             continue
         x = jtu.tree_map(lambda x: np.asarray(x, float), x)
-        shapes, expected = jtu.tree_map(np.shape, x), jtu.tree_map(np.shape, like)
-        if shapes != expected:
-            raise ValueError(
-                f"{which}: {name} has shapes {shapes}, and the start has {expected}.\n"
-                "Usual cause: a coordinate left out.\nFix: all coordinates, NaN for those that are free."
-            )
+        fix = "all coordinates, NaN for those that are free"
+        must_be_like(x, like, f"{name} of the {which}", "the start", fix, "a coordinate left out")
         found.append(coordinates.vector(x).astype(float))
     return End(*found)
 
 
 def check_number(call: Call, value: Any):
     """Raise where a function of the user's does not return one number."""
-    if np.shape(value) != () or not np.issubdtype(getattr(value, "dtype", type(value)), np.number):
-        raise ValueError(
-            f"{call} must return one number, and returned shape {np.shape(value)}.\n"
-            "Usual cause: a control that is an array, squared and not summed.\n"
-            'Fix: jnp.sum(u["push"] ** 2).'
-        )
+    well = np.shape(value) == () and np.issubdtype(getattr(value, "dtype", type(value)), np.number)
+    cause = "a control that is an array, squared and not summed"
+    must_return(well, call, "one number", value, 'jnp.sum(u["push"] ** 2)', cause)
 
 
 def _check_conditions(call: Call, value: Any):
-    if any(np.ndim(x) > 1 for x in jtu.tree_leaves(value)) or not jtu.tree_leaves(value):
-        raise ValueError(f"{call} must return numbers that vanish at the end.\nFix: q - jnp.array([1.0, 0.0]).")
+    well = jtu.tree_leaves(value) and all(np.ndim(x) < 2 for x in jtu.tree_leaves(value))
+    must_return(well, call, "numbers that vanish at the end", value, "q - jnp.array([1.0, 0.0])")
 
 
 def _limits(names: dict[str, list[str]], bounds: Mapping) -> dict[str, np.ndarray]:
@@ -247,23 +230,16 @@ def _limits(names: dict[str, list[str]], bounds: Mapping) -> dict[str, np.ndarra
         kinds = {kind for kind, _ in places}
         if not places:
             every = [x for known in names.values() for x in known]
-            near = difflib.get_close_matches(str(name), every, 1)
-            raise ValueError(
-                f"bounds name '{name}', which is no control, coordinate or velocity: {listed(every)}.\n"
-                f"Fix: {near[0] if near else every[0]!r}."
-            )
+            must_name(name, every, "bounds names", "control, coordinate or velocity")
         if len(kinds) > 1:
             raise ValueError(
                 f"'{name}' is the name of a control and of a coordinate.\nFix: another name for the control."
             )
-        if not (isinstance(pair, (tuple, list)) and len(pair) == 2):
-            raise TypeError(
-                f"the bounds of '{name}' must be a pair.\nFix: '{name}': (low, high), with jnp.inf for none."
-            )
+        well, claim = isinstance(pair, (tuple, list)) and len(pair) == 2, f"the bounds of '{name}' must be a pair"
+        must(well, claim, pair, f"'{name}': (low, high), with jnp.inf for none", error=TypeError)
         kind, at = places[0][0], [i for _, i in places]
         low, high = (np.broadcast_to(np.ravel(np.asarray(x, float)), len(at)) for x in pair)
-        if not np.all(low <= high):
-            raise ValueError(f"the lower bound of '{name}' is above the upper one: {pair!r:.80}.\nFix: (low, high).")
+        must(np.all(low <= high), f"the lower bound of '{name}' must be below the upper one", pair, "(low, high)")
         found[kind][:, at] = low, high
     return found
 

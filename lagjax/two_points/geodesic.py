@@ -32,7 +32,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
-from lagjax.mechanics import accelerations_at, listed
+from lagjax.mechanics import accelerations_at
+from lagjax.refusals import must_be_function, must_name
 from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare
 from lagjax.two_points.answer import Connection, is_same
 from lagjax.two_points.connect import ELEMENTS, connected
@@ -257,12 +258,7 @@ def _point(system, s, outputs) -> Geodesic:
 def _round_the_other_way(model, a: PyTree, b: PyTree, angles) -> list[PyTree]:
     """The ends that are the same point: the nearest way round, and for each angle the other way."""
     names = [angles] if isinstance(angles, str) else list(angles)
-    unknown = [name for name in names if name not in model.names]
-    if unknown:
-        raise ValueError(
-            f"angles names '{unknown[0]}', and the coordinates are {listed(model.names)}.\n"
-            f'Fix: angles="{model.names[0]}".'
-        )
+    must_name(names, model.names, "angles names", "coordinate", "angles='{}'")
     x, y = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(q)]).astype(float) for q in (a, b))
     around = np.array([name in names for name in model.names])
     nearest = np.where(around, y - TURN * np.round((y - x) / TURN), y)
@@ -337,11 +333,9 @@ def parallel_transport(
     """
     system = of_metric(metric)
     check_system(system, w, params, states=False)
-    if not isinstance(path, Geodesic) and not callable(path):
-        raise TypeError(
-            f"a path is a function of t or a Geodesic, not {type(path).__name__}.\n"
-            'Fix: lambda t: {"psi": 1.0, "theta": 2.0 * t}.'
-        )
+    fix = 'lambda t: {"psi": 1.0, "theta": 2.0 * t}'
+    if not isinstance(path, Geodesic):
+        must_be_function(path, "a path", "t, or a Geodesic", fix)
     if isinstance(path, Geodesic):
         start = jax.tree.map(lambda x: x[0], path.connection.q)
         t_a, t_b = np.zeros((), path.length.dtype), np.ones((), path.length.dtype)

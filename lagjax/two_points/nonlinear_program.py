@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax.refusals import installed
+
 
 class SolverAnswer(NamedTuple):
     """A solution x, its cost, the equations' values and multipliers, and the solver's status and iterations."""
@@ -110,14 +112,7 @@ class NonlinearProgram:
 
 def import_casadi():
     """casadi, which brings Ipopt with it."""
-    try:
-        import casadi
-    except ImportError as error:
-        raise ImportError(
-            "lj.steer solves its nonlinear program by Ipopt, which comes with casadi, and casadi is not installed.\n"
-            'Fix: pip install "lagjax[steer]".'
-        ) from error
-    return casadi
+    return installed("casadi", "lj.steer, which solves its nonlinear program by casadi's Ipopt,", "steer")
 
 
 def _functions(casadi: Any, program: NonlinearProgram) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from lagjax.mechanics import listed
+from lagjax.refusals import must_be_function
 from lagjax.system import System, coordinates
 from lagjax.two_points.control_problem import Question, asked
 from lagjax.two_points.mesh import Jump, Mesh, even, jumps_of, places
@@ -100,11 +101,8 @@ def first_plan(question: Question, guess: Callable | Steering | None, controls_a
         path = _moved_to_ends(question, _path_of(guess))
         controls_at = controls_at or (lambda t: guess.controls(_as_before(guess, (t - t_a) / (t_b - t_a))))
     elif guess is not None:
-        if not callable(guess):
-            raise TypeError(
-                f"guess is a function of t or an earlier Steering, not {type(guess).__name__}.\n"
-                'Fix: guess=lambda t: {"x": 0.5 * t}, like the coordinates.'
-            )
+        fix = 'guess=lambda t: {"x": 0.5 * t}, like the coordinates'
+        must_be_function(guess, "guess", "t, or an earlier Steering", fix)
 
         def path(shares: np.ndarray) -> np.ndarray:
             return np.stack([coordinates.vector(guess(t)) for t in t_a + shares * (t_b - t_a)])

@@ -62,6 +62,7 @@ from lagjax.integrate import ENDED_WELL, Trajectory, is_among
 from lagjax.jaxtools import compiled, to_jax
 from lagjax.mechanics import accelerations_at
 from lagjax.numerics import null_space
+from lagjax.refusals import must_be_function
 from lagjax.system import (
     OF_STATE,
     Call,
@@ -469,11 +470,8 @@ def lqr(
 
 def _along_trajectory(system, controls, trajectory, cost, params, end_cost, with_control) -> TrackingLQR:
     """The regulator about a trajectory."""
-    if not callable(controls):
-        raise TypeError(
-            f"about a trajectory controls are a function of time, not {type(controls).__name__}.\n"
-            'Fix: controls=found.controls of lj.steer, or lambda t: {"push": ...}.'
-        )
+    fix = 'controls=found.controls of lj.steer, or lambda t: {"push": ...}'
+    must_be_function(controls, "controls about a trajectory", "time", fix)
     if jnp.ndim(trajectory.end.t) or not is_among(trajectory.result, ENDED_WELL):
         raise ValueError(
             "the trajectory failed, or is a batch: there is no motion to keep to.\n"

@@ -27,6 +27,7 @@ from scipy.linalg import eigh
 
 from lagjax.integrate import Trajectory
 from lagjax.jaxtools import compiled, numpy_of
+from lagjax.refusals import must_be, must_be_whole
 from lagjax.system import Model, coordinates
 from lagjax.two_points import mesh
 from lagjax.two_points.elements import rule_of_degree
@@ -62,16 +63,12 @@ def guesses_of(model: Model, starts: Starts) -> list[PathGuess]:
     """The starts that are asked for."""
     if callable(starts) or isinstance(starts, Trajectory):
         return [PathGuess("the given path", starts)]
-    if not isinstance(starts, int | np.integer | Sequence):
-        raise TypeError(
-            f"starts is a number of starts, a path q(t), a motion of integrate, or a list of these, not "
-            f"{type(starts).__name__}.\nFix: starts=8."
-        )
+    claim = "starts must be a number of starts, a path q(t), a motion of integrate, or a list of these"
+    must_be(int | np.integer | Sequence, starts, claim, "starts=8")
     if not isinstance(starts, int | np.integer):
         named = enumerate(starts, start=1)
         return [start if isinstance(start, PathGuess) else PathGuess(f"given path {i}", start) for i, start in named]
-    if starts < 1:
-        raise ValueError(f"starts={starts}: there must be one at least.\nFix: starts=1, the straight line.")
+    must_be_whole(starts, "starts", fix="starts=1, the straight line")
     random = np.random.default_rng(0)
     waves = [waves_of(random, AMPLITUDES[i % 3], np.ones(model.n)) for i in range(starts - 1)]
     return [PathGuess("straight line"), *(PathGuess(f"random start {i + 1}", wave) for i, wave in enumerate(waves))]

@@ -23,10 +23,11 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.integrate import ROUND_OFFS, Trajectory, arguments, integrate, nystrom_for, reporting, runs_backward
+from lagjax.integrate import Trajectory, arguments, integrate, nystrom_for, reporting, runs_backward
 from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of, to_jax
 from lagjax.mechanics import is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Tsit5
+from lagjax.refusals import PACKAGES, must
 from lagjax.system import State, System, model_of
 
 # From too loose for high orders to show, to where round-off dominates.
@@ -55,12 +56,9 @@ def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.Abst
         return usual_methods(system, start)
     if isinstance(methods, (str, diffrax.AbstractSolver, type)) or not isinstance(methods, Iterable):
         fix = f"methods=[{as_code(methods)}]" if isinstance(methods, diffrax.AbstractSolver) else FIX
-        raise TypeError(
-            f"methods must be a sequence of solvers, or a dict of them by name, not {_in_words(methods)}.\nFix: {fix}."
-        )
+        must(False, "methods must be a sequence of solvers, or a dict of them by name", methods, fix, error=TypeError)
     named = dict(methods) if isinstance(methods, Mapping) else _named(methods)
-    if not named:
-        raise ValueError("methods is empty: there is nothing to compare.\nFix: leave it out.")
+    must(named, "methods must hold something to compare", methods, "leave it out")
     for name, method in named.items():
         _check(name, method, system, start)
     return named
@@ -112,42 +110,18 @@ def ladder(tolerances: Any, dtype: Any) -> tuple[float, ...]:
         found = np.atleast_1d(np.asarray(tolerances, float))
     except (TypeError, ValueError):
         found = np.zeros(())
-    if found.ndim != 1 or not found.size:
-        raise ValueError(
-            f"tolerances must be a sequence of positive numbers, not {tolerances!r}.\n"
-            "Fix: tolerances=(1e-4, 1e-6, 1e-8)."
-        )
-    floor = ROUND_OFFS * float(np.finfo(dtype).eps)
+    fix, cause = "tolerances=(1e-4, 1e-6, 1e-8)", "exponents instead of powers of ten"
+    well = found.ndim == 1 and found.size and np.all(np.isfinite(found) & (found > 0))
+    must(well, "tolerances must be a sequence of positive numbers", tolerances, fix, cause)
     for value in found:
-        if not np.isfinite(value) or value <= 0:
-            raise ValueError(
-                f"tolerances must be positive numbers, but one is {value:g}.\n"
-                "Usual cause: exponents instead of powers of ten.\nFix: tolerances=(1e-4, 1e-6, 1e-8)."
-            )
-        if value < floor:
-            cause = "JAX works in float32 by default" if np.dtype(dtype) == np.float32 else "a wrong exponent"
-            raise ValueError(
-                f"a tolerance of {value:.3g} is below what {np.dtype(dtype)} can reach ({floor:.1g}).\n"
-                f"Usual cause: {cause}.\nFix: tolerances down to {10 * floor:.0e}"
-                + (
-                    ', or jax.config.update("jax_enable_x64", True) before the first array.'
-                    if np.dtype(dtype) == np.float32
-                    else "."
-                )
-            )
+        arguments.check_reach(value, "tolerances", np.dtype(dtype))
     return tuple(float(value) for value in sorted(set(found), reverse=True))
 
 
 def as_code(method: Any) -> str:
     """A method as it is written in code."""
-    package = arguments.PACKAGES.get(type(method).__module__.split(".")[0], "")
+    package = PACKAGES.get(type(method).__module__.split(".")[0], "")
     return f"{package}{method!r}"
-
-
-def _in_words(x: float):
-    if isinstance(x, type):
-        return f"the class {x.__name__}"
-    return f"{x!r}" if isinstance(x, str) else f"one {type(x).__name__}"
 
 
 MAX_STEPS = 2**20

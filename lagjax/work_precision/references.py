@@ -22,6 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax.integrate import Crossing, Trajectory, ended_well, message, runs_backward
 from lagjax.numerics import Radau5
+from lagjax.refusals import must, must_be_single, must_name
 from lagjax.system import coordinates
 from lagjax.work_precision.methods import TIGHTEST, ComparedMotion, TimedProgram, usual_methods
 
@@ -239,11 +240,8 @@ def given_reference(reference: Any, motion: ComparedMotion, program: TimedProgra
 
 def _as_states(states: Any, motion: ComparedMotion):
     """(q, v) in the structure and shapes of the start, each leaf with an axis of times in front."""
-    if not (isinstance(states, (tuple, list)) and len(states) == 2):
-        raise TypeError(
-            f"the reference must give two things, coordinates and velocities, but gave {type(states).__name__}"
-            f"{f' of {len(states)}' if isinstance(states, (tuple, list)) else ''}.\nFix: {FIX_OF_FORM}."
-        )
+    well = isinstance(states, (tuple, list)) and len(states) == 2
+    must(well, "the reference must give coordinates and velocities", states, FIX_OF_FORM, error=TypeError)
     count = len(motion.ts)
     for which, tree, like in zip(("coordinates", "velocities"), states, motion.start[1:3]):
         if jax.tree.structure(tree) != jax.tree.structure(like):
@@ -263,11 +261,7 @@ def _as_states(states: Any, motion: ComparedMotion):
 
 
 def _check_trajectory(reference: Trajectory, motion: ComparedMotion):
-    if reference.t.ndim != 1:
-        raise ValueError(
-            f"the reference is a batch of shape {reference.t.shape[:-1]}.\n"
-            "Fix: reference=jax.tree.map(lambda x: x[0], traj), one lane of it."
-        )
+    must_be_single(reference.t.shape[:-1], "the reference", "reference={traj}")
     t, ts = np.asarray(reference.t), motion.ts
     if t.shape != ts.shape or not np.allclose(t, ts, rtol=0, atol=8 * np.finfo(ts.dtype).eps * np.max(np.abs(ts))):
         raise ValueError(
@@ -279,8 +273,7 @@ def _check_trajectory(reference: Trajectory, motion: ComparedMotion):
             f"the reference did not reach its end: {message(reference.result)}\nFix: leave reference out, or repair it."
         )
     _as_states((reference.q, reference.v), motion)
-    missing = [name for name in motion.options["events"] or {} if name not in reference.events]
-    if missing:
-        raise ValueError(
-            f"the reference does not have the event {missing[0]!r}.\nFix: integrate it with events=events, too."
-        )
+    events = motion.options["events"] or {}
+    must_name(
+        events, reference.events, "the events ask for", "event of the reference", "integrate it with events=events, too"
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from lagjax.display import DrawnAxes, labelled, table
 from lagjax.display import plots as plot
 from lagjax.integrate import Trajectory
+from lagjax.refusals import installed
 from lagjax.work_precision.methods import as_code
 from lagjax.work_precision.references import Reference
 
@@ -184,10 +185,7 @@ class WorkPrecision:
 
         **Raises:** `ImportError` without pandas.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError('this needs pandas, an optional extra.\nFix: pip install "lagjax[data]"') from error
+        pandas = installed("pandas", "this", "data")
         points = list(self.points)
         names = ("method", "tolerance", "error", "trusted", "seconds", "least", "steps", "evaluations")
         columns = {name: [getattr(point, name) for point in points] for name in names}
@@ -205,10 +203,7 @@ class WorkPrecision:
 
         **Raises:** `ImportError` without xarray.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError('this needs xarray, an optional extra.\nFix: pip install "lagjax[data]"') from error
+        xarray = installed("xarray", "this", "data")
         methods, points = list(self.curves), list(self.points)
         tolerances = sorted({point.tolerance for point in points}, reverse=True)
         # Not called `method`, which is an argument of xarray's `sel`.

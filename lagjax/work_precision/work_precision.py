@@ -28,8 +28,8 @@ from jaxtyping import Array, ArrayLike, PyTree
 from lagjax.display import plots as plot
 from lagjax.display import table
 from lagjax.integrate import Crossing, Trajectory, arguments, ended_well, integrate, is_suited, message
-from lagjax.jaxtools import is_eager, is_traced
 from lagjax.numerics import EqualSteps, Gauss, Radau5, Splitting, evaluations_a_step
+from lagjax.refusals import must, must_be, must_be_function, must_have_values, must_name, must_not_meet
 from lagjax.system import State, System, by_name, check_system, coordinates, model_of
 from lagjax.work_precision import references
 from lagjax.work_precision.methods import (
@@ -196,29 +196,20 @@ def _motion(
 ):
     """The motion, with its start as arrays; raise if the arguments do not define one."""
     check_system(system, q0, v0, params)
-    unknown = [name for name in options if name not in OPTIONS]
-    if unknown:
-        raise TypeError(
-            f"work_precision() has no argument {unknown[0]!r}.\n"
-            f"Fix: of integrate's arguments it takes {', '.join(OPTIONS)}; rtol is its tolerances=."
-        )
-    if not is_eager() or is_traced((q0, v0, params, ts)):
-        raise TypeError("work_precision measures times, but it is being traced.\nFix: call it outside jit.")
+    fix = "leave it out; rtol is its tolerances="
+    must_name(options, OPTIONS, "work_precision() was given", "argument of it", fix, error=TypeError)
+    must_have_values((q0, v0, params, ts), "work_precision measures times", "call it outside jit", eager=True)
     ts = np.asarray(arguments.vector_of_times(ts))
     start = coordinates.state(ts[0], q0, v0, params)
     return ComparedMotion(system, start, arguments.times(ts, start.t.dtype), {**options, "events": events})
 
 
 def _check(reference: Any, error: Any, others: Any, events: Mapping[str, Crossing] | None):
-    if reference is not None and error is not None:
-        raise ValueError("reference and error are two ways to define the error.\nFix: leave one of them out.")
-    if reference is not None and not isinstance(reference, (Trajectory, tuple, list)) and not callable(reference):
-        raise TypeError(
-            f"reference is of type {type(reference).__name__}, which cannot be compared with.\n"
-            f"Fix: {references.FIX_OF_FORM}."
-        )
-    if others and events:
-        raise ValueError("others have no events to compare.\nFix: leave out events, or others.")
+    must_not_meet({"reference": reference, "error": error}, "they are two ways to define the error")
+    if not callable(reference):
+        claim = "reference must be something to compare with"
+        must_be(Trajectory | tuple | list | None, reference, claim, references.FIX_OF_FORM)
+    must_not_meet({"others": others or None, "events": events or None}, "others have no events to compare")
 
 
 def _solves_of_program(name: str, program: TimedProgram, tolerances: Sequence[float], patience: float):
@@ -511,8 +502,7 @@ def horizons(
     Source: Hairer, Lubich & Wanner, *Geometric Numerical Integration*, §X.3.
     """
     check_system(system, q0, v0, params)
-    if not is_eager() or is_traced((q0, v0, params)):
-        raise TypeError("horizons measures times, but it is being traced.\nFix: call it outside jit.")
+    must_have_values((q0, v0, params), "horizons measures times", "call it outside jit", eager=True)
     ends = _checked(period, periods, error, methods, reference)
     start = coordinates.state(0.0, q0, v0, params)
     solvers = {_label(method): method for method in (_usual(system, start) if methods is None else methods)}
@@ -584,15 +574,11 @@ def _checked(period: Any, periods: Any, error: Any, methods: Any, reference: Any
             f"horizons are numbers of periods of a positive length, increasing, not {periods!r} of {period!r}.\n"
             "Fix: period=6.28, periods=(10, 100, 1000)."
         )
-    if not 0 < error < 1:
-        raise ValueError(f"error is relative, between 0 and 1, not {error!r}.\nFix: error=1e-3.")
-    if methods is not None and (isinstance(methods, (str, dict)) or not isinstance(methods, Iterable)):
-        raise TypeError(
-            "methods must be a sequence of solvers and methods of equal steps.\n"
-            "Fix: methods=[lj.Nystrom12(), lj.Gauss(4)], or leave it out."
-        )
-    if methods is not None and not list(methods):
-        raise ValueError("methods is empty: there is nothing to compare.\nFix: leave it out.")
+    must(0 < error < 1, "error is relative, and must be between 0 and 1", error, "error=1e-3")
+    well = methods is None or isinstance(methods, Iterable) and not isinstance(methods, (str, dict))
+    fix = "methods=[lj.Nystrom12(), lj.Gauss(4)], or leave it out"
+    must(well, "methods must be a sequence of solvers and methods of equal steps", methods, fix, error=TypeError)
+    must(methods is None or list(methods), "methods must hold something to compare", methods, "leave it out")
     for method in methods or ():
         arguments.check_method(method)
         if not isinstance(method, (EqualSteps, diffrax.AbstractAdaptiveSolver)):
@@ -600,9 +586,6 @@ def _checked(period: Any, periods: Any, error: Any, methods: Any, reference: Any
                 f"{type(method).__name__} does not estimate its error, so no tolerance sets its steps.\n"
                 "Fix: leave it out, or leave methods out."
             )
-    if reference is not None and not callable(reference):
-        raise TypeError(
-            "reference must be a function of times, since horizons differ.\n"
-            "Fix: reference=lambda ts: (q, v), or leave it out."
-        )
+    fix = "reference=lambda ts: (q, v), or leave it out"
+    must_be_function(reference, "reference", "times, since horizons differ", fix, optional=True)
     return ends

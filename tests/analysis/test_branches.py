@@ -173,7 +173,7 @@ def test_what_is_drawn():
     dashes = {line.get_linestyle() for line in axis.get_lines() if len(line.get_xdata()) > 2}
     assert dashes == {"-", "--"} and axis.get_xlabel() == "mu" and axis.get_ylabel() == "q"
     assert {"stable", "unstable", "pitchfork"} <= set(axis.get_legend_handles_labels()[1])
-    with pytest.raises(ValueError, match="names no coordinate"):
+    with pytest.raises(ValueError, match="which is no coordinate"):
         found.plot("theta")
 
 

@@ -261,7 +261,7 @@ def test_combination_resonance():
 
 def test_no_orbit_to_begin_with():
     """A system is not an orbit."""
-    with pytest.raises(TypeError, match="needs a periodic orbit, not System") as raised:
+    with pytest.raises(TypeError, match="must be a periodic orbit, not a System") as raised:
         lj.continue_orbits(pendulum, along="g", to=2.0)  # type: ignore
     assert "Fix: orbit = lj.periodic_orbit" in str(raised.value) and PARAMS["g"] > 0
 

@@ -247,7 +247,7 @@ def test_the_action_of_a_trajectory():
         lj.action(system, motion, t0=0.0, t1=2.0)
     with pytest.raises(ValueError, match="a path that is a function needs its ends"):
         lj.action(system, lambda t: t, params)
-    with pytest.raises(TypeError, match="a path is a function of t or a Trajectory"):
+    with pytest.raises(TypeError, match="a path must be a function of t, or a Trajectory"):
         lj.action(system, 1.0, params, 0.0, 1.0)
 
 

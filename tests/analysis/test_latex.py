@@ -170,5 +170,5 @@ def test_what_cannot_be_written(monkeypatch):
 def test_without_sympy(monkeypatch):
     """SymPy is an extra, and the message says how to install it."""
     monkeypatch.setitem(sys.modules, "sympy", None)
-    with pytest.raises(ImportError, match="lj.latex needs SymPy(?s:.*)pip install 'lagjax.sympy.'"):
+    with pytest.raises(ImportError, match='lj.latex needs sympy(?s:.*)pip install "lagjax.sympy."'):
         lj.latex(lj.System(lambda t, q, v, p: 0.5 * v**2), 0.25, 0.5)

@@ -64,7 +64,7 @@ def test_what_programs_show(system, state, timeless, unseen):
 
 REFUSED = {
     "parts": (bouncing, {"parts": 4}, ValueError, "parts=4: a motion with switches is not divided"),
-    "no such phase": (bouncing, {"phase": "rolling"}, ValueError, "phase='rolling' is not a phase"),
+    "no such phase": (bouncing, {"phase": "rolling"}, ValueError, "phase names 'rolling', which is no phase"),
     "no phases": (block, {"phase": "sticks"}, ValueError, "phase= names the first phase of a lj.Hybrid"),
     "energy": (wheel, {"hold": "energy"}, ValueError, "the Jacobi integral is not conserved here"),
     "relative": (block, {"relative": "q"}, ValueError, "the system depends on it"),

@@ -190,13 +190,13 @@ def test_lanes():
 
 SIMPLE = {"start": (2.0, 0.0), "period": 6.0}
 REFUSED = {
-    "no pair": (pendulum, {"start": 2.0}, TypeError, r"start must be a pair \(q, v\), not float"),
+    "no pair": (pendulum, {"start": 2.0}, TypeError, r"start must be a pair \(q, v\), not 2.0"),
     "a period below zero": (pendulum, {"period": -1.0}, ValueError, "period must be one positive number"),
     "no such name": (
         pendulum,
         {"hold": "theta"},
         ValueError,
-        "hold names 'theta', and there are 'energy', 'period', 'q' and 'v'",
+        "hold names 'theta', which is no coordinate or velocity; there are 'energy', 'period', 'q' and 'v'",
     ),
     "seen": (pendulum, {"relative": "q"}, ValueError, "the system depends on it"),
     "no angle of that name": (pendulum, {"turns": {"phi": 1}}, ValueError, "turns names 'phi'"),

@@ -94,9 +94,9 @@ def test_pictures():
     np.testing.assert_array_equal(axis.lines[0].get_xydata(), numbers.T[:4])
     (axis,) = section.plot(x="t", y="q.x").axes
     np.testing.assert_array_equal(axis.lines[0].get_xydata(), [(t, 0.0) for t in range(1, 5)])
-    with pytest.raises(ValueError, match="to plot 'q.z': there is none; there are t, q.x, q.y"):
+    with pytest.raises(ValueError, match="plot was given 'q.z', which is no column; there are 't', 'q.x', 'q.y'"):
         section.plot(x="q.z", y="v.y")
-    with pytest.raises(ValueError, match="only one of them was given"):
+    with pytest.raises(ValueError, match="x is given, but y is not"):
         section.plot(x="q.y")
     with pytest.raises(ValueError, match="did not cross the section"):
         in_a_plane(count=0)[0].plot()
@@ -152,9 +152,9 @@ REFUSED = {
     "no function": ({"section": 0.0}, TypeError, "a function of"),
     "terminal": ({"section": lj.Crossing(bottom)}, ValueError, "ends the motion at its first crossing"),
     "a vector": ({"section": lambda t, q, v, p: jnp.stack([q, v])}, ValueError, "event 'section' must return one"),
-    "the name": ({"section": bottom, "events": {"section": ALSO["turn"]}}, ValueError, "is named 'section'"),
+    "the name": ({"section": bottom, "events": {"section": ALSO["turn"]}}, ValueError, "called 'section'"),
     "no events": ({"section": bottom, "events": [ALSO["turn"]]}, TypeError, "by name"),
-    "a coordinate": ({"section": bottom, "events": {"a": lj.turning_points("r")}}, ValueError, "of 'r': there is none"),
+    "a coordinate": ({"section": bottom, "events": {"a": lj.turning_points("r")}}, ValueError, "'r', which is no"),
 }
 
 
@@ -178,11 +178,15 @@ def test_turning_points_by_name():
             ValueError,
             r'There are q\[0\], q\[1\](?s:.*)lj.turning_points\("q\[0\]"\)',
         ),
-        (lambda: velocity("x", {"phi": 1.0, "r": 2.0}), ValueError, "points of 'x': there is none; there are phi, r"),
-        (lambda: lj.turning_points(0), TypeError, "by its name, not as int"),
-        (lambda: lj.periods(traj), TypeError, "not from a Trajectory"),
+        (lambda: velocity("x", {"phi": 1.0, "r": 2.0}), ValueError, "'x', which is no coordinate; .* 'phi' and 'r'"),
+        (lambda: lj.turning_points(0), TypeError, "by its name, not 0"),
+        (lambda: lj.periods(traj), TypeError, "must be crossings, not a Trajectory"),
         (lambda: lj.periods(crossings(np.ones(1))), ValueError, "only one crossing was kept"),
-        (lambda: lj.PoincareSection(traj, "top"), ValueError, "no event 'top'; recorded: 'section'"),
+        (
+            lambda: lj.PoincareSection(traj, "top"),
+            ValueError,
+            "'top', which is no event of the trajectory; there is 'section'",
+        ),
     ):
         with pytest.raises(error, match=words):
             act()

@@ -37,5 +37,5 @@ def test_refused_in_words():
     record = lj.Record(TS, q=bounced(9.81, 0.8))
     with pytest.raises(ValueError, match=r"(?s)lj\.Hybrid the phase in which each window would start is.*Fix:"):
         lj.fit(ball, record, {"g": 9.5, "e": 0.75}, window=0.5)
-    with pytest.raises(ValueError, match="'lies' is not a phase"):
+    with pytest.raises(ValueError, match="'lies', which is no phase.*'flies'"):
         lj.fit(ball, record, {"g": 9.5, "e": 0.75}, start="lies")

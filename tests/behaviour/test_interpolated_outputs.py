@@ -151,7 +151,7 @@ def test_beside_events_and_in_float32():
 
 def test_refused():
     """Unknown words, and methods whose steps are too long for the polynomial."""
-    with refusal(ValueError, "outputs must be 'exact' or 'interpolated'", 'outputs="exact"'):
+    with refusal(ValueError, "outputs must be 'exact', 'interpolated' or None", 'outputs="exact"'):
         lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="linear")
     with refusal(ValueError, "which Dopri8 does not go with", r"method=lj.Tsit5\(\)"):
         lj.integrate(pendulum, 1.2, 0.0, PARAMS, ts=FEW, outputs="interpolated", method=lj.Dopri8())

@@ -216,24 +216,24 @@ WRONG_VALUES = [
     *((lambda x=x: a_rod(inertia=x), "three principal moments") for x in ((1, NAN, 1), (np.inf,) * 3, 1.0, (1.0, 2.0))),
     *((lambda x=x: a_rod(x), "mass of 'rod' must be a positive number") for x in (0.0, np.inf, "1", np.ones(1))),
     (lambda: lj.bodies.spherical(ROD.at((1.0, 0.0, 0.0)), ROD.at((-1.0, 0.0, 0.0))), "both places are on 'rod'"),
-    (lambda: lj.bodies.multibody([ROD, a_rod(2.0)]), "two bodies or constraints are called 'rod'"),
+    (lambda: lj.bodies.multibody([ROD, a_rod(2.0)]), "two bodies are called 'rod'"),
     *((lambda x=x: ROD.at(x), "a point of 'rod' must be three numbers") for x in ((1.0, 0.0), (0.0, 0.0, NAN))),
     *((lambda x=x: ROD.at(axis=x), "the axis of a marker on 'rod'") for x in ((0.0, 0.0, 0.0), (np.inf, 0.0, 0.0))),
     (lambda: lj.bodies.Pose.at((1.0, 2.0)), "position of a pose must be three numbers"),
     *((lambda x=x: lj.bodies.Pose.at(axis=x), "axis of a pose must be finite and not zero")
       for x in ((0, 0, 0), (NAN, 0, 0))),
-    *((lambda x=x: lj.bodies.Pose.at().moving(**x), "must be three numbers, and has shape")
+    *((lambda x=x: lj.bodies.Pose.at().moving(**x), "must be three numbers, not ")
       for x in ({"velocity": 3.0}, {"spin": 3.0}, {"spin": (1.0, 2.0)})),
     (lambda: lj.bodies.weight([ROD], (0.0, 0.0, NAN)), "the field g of lj.bodies.weight must be 3 finite numbers"),
-    (lambda: lj.bodies.weight([ROD], 9.81), "the field g of lj.bodies.weight must be 3 finite numbers, and is 9.81"),
+    (lambda: lj.bodies.weight([ROD], 9.81), "the field g of lj.bodies.weight must be 3 finite numbers, not 9.81"),
     (lambda: lj.bodies.spring(GROUND, ROD.at(), NAN), "the stiffness of lj.bodies.spring must be a finite number"),
-    (lambda: lj.bodies.rolling_sphere(ROD.at(), GROUND, -1.0), "the radius of .* above zero, and is -1.0"),
-    (lambda: lj.bodies.rolling(ROD.at(), GROUND, NAN), "the radius of lj.bodies.rolling .* above zero, and is nan"),
-    (lambda: lj.bodies.rolling_ellipsoid(ROD.at(), GROUND, (1.0, 0.0, 1.0)), "a half axis of .*, and is 0"),
+    (lambda: lj.bodies.rolling_sphere(ROD.at(), GROUND, -1.0), "the radius of .* above zero, not -1.0"),
+    (lambda: lj.bodies.rolling(ROD.at(), GROUND, NAN), "the radius of lj.bodies.rolling .* above zero, not nan"),
+    (lambda: lj.bodies.rolling_ellipsoid(ROD.at(), GROUND, (1.0, 0.0, 1.0)), "a half axis of .*, not 0"),
     (lambda: lj.bodies.multibody(body for body in ()), "lj.bodies.multibody was given no bodies.\nUsual cause: a gen"),
 ]  # fmt: skip
 WRONG_KINDS = [
-    (lambda: lj.bodies.revolute(ROD, GROUND), "Body is none.\nFix: lj.bodies.spherical"),
+    (lambda: lj.bodies.revolute(ROD, GROUND), "not a Body.\nFix: lj.bodies.spherical"),
     (lambda: ROD.spin({"rod": lj.bodies.Pose.at()}, NO_POSE),
      "'rod' of q and v must be a lj.bodies.Pose, and is tuple.\nFix: q0 ="),
     (lambda: ROD.point({"rods": lj.bodies.Pose.at()}, (1.0, 0.0, 0.0)),
@@ -244,15 +244,15 @@ WRONG_KINDS = [
      "lj.bodies.multibody takes a list of lj.bodies.Body, and was given Body, Marker"),
     (lambda: lj.bodies.multibody([ROD], {"hinge": HINGE}, PULL), "one load was given"),
     (lambda: lj.bodies.multibody([ROD], {}, [PULL, of_state]),
-     "load 1 of lj.bodies.multibody is no lj.bodies.Load, but function"),
+     "load 1 of lj.bodies.multibody must be a lj.bodies.Load, not a function"),
     (lambda: lj.bodies.multibody([ROD], {"hinge": PULL}),
-     "joint 'hinge' of lj.bodies.multibody is no constraint, but Load"),
+     "joint 'hinge' of lj.bodies.multibody must be a constraint, not a Load"),
     (lambda: lj.bodies.multibody([ROD], [HINGE]),
-     "joints of lj.bodies.multibody are a dict by name, and list was given"),
-    (lambda: lj.bodies.multibody([ROD], forces=of_state), "no argument 'forces'.\nFix: .*force, dissipation"),
-    *((lambda load=load: load(GROUND, ROD, 1.0), "held at two places on bodies, and Body is none")
+     "joints of lj.bodies.multibody must be a dict by name, not ."),
+    (lambda: lj.bodies.multibody([ROD], forces=of_state), "'forces', which is no argument .*'force', 'dissipation'"),
+    *((lambda load=load: load(GROUND, ROD, 1.0), "held at two places on bodies: a lj.bodies.Marker, not a Body")
       for load in (lj.bodies.spring, lj.bodies.torsion, lj.bodies.motor)),
-    (lambda: lj.bodies.applied(ROD, (1.0, 0.0, 0.0)), "a force acts at a place on a body, and Body is none"),
+    (lambda: lj.bodies.applied(ROD, (1.0, 0.0, 0.0)), "acts at a place on a body: a lj.bodies.Marker, not a Body"),
     # Numbers are functions of params, forces of the state; JAX's own are neither.
     (lambda: a_rod(of_state), r"mass\(params\) of 'rod' is called with 1 argument, but .*f\(t, q, v, params\)"),
     (lambda: ROD.at(of_state), r"a point\(params\) of 'rod' is called with 1 argument"),

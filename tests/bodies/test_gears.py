@@ -110,12 +110,12 @@ def test_refused_gears():
     """What is no gear is said with its body or number, and how it is written."""
     a, b = sun.at(), planet.at()
     for given, error, words in (
-        ((a, b, np.nan), ValueError, "finite number that is not 0, and is nan.\nUsual cause: a division by zero"),
+        ((a, b, np.nan), ValueError, "finite number that is not 0, not nan.\nUsual cause: a division by zero"),
         ((a, b, 0), ValueError, "the ratio of lj.bodies.gear must be a finite number that is not 0"),
         ((a, b, (1.0, 2.0)), ValueError, "the ratio of lj.bodies.gear must be a finite number"),
         ((a, sun.at((1.0, 0.0, 0.0)), 2.0), ValueError, "both places are on 'sun'"),
-        ((a, planet, 2.0), TypeError, "and Body is none"),
-        ((a, b, 2.0, arm.at()), TypeError, "the carrier of lj.bodies.gear is a body, and Marker is none"),
+        ((a, planet, 2.0), TypeError, "not a Body"),
+        ((a, b, 2.0, arm.at()), TypeError, "the carrier of lj.bodies.gear must be a body, not a Marker"),
         ((a, b, 2.0, sun), ValueError, "the carrier of lj.bodies.gear, 'sun', is one of the two bodies"),
         ((a, b, lambda t, q, v, params: 2.0), TypeError, "ratio"),
     ):

@@ -83,12 +83,12 @@ def test_shapes_stand_where_bodies_are():
 
 def test_what_is_no_place():
     """Names in place of bodies, colours by name, radii of NaN, and lines through nothing are refused."""
-    with pytest.raises(TypeError, match="(?s)not str.*Fix: lj.shapes.sphere"):
+    with pytest.raises(TypeError, match="(?s)not 'a'.*Fix: lj.shapes.sphere"):
         lj.shapes.sphere("a", 1.0)
-    with pytest.raises(ValueError, match="six hexadecimal digits, and is 'red'"):
+    with pytest.raises(ValueError, match="six hexadecimal digits, not 'red'"):
         lj.shapes.sphere(A, 1.0, color="red")
     for radius in (np.nan, np.inf, -1.0):
-        with pytest.raises(ValueError, match=f"must be a finite number from zero on, and is {radius}"):
+        with pytest.raises(ValueError, match=f"must be a finite number from zero on, not {radius}"):
             lj.shapes.rod(A, (0.0, 0.0, 1.0), radius)
     with pytest.raises(ValueError, match="needs places"):
         lj.shapes.line()

@@ -224,7 +224,7 @@ def test_what_is_no_tree_is_refused():
             lj.bodies.Tree(bodies, joints)
     with pytest.raises(TypeError, match="none that a tree has coordinates for"):
         lj.bodies.Tree([a], {"x": lj.Holonomic(lambda t, q, params: q["a"].position)})
-    with pytest.raises(TypeError, match="no lj.bodies.Load"):
+    with pytest.raises(TypeError, match="must be a lj.bodies.Load"):
         lj.bodies.Tree([a], {"x": hinge}).system([hinge])
 
 
@@ -233,8 +233,8 @@ def test_armature_and_frames_that_are_none_are_refused():
     frame, rod = lj.bodies.Body("frame", 0.0, (0.0, 0.0, 0.0)), lj.bodies.Body("rod", 1.0, (1.0, 1.0, 1.0))
     hinge, on = lj.bodies.revolute(lj.bodies.ground.at(), rod.at()), lj.bodies.revolute(rod.at(), frame.at())
     for bodies, joints, armature, said in (
-        ([rod], {"x": hinge}, {"y": 1.0}, "armature 'y' belongs to no joint"),
-        ([rod], {}, {"rod": 1.0}, "armature 'rod' belongs to no joint"),
+        ([rod], {"x": hinge}, {"y": 1.0}, "armature names 'y', which is no joint"),
+        ([rod], {}, {"rod": 1.0}, "armature names 'rod', which is no joint"),
         ([rod], {"x": hinge}, {"x": -1.0}, "must be a moment of inertia that is not negative"),
         ([rod], {"x": [hinge]}, {"x": (1.0, 2.0)}, "or \\(1,\\) of them"),
         ([rod, frame], {"x": hinge, "y": on}, {}, "'frame' moves and has no mass"),

@@ -337,10 +337,50 @@ print(type(traj.q).__name__, traj.asked, traj.at(0.5).q.x, repr(traj).split("err
 """
 
 
-def run(*args, cache):
+DOORS = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import numpy as np
+import lagjax as lj
+def lagrangian(t, q, v, params):
+    swing = params["l"] * v["a"]
+    return 0.5 * (swing**2 + v["b"] ** 2 - q["b"] ** 2) + params["l"] * jnp.cos(q["a"]) + 0.1 * v["a"] * v["b"]
+system = lj.System(lagrangian)
+rest, q, v, ts = {"a": 0.0, "b": 0.0}, {"a": 0.3, "b": 0.1}, {"a": 0.0, "b": 0.2}, np.linspace(0.0, 1.0, 5)
+def end(l):
+    return lj.integrate(system, q, v, {"l": l}, ts=ts).q["a"][-1]
+def record():
+    swing = 0.3 * np.cos(np.linspace(0.0, 2.0, 12))
+    return lj.Record(np.linspace(0.0, 2.0, 12), q={"a": swing, "b": 0.5 * swing}, q0=q, v0=v, sigma=0.1)
+lengths = {"l": np.linspace(1.0, 2.0, 16)}
+doors = {
+    "accelerations": lambda: lj.accelerations(system, 0.0, q, v, {"l": 2.0}),
+    "rollout": lambda: lj.rollout(system, q, v, {"l": 2.0}, 10, 0.01),
+    "normal_modes": lambda: lj.normal_modes(system, 0.0, rest, rest, {"l": 2.0}).frequency,
+    "sweep": lambda: lj.sweep(lambda at: end(at["l"]), lengths).values,
+    "equilibria": lambda: lj.equilibria(system, {"l": 2.0}, starts=[q]).q,
+    "orbit": lambda: lj.periodic_orbit(system, (rest | {"a": 0.3}, rest), 8.8, {"l": 2.0}).period,
+    "exponents": lambda: lj.lyapunov_exponents(system, q, v, {"l": 2.0}, ts=np.linspace(0.0, 30.0, 31)).exponents,
+    "fit": lambda: lj.fit(system, record(), {"l": 1.0}, free="l").params,
+    "sweep of slopes": lambda: lj.sweep(lambda at: jax.grad(end)(at["l"]), lengths).values,
+    "sweep of curvatures": lambda: lj.sweep(lambda at: jax.hessian(end)(at["l"]), lengths).values,
+    "sweep of pushes": lambda: lj.sweep(lambda at: jax.jacfwd(end)(at["l"]), lengths).values,
+    "sweep of lanes": lambda: lj.sweep(lambda at: jax.vmap(end)(at["l"] + jnp.arange(3.0)).sum(), lengths).values,
+    "sweep of rests": lambda: lj.sweep(lambda at: lj.equilibria(system, at, starts=[q]).q, lengths).values,
+}
+answers = [doors[name]() for name in sys.argv[1].split(",")]
+found = lj.cache()
+print(found.found, found.written, *(np.asarray(x).tobytes().hex() for x in jax.tree.leaves(answers)))
+print(found.not_kept)
+"""
+
+
+def run(*args, cache, script=MOTION):
     """What new processes print, which run at once."""
     environment = {**os.environ, "LAGJAX_CACHE": str(cache)}
-    ask = [sys.executable, "-c", MOTION]
+    ask = [sys.executable, "-c", script]
     started = [
         subprocess.Popen(
             [*ask, *map(str, one)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -369,3 +409,49 @@ def test_motions_in_new_processes(tmp_path):
     assert counts == [(0, 0)] * 2 and others[1] == answers[4]
     counts, (changed,) = run((9.82, 1), cache=tmp_path)
     assert counts == [(0, 1)] and changed == others[0] and folder.size(tmp_path)[0] == 2
+
+
+FEW = "accelerations,rollout,normal_modes,sweep"
+MORE = "equilibria,orbit,exponents,fit,sweep of slopes,sweep of pushes,sweep of lanes,sweep of rests"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "doors, count",
+    [(FEW, 6), pytest.param(f"{MORE},sweep of curvatures", 11, marks=pytest.mark.exhaustive)],
+)
+def test_doors_in_new_processes(tmp_path, doors, count):
+    """The same bits without the folder, with an empty one, and from it, where nothing is compiled any more."""
+    (off,) = run((doors,), cache="off", script=DOORS)[1]
+    counts, (first,) = run((doors,), cache=tmp_path, script=DOORS)
+    assert counts[0][1] >= count - 1 and first[0] == off[0] and first[1] == "{}\n", first[1]
+    counts, (again,) = run((doors,), cache=tmp_path, script=DOORS)
+    assert counts == [(counts[0][0], 0)] and counts[0][0] >= count - 1 and again == first
+
+
+HISTORIES = """
+import sys
+import jax
+import numpy as np
+jax.config.update("jax_enable_x64", True)
+import lagjax as lj
+from tests.system import test_traced_functions as histories
+answer = histories.weight_at
+def from_the_folder(system):
+    histories.forget()
+    return answer(system)
+histories.weight_at = from_the_folder
+wrong, asked = histories.wrong_answers(np.random.default_rng(int(sys.argv[2])), int(sys.argv[1]))
+found = lj.cache()
+print(found.found, found.written, wrong, asked)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [40, pytest.param(320, marks=pytest.mark.exhaustive)])
+def test_random_histories_from_the_folder(tmp_path, count):
+    """Every answer of random histories of changes is that of L as it is then, with each program from the folder."""
+    for seed in (0, 1):
+        ((found, _),), ((answers, _),) = run((count, seed), cache=tmp_path, script=HISTORIES)
+        wrong, asked = map(int, answers)
+        assert wrong == 0 and asked == 5 * count and found > count

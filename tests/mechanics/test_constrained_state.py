@@ -210,7 +210,7 @@ def test_names_to_hold():
         ("x", (7, 8)),
     ):
         np.testing.assert_array_equal(np.flatnonzero(~free_coordinates(q, name)), held)
-    with pytest.raises(ValueError, match="hold names 'cran', but the coordinates are 'crank.position"):
+    with pytest.raises(ValueError, match="hold names 'cran', which is no coordinate; there are 'crank.position"):
         free_coordinates(q, "cran")
 
 

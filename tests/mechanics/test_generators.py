@@ -43,7 +43,7 @@ def test_a_generator_of_the_wrong_structure_is_named():
         (lambda t, q, params: {"x": jnp.ones(3), "y": 0.0}, ValueError, r"moves 'x', of shape \(\)"),
         (lambda t, q: q, TypeError, "is called with 3 arguments"),
         (lambda t, q, params: {"x": q["r"], "y": 0.0}, ValueError, "asks for 'r'"),
-        (lj.Generator.shift("phi"), ValueError, "no coordinate 'phi'; the coordinates are 'x' and 'y'"),
+        (lj.Generator.shift("phi"), ValueError, "names 'phi', which is no coordinate; there are 'x' and 'y'"),
         (lj.Generator(time=lambda t, q, params: jnp.ones(2)), ValueError, "must return one number"),
     ]
     for generator, kind, words in cases:
@@ -51,11 +51,11 @@ def test_a_generator_of_the_wrong_structure_is_named():
             lj.noether_charge(STONE, generator)(*state)
         with pytest.raises(kind, match=words):
             lj.is_symmetry(STONE, generator, *state[1:])
-    with pytest.raises(TypeError, match="a generator is a lj.Generator or a function"):
+    with pytest.raises(TypeError, match="a generator must be a function .* or a lj.Generator"):
         lj.noether_charge(STONE, 1.0)
     with pytest.raises(ValueError, match="no points to move in space among the coordinates"):
         lj.noether_charge(lj.System(lambda t, q, v, p: v**2), lj.Generator.rotation("z"))(0.0, 0.5, 0.5, None)
     with pytest.raises(TypeError, match="must move something"):
         lj.Generator()
-    with pytest.raises(ValueError, match='an axis is "x", "y", "z" or a vector'):
+    with pytest.raises(ValueError, match="an axis must be 'x', 'y', 'z' or a vector"):
         lj.Generator.rotation("w")

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.models.readers import mujoco_itself
+from lagjax.refusals import installed
 from tests.models.test_links_and_joints import ARM, MOVING
 from tests.models.test_readers import BODY, PENDULUM, arm, two_links
 
-mujoco = mujoco_itself()
+mujoco = installed("mujoco", "a test", "models")
 
 # As MuJoCo must be asked, so that it keeps links apart and numbers as they are.
 ASKED = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath="false" balanceinertia="false"/></mujoco>'

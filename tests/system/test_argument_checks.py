@@ -60,7 +60,7 @@ NO_SYSTEMS = {
     "the class": (lj.System, "the class System", r"lj.System\(lagrangian\)"),
     "a constraint": (lj.Holonomic(rod), "a Holonomic", "constraints={"),
     "what was found of one": (lj.noether_charge(pendulum, TURN), "a NoetherCharge", "its .system"),
-    "a number": (3.0, "a float", "as the first argument"),
+    "a number": (3.0, "3.0", "as the first argument"),
     "nothing": (None, "None", "as the first argument"),
 }
 
@@ -86,7 +86,7 @@ def test_no_door_is_left_out():
     first = {name: next(iter(inspect.signature(function).parameters), "") for name, function in functions.items()}
     of_systems = {name for name, argument in first.items() if argument == "system"}
     assert of_systems - {"floquet"} <= set(DOORS)
-    with pytest.raises(TypeError, match=r"a lj.System or a periodic orbit, not function.\nFix: "):
+    with pytest.raises(TypeError, match=r"or a periodic orbit, not the function 'pendulum_lagrangian'.\nFix: "):
         lj.floquet(pendulum.lagrangian, 0.0, 1.0, 0.0, PARAMS, 1.0)
 
 
@@ -95,7 +95,7 @@ def test_other_refusals_of_what_is_no_system():
     for act, words in (
         (lambda: lj.energy_ledger(pendulum), "needs a motion that was computed"),
         (lambda: lj.sweep(pendulum, {"g": [1.0, 2.0]}), "a function of a point"),
-        (lambda: lj.Hybrid({"swinging": pendulum.lagrangian}), "phase 'swinging' is function"),
+        (lambda: lj.Hybrid({"swinging": pendulum.lagrangian}), "phase 'swinging' must be a lj.System"),
     ):
         with pytest.raises(TypeError, match=words + "(?s:.*)Fix: "):
             act()

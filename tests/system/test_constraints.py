@@ -42,7 +42,7 @@ def test_residuals_and_closed_forms():
 @pytest.mark.parametrize("kind", [lj.Holonomic, lj.Nonholonomic])
 def test_no_function_no_constraint(kind):
     """A number is refused with the fix; twin: a function is taken, and named."""
-    with pytest.raises(TypeError, match=f"needs a function(.|\n)*Fix: lj.{kind.__name__}"):
+    with pytest.raises(TypeError, match=f"must be a function of(.|\n)*Fix: lj.{kind.__name__}"):
         kind(1.0)
     assert repr(kind(np.hypot)) == f"{kind.__name__}(hypot)"
 

@@ -48,22 +48,22 @@ VALUES = [
     (lambda: lj.Friction(sliding, -1.0, 1.0), "coefficient = -1.0 is below zero"),
     (lambda: lj.Stop(above), "needs low, high"),
     (lambda: lj.Stop(above, low=2.0, high=1.0), "above high"),
-    (lambda: lj.Elements({"floor": floor}, impacts="both"), "one of 'sequential'"),
-    (lambda: lj.CompliantContact(above, -1.0), "stiffness = -1.0 is not above zero"),
+    (lambda: lj.Elements({"floor": floor}, impacts="both"), "'sequential' or 'simultaneous', not 'both'"),
+    (lambda: lj.CompliantContact(above, -1.0), "stiffness must be above zero, not -1.0"),
     (lambda: lj.CompliantContact(above, 1.0, -1.0), "damping = -1.0 is below zero"),
     (lambda: lj.CompliantContact(above, 1.0, sliding=sliding), "sliding is given, but friction is not"),
-    (lambda: lj.SampledControl(sliding, 0.0), r"(?s)every = 0.0 is not above zero.*Fix: every=1.0"),
-    (lambda: lj.SampledControl(sliding, np.nan), "every = nan is not above zero"),
-    (lambda: lj.SampledControl(sliding, 1.0, np.inf), "offset = inf is no time"),
+    (lambda: lj.SampledControl(sliding, 0.0), r"(?s)every must be above zero, not 0.0.*Fix: every=1.0"),
+    (lambda: lj.SampledControl(sliding, np.nan), "every must be above zero, not nan"),
+    (lambda: lj.SampledControl(sliding, 1.0, np.inf), "infinity in offset: inf"),
     # Names that clash or do not exist, shapes that differ.
     (lambda: moved(cart, {"x": 0.0}, {"x": 0.0}), r"(?s)q0 has no entry 'u'.*Fix: q0 = \{..., 'u': 0.0\}"),
     (lambda: moved(cart, {"x": 0.0, "u": np.zeros(2)}, {"x": 0.0}), r"of element 'u' must return .* shape \(\)"),
     (lambda: lj.System(energy, states={"u": three}, elements={"u": servo}),
      "'u' is the name of a state and of a lj.SampledControl"),
-    (lambda: held_by({"floor": held}, floor=floor), "'floor' is the name of an element and of a constraint"),
-    (lambda: held_by({"floor friction": skids}, floor=rough), "'floor friction' is the name of"),
-    (lambda: held_by(**{"floor": rough, "floor friction": floor}), "'floor friction' is the name of"),
-    (lambda: moved(rubbed), "normal='flour' of element 'brake' is no constraint and no contact; .*'floor'"),
+    (lambda: held_by({"floor": held}, floor=floor), "an element and a constraint, .* called 'floor'"),
+    (lambda: held_by({"floor friction": skids}, floor=rough), "called 'floor friction'"),
+    (lambda: held_by(**{"floor": rough, "floor friction": floor}), "called 'floor friction'"),
+    (lambda: moved(rubbed), "normal of element 'brake' names 'flour', which is no constraint or contact; .*'floor'"),
     (lambda: held_by(floor=lj.Contact(above, friction=0.1, sliding=three)),
      r"sliding\(t, q, v, params\) of element 'floor' must return a number"),
     (lambda: held_by(brake=lj.Friction(three, 0.1, 1.0)), r"(?s)a number, .* or \(2,\) for .*jnp.full\(k, N\)"),
@@ -73,7 +73,7 @@ VALUES = [
 ]  # fmt: skip
 KINDS = [
     (lambda: lj.Contact(1.0), "gap must be a function"),  # pyright: ignore
-    (lambda: lj.System(lagrangian, elements={"floor": held}), "element 'floor' is a Holonomic"),  # pyright: ignore
+    (lambda: lj.System(lagrangian, elements={"floor": held}), "element 'floor' must be .* not a Holonomic"),  # pyright: ignore
     (lambda: lj.CompliantContact(above, 1.0, restitution=0.5), "restitution"),  # pyright: ignore
     (lambda: lj.SampledControl(1.0, 0.1), "controller must be a function"),  # pyright: ignore
     (lambda: lj.accelerations(rubbed, 0.0, 0.0, 0.0, None), "(?s)'brake', 'floor'.*lj.integrate takes elements"),

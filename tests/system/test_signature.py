@@ -24,7 +24,7 @@ def test_another_system_is_told(tmp_path):
     ):
         with pytest.raises(ValueError, match=words):
             lj.load_trajectory(path, other)
-    with pytest.raises(TypeError, match="system must be a lj.System, not function"):
+    with pytest.raises(TypeError, match="system must be a lj.System, not the function 'cartesian_lagrangian'"):
         lj.load_trajectory(path, cartesian_lagrangian)
     made_anew = lj.System(lambda *s: cartesian_lagrangian(*s), {"rod": lj.Holonomic(lambda *at: rod(*at))})
     np.testing.assert_array_equal(lj.load_trajectory(path, made_anew).q["x"], traj.q["x"])

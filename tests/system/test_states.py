@@ -44,7 +44,7 @@ REFUSED = [
     # Wrong rates, and functions that read what they must not.
     (lambda: at(with_state(lambda t, q, v, p: jnp.ones(1))), ValueError,
      r"(?s)of shape \(\), and returned shape \(1,\).*\nFix: "),
-    (lambda: at(with_state(lambda t, q, v, p: None)), ValueError, r"(?s)returned a NoneType.*\nFix: "),
+    (lambda: at(with_state(lambda t, q, v, p: None)), ValueError, r"(?s)returned None.*\nFix: "),
     (lambda: at(with_state(lambda t, q, v, p: 1.0 - v["z"])), ValueError,
      r"(?s)rate of state 'z' contains v\['z'\].*\nFix: "),
     (lambda: at(with_state(square, force=lambda t, q, v, p: q)), ValueError, r"(?s)force acts on state 'z'.*\nFix: "),

@@ -85,7 +85,7 @@ def test_called_lagrangian_and_bare_constraint():
         lj.System(pendulum.lagrangian, pendulum.lagrangian)
     with refusal(TypeError, "params in the place of constraints", "each call takes them"):
         lj.System(pendulum.lagrangian, PARAMS)
-    with refusal(TypeError, "named 3, but its name must be text"):
+    with refusal(TypeError, "the name of a constraint must be text, not 3"):
         lj.System(pendulum.lagrangian, {3: lj.Holonomic(lambda t, q, params: q)})
 
 
@@ -185,14 +185,14 @@ def run(system, ts=(0.0, 1.0), **options):
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (lambda: hybrid("rolling"), ValueError, "names a phase 'rolling', which does not exist"),
-        (lambda: run(bouncing, start="rolling"), ValueError, "start='rolling' is not a phase"),
+        (lambda: hybrid("rolling"), ValueError, "names 'rolling', which is no phase"),
+        (lambda: run(bouncing, start="rolling"), ValueError, "start names 'rolling', which is no phase"),
         (lambda: run(ball, start="flying"), ValueError, "start= names the first phase"),
         (lambda: run(bouncing, (1.0, 0.0)), ValueError, "runs forward"),
         (lambda: hybrid(when=lambda t, q, v, p: v), ValueError, "leads back to its phase and resets nothing"),
         (lambda: lj.mass_matrix(bouncing, 0.0, 1.0, 0.0, HOOP), TypeError,
          r"(?s)takes one system.*hybrid.systems\[0\] for 'flying'"),
-        (lambda: lj.Hybrid({"a": falling}), TypeError, "phase 'a' is function"),
+        (lambda: lj.Hybrid({"a": falling}), TypeError, "phase 'a' must be a lj.System, not the function"),
         (lambda: run(hybrid(reset=lambda t, q, v, p: (v, v, v))), ValueError,
          r"reset\(t, q, v, params\).* must return velocities like v"),
     ],

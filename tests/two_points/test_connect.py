@@ -89,7 +89,7 @@ def test_free_ends():
 @pytest.mark.parametrize(
     "change, words",
     [
-        ({"q_b": np.zeros(3)}, "must have the structure and shapes of q_a"),
+        ({"q_b": np.zeros(3)}, "q_b must be like q_a, in structure and shapes"),
         ({"t_b": 0.0}, "is not after t_a"),
         ({"t_b": np.inf}, "t_b is inf, and a motion goes from one finite state"),
         ({"q_b": np.array([4.0, np.nan])}, r"coordinate 'q\[1\]' of q_b is nan, and a motion goes"),
@@ -97,7 +97,7 @@ def test_free_ends():
         ({"end": lambda t, q, v, params: jnp.zeros(3)}, "there are 3 conditions of positions on the end"),
         ({"end": lambda t, q, v, params: v[0]}, "there is one condition with velocities"),
         ({"end": lambda t, q, v, params: (q, v)}, "must return a scalar or a vector that vanishes"),
-        ({"starts": 0}, "there must be one at least"),
+        ({"starts": 0}, "starts must be a whole number above zero, not 0"),
     ],
 )
 def test_refused(change, words):

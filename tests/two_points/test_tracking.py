@@ -119,7 +119,7 @@ def test_on_a_constraint():
 def test_questions_that_are_wrong():
     """Controls that are no function, an end's cost without an end, and a control for nothing."""
     motion = reference_motion("driven")
-    with pytest.raises(TypeError, match="about a trajectory controls are a function of time, not dict"):
+    with pytest.raises(TypeError, match="controls about a trajectory must be a function of time, not {"):
         lj.lqr(mass, {"push": 0.0}, motion, squares, PARAMS)
     with pytest.raises(ValueError, match="end_cost belongs to a trajectory"):
         lj.lqr(mass, {"push": 0.0}, (0.0, 0.0), squares, PARAMS, end_cost=lambda t, q, v, p: q**2)

@@ -59,7 +59,7 @@ def test_in_space():
 
 def test_a_path_that_is_none():
     """A path must be a function or a geodesic."""
-    with pytest.raises(TypeError, match="a path is a function of t or a Geodesic, not dict"):
+    with pytest.raises(TypeError, match="a path must be a function of t, or a Geodesic, not {"):
         lj.parallel_transport(sphere, {"psi": 1.0, "theta": 0.0}, {"psi": 1.0, "theta": 0.0})
 
 

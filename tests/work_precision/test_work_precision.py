@@ -154,17 +154,17 @@ def test_nothing_in_reach_is_said(made_up, monkeypatch):
     [
         ({"methods": "Dopri8"}, TypeError, "methods must be a sequence of solvers"),
         ({"methods": lj.Dopri8()}, TypeError, r"Fix: methods=\[lj.Dopri8\(\)\]"),
-        ({"methods": []}, ValueError, "methods is empty"),
-        ({"methods": [lj.Dopri8]}, TypeError, r"is the class.*\n.*\n.*lj.Dopri8\(\)"),
-        ({"methods": [lj.Dopri8(), "RK45"]}, TypeError, "method 'str'.*not str"),
+        ({"methods": []}, ValueError, "methods must hold something"),
+        ({"methods": [lj.Dopri8]}, TypeError, r"the class.*\n.*\n.*lj.Dopri8\(\)"),
+        ({"methods": [lj.Dopri8(), "RK45"]}, TypeError, "method 'str'.*not 'RK45'"),
         ({"methods": [diffrax.Euler()]}, TypeError, r"does not estimate its error(.*\n)*.*HalfSolver\(diffrax.Euler"),
         ({"methods": {"s": diffrax.SemiImplicitEuler()}}, TypeError, "method 's'.*does not estimate its error"),
-        ({"tolerances": (1e-6, 0.0)}, ValueError, "positive numbers, but one is 0"),
+        ({"tolerances": (1e-6, 0.0)}, ValueError, "positive numbers, not .1e-06, 0.0"),
         ({"tolerances": (1e-6, -1e-8)}, ValueError, "positive"),
         ({"tolerances": (1e-17,)}, ValueError, "below what float64 can reach"),
         ({"tolerances": ()}, ValueError, "sequence of positive numbers"),
-        ({"rtol": 1e-6}, TypeError, "no argument 'rtol'(.*\n)*.*tolerances="),
-        ({"reference": "exact"}, TypeError, "reference is of type str"),
+        ({"rtol": 1e-6}, TypeError, "'rtol', which is no argument(.*\n)*.*tolerances="),
+        ({"reference": "exact"}, TypeError, "something to compare with, not 'exact'"),
         ({"reference": swing, "error": len}, ValueError, "two ways to define the error"),
     ],
 )
@@ -235,7 +235,7 @@ def test_a_motion_that_amplifies_is_said_to(made_up):
 @pytest.mark.parametrize(
     ("reference", "error", "words"),
     [
-        ((np.zeros(4),), TypeError, "two things"),
+        ((np.zeros(4),), TypeError, "must give coordinates and velocities, not "),
         ((np.zeros(4), {"theta": np.zeros(4)}), ValueError, "velocities are not in the structure of v0"),
         ((np.zeros(2), np.zeros(4)), ValueError, r"shape \(2,\) at 'q', but \(4,\) is needed"),
     ],

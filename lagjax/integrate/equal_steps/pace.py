@@ -27,6 +27,7 @@ from lagjax.integrate.equal_steps.gauss_step import added
 from lagjax.integrate.equal_steps.watched_step import Due
 from lagjax.jaxtools import where
 from lagjax.numerics import EqualSteps
+from lagjax.refusals import must_return
 from lagjax.system import OF_POSITION, OF_STATE, Call, Form, State, traced_call
 
 
@@ -40,12 +41,9 @@ def with_traced_pace(method: EqualSteps, start: State) -> EqualSteps:
 
 def _check(call: Call, value: Any):
     shape, dtype = jnp.shape(value), jnp.result_type(value)
-    if shape != () or not jnp.issubdtype(dtype, jnp.floating) and not jnp.issubdtype(dtype, jnp.integer):
-        raise ValueError(
-            f"{call} must return one positive number, and returned shape {shape}, {dtype}.\n"
-            "Usual cause: distances that are left as a vector.\n"
-            "Fix: jnp.sum(q**2) ** 0.75, for the distance to the power 3/2."
-        )
+    real = jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
+    fix = "jnp.sum(q**2) ** 0.75, for the distance to the power 3/2"
+    must_return(shape == () and real, call, "one positive number", value, fix, "distances that are left as a vector")
 
 
 class Pace(NamedTuple):

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jaxtools import length, without_init
+from lagjax.refusals import must, must_be, must_be_function, must_be_whole, must_differ, must_return
 from lagjax.system import (
     OF_STATE,
     WITH_MULTIPLIERS,
@@ -70,19 +71,12 @@ class Crossing(eqx.Module):
     most: int = eqx.field(static=True)
 
     def __init__(self, guard: Callable, direction: int | None = 0, terminal: bool = True, most: int = 32):
-        if not callable(guard):
-            raise TypeError(
-                f"a guard must be a function of (t, q, v, params), not {type(guard).__name__}.\n"
-                'Fix: lj.Crossing(lambda t, q, v, params: q["y"]).'
-            )
+        must_be_function(guard, "a guard", "(t, q, v, params)", 'lj.Crossing(lambda t, q, v, params: q["y"])')
         # True is 1; what False means, diffrax and NumPy do not agree on.
-        if direction not in DIRECTIONS or direction is False:
-            raise ValueError(
-                f"direction must be 1 (from below), -1 (from above) or 0 (both), not {direction!r}.\n"
-                "Fix: one of them, as direction=-1 for crossings from above."
-            )
-        if not (isinstance(most, int) and most > 0):
-            raise ValueError(f"most must be a whole number above zero, not {most!r}.\nFix: most=1000.")
+        wanted = "direction must be 1 (from below), -1 (from above) or 0 (both)"
+        well = direction in DIRECTIONS and direction is not False
+        must(well, wanted, direction, "one of them, as direction=-1 for crossings from above")
+        must_be_whole(most, "most", fix="most=1000")
         self.guard = guard
         self.direction = DIRECTIONS[direction]
         self.terminal = bool(terminal)
@@ -231,37 +225,22 @@ def _number(value: Any, t: Array):
 
 def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
     """Return the crossings in `events` and those for the conditions of `event`, by name; raise for anything else."""
-    if events is not None and not isinstance(events, Mapping):
-        raise TypeError(
-            f"events must be given by name, not as {type(events).__name__}.\n"
-            'Fix: events={"apex": lj.Crossing(lambda t, q, v, params: v["y"])}.'
-        )
+    example = 'events={"apex": lj.Crossing(lambda t, q, v, params: v["y"])}'
+    must_be(Mapping | None, events, "events must be given by name", example)
     for name, crossing in (events or {}).items():
-        if not isinstance(crossing, Crossing):
-            raise TypeError(
-                f"event '{name}' must be a lj.Crossing, not {type(crossing).__name__}.\n"
-                f'Fix: "{name}": lj.Crossing(lambda t, q, v, params: q["y"]).'
-            )
+        must_be(Crossing, crossing, f"event '{name}' must be a lj.Crossing", example)
     found = dict(sorted((events or {}).items()))
     if event is None:
         return found
-    if not isinstance(event, diffrax.Event):
-        raise TypeError(
-            f"event must be a diffrax.Event, not {type(event).__name__}.\n"
-            "Usual cause: its condition was passed instead.\n"
-            'Fix: events={"down": lj.Crossing(lambda t, q, v, params: q["y"])}.'
-        )
+    must_be(diffrax.Event, event, "event must be a diffrax.Event", example, "its condition was passed instead")
     of_diffrax = {None: 0, True: 1, False: -1}
     conditions = jtu.tree_leaves_with_path(event.cond_fn, is_leaf=callable)
     directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
     for (path, condition), direction in zip(conditions, directions):
         if not asks_diffrax(condition):
             name = "event" + jtu.keystr(path)
-            if name in found:
-                raise ValueError(
-                    f"two events have the name '{name}', which lagjax gives to the diffrax.Event.\n"
-                    "Fix: use another name in events=, or give both there, as lj.Crossing."
-                )
+            fix = "another name in events=, or both there, as lj.Crossing"
+            must_differ([name, *found], "two events, one of them by lagjax as it is a diffrax.Event,", fix)
             found[name] = Crossing(Condition(condition), of_diffrax[direction])
     return found
 
@@ -307,13 +286,10 @@ def traced_guard(name: str, guard: Callable, given: Mapping[str, Any]) -> Traced
 
 def _check(call: Call, value: Any):
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", np.dtype(type(value)))
-    if shape != () or not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)):
-        raise ValueError(
-            f"{call} must return one real number, or true or false, but returned "
-            f"{'nothing' if value is None else f'shape {shape}, {dtype}'}.\n"
-            "Usual cause: a whole vector, or a function without return.\n"
-            "Fix: return one coordinate of it; several coordinates need an event each."
-        )
+    well = jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.bool_)
+    cause = "a whole vector, or a function without return"
+    fix = "return one coordinate of it; several coordinates need an event each"
+    must_return(shape == () and well, call, "one real number, or true or false", value, fix, cause)
 
 
 class EventWarning(UserWarning):

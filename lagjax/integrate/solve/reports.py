@@ -49,6 +49,7 @@ from lagjax.jaxtools import (
     stands_for,
     stop_gradient,
 )
+from lagjax.refusals import must_be
 
 # The tightest tolerance that is not below round-off.
 ROUND_OFFS = 8
@@ -68,10 +69,8 @@ ROUND_OFF = 3.0
 
 def steps_to_repeat(estimate: bool | None, controller, progress: bool) -> np.ndarray:
     """Return the most steps of a motion to be integrated again; raise if `estimate` is not None, True or False."""
-    if not (estimate is None or isinstance(estimate, (bool, np.bool_))):
-        raise TypeError(
-            f"estimate_error must be True, False or None, not {estimate!r}.\nFix: estimate_error=True, or leave it out."
-        )
+    kinds = bool | np.bool_ | None
+    must_be(kinds, estimate, "estimate_error must be True, False or None", "estimate_error=True, or leave it out")
     ours = controller is None or _fixed(controller)
     by_default = STEPS_AT_MOST if is_eager() and ours and not progress else 0
     limits = {None: by_default, True: np.iinfo(np.int32).max, False: 0}

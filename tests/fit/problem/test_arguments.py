@@ -38,7 +38,7 @@ KNOWN = lj.Record(T, q=Q, q0=1.0, v0=0.0, hold_q=True, hold_v=True)
         ((lj.Record(T, q=Q, v=Q), PENDULUM, {}), ValueError, "several kinds.*sigma"),
         ((lj.Record(T, q=Q, sigma={"v": 0.1}), PENDULUM, {}), ValueError, "sigma has no entry 'q'"),
         ((lj.Record(T, q=Q, sigma=-1.0), PENDULUM, {}), ValueError, "sigma must be positive"),
-        ((lj.Record(T, q=Q, params={"mass": 2.0}), PENDULUM, {}), ValueError, "'mass', which is not in params"),
+        ((lj.Record(T, q=Q, params={"mass": 2.0}), PENDULUM, {}), ValueError, "'mass', which is no entry of params"),
         ((lj.Record(T, q=Q, params={"m": 2.0}), PENDULUM, {}), ValueError, "which the fit is to find"),
         ((lj.Record(T, end={"t": 1.0}, q0=0.1, v0=0.0), PENDULUM, {}), ValueError, "event"),
         (([RECORD, lj.Record(T, v=Q)], PENDULUM, {}), ValueError, "record 1 holds 'v'"),

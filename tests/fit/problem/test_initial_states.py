@@ -81,8 +81,8 @@ def test_unknowns_of_a_start_keep_to_the_constraints():
 @pytest.mark.parametrize(
     ("measured", "words"),
     [
-        ({"q": {"z": np.zeros((1, 60))}}, "'z' was measured as q, but the motion has no such name: 'x' and 'y'"),
-        ({"multipliers": {"rope": np.zeros((1, 60))}}, "'rope' was measured as multipliers(.|\n)*'rod'"),
+        ({"q": {"z": np.zeros((1, 60))}}, "as q has 'z', which is no name of the motion; there are 'x' and 'y'"),
+        ({"multipliers": {"rope": np.zeros((1, 60))}}, "measured as multipliers has 'rope'(.|\n)*'rod'"),
         ({"q": np.zeros((1, 60))}, "but the motion has(.|\n)*in that structure"),
         ({"q": {"x": np.zeros((1, 60, 1))}}, r"'x' was measured with the shape \(1,\) at each time, but"),
     ],

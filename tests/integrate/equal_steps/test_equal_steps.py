@@ -117,7 +117,7 @@ REFUSED = {
     "no length": (kepler, ellipse(0.3), lj.Gauss(2), {"dt0": None},
                   "makes steps of equal length, which is not given.*dt0=0.01"),
     "rest": (kepler, ellipse(0.3), lj.Splitting(), {"event": diffrax.Event(diffrax.steady_state_event())},
-             r"event has no meaning for lj.Splitting\(4\)"),
+             r"event and lj.Splitting\(4\) exclude each other"),
     "phases": (lj.Hybrid({"up": kepler, "down": kepler}, [lj.Switch("up", to="down", when=lambda t, q, v, p: q[0])]),
                ellipse(0.3), lj.Splitting(), {}, "a motion in phases has steps that end at switches"),
     "mass": (POLAR, ({"r": 1.0, "a": 0.0}, {"r": 0.0, "a": 1.0}), lj.Splitting(), {},
@@ -188,7 +188,7 @@ def test_methods_that_do_not_exist():
     """Numbers of stages and orders that there are not."""
     with pytest.raises(ValueError, match="stages must be a whole number from 1 to 8"):
         lj.Gauss(9)
-    with pytest.raises(ValueError, match=r"order must be one of \(2, 4, 6, 8\)"):
+    with pytest.raises(ValueError, match=r"order must be 2, 4, 6 or 8"):
         lj.Splitting(5)
 
 

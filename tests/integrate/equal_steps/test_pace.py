@@ -92,7 +92,7 @@ def test_there_and_back(kind):
 def test_what_a_pace_refuses():
     """Bad input, in words."""
     refused = partial(run, ts=[0.0, 1.0])
-    with pytest.raises(TypeError, match=r"pace must be a function of \(t, q, params\), not float"):
+    with pytest.raises(TypeError, match=r"pace must be a function of \(t, q, params\), not 0.1"):
         lj.Gauss(3, pace=0.1)
     with pytest.raises(ValueError, match=r"pace\(t, q, params\) of lj.Splitting must return one .* shape \(2,\)"):
         refused(lj.Splitting(4, pace=lambda t, q, params: q))
