@@ -14,6 +14,7 @@ import concurrent.futures
 import importlib
 import inspect
 import io
+import itertools
 import os
 import platform
 import queue
@@ -41,6 +42,8 @@ NEEDS_CLOUDPICKLE = 'on= needs cloudpickle, an optional extra.\nFix: pip install
 # A task takes about so long; there are at least so many, so that no worker waits long for the last, and, of a sweep of
 # days, at most so many: each costs a scheduler a millisecond.
 TASK_SECONDS, FEWEST_TASKS, MOST_TASKS = 2.0, 64, 10_000
+# Tasks of one chunk, which are begun before it is known how long a point takes.
+FIRST_TASKS = 16
 # The sweeps that a worker process keeps compiled.
 KEPT = 4
 # How many tasks that were lost a message names.
@@ -66,10 +69,11 @@ class Job(NamedTuple):
 class Done(NamedTuple):
     """What a task gives back.
 
-    `seconds` of its work without `compiling`, `worker` (host, process); `leaves` of values and status, or None where
-    they are in a store.
+    `points` and `seconds` of its work, without `compiling`; `worker` (host, process); `leaves` of values and status, or
+    None where they are in a store.
     """
 
+    points: int
     seconds: float
     compiling: float
     worker: tuple[str, int]
@@ -156,7 +160,7 @@ def compute(job: Job, indices: np.ndarray | tuple[int, int]) -> Done:
     indices = np.arange(*indices) if isinstance(indices, tuple) else indices
     started = time.perf_counter()
     leaves = jax.tree.leaves(_results(opened.engine, indices))
-    return Done(time.perf_counter() - started, compiling, _worker(), leaves)
+    return Done(len(indices), time.perf_counter() - started, compiling, _worker(), leaves)
 
 
 def fill(job: Job, place: str, digest: str, numbers: list[int]) -> Done:
@@ -173,7 +177,7 @@ def fill(job: Job, place: str, digest: str, numbers: list[int]) -> Done:
         end = start + here.stop - here.start
         store.write(number, *jax.tree.map(lambda x, start=start, end=end: x[start:end], results))
         start = end
-    return Done(time.perf_counter() - started, compiling, _worker(), None)
+    return Done(start, time.perf_counter() - started, compiling, _worker(), None)
 
 
 def _store(place: str, digest: str):
@@ -290,7 +294,6 @@ class Remote:
         """(seconds of computing, values, status) at no more than `chunk` indices, by one worker."""
         with waiting(self.progress, "a worker compiles"):
             ((_, done),) = self._done([(compute, (_short(indices),), indices)])
-        self._compiling, self._pace = done.compiling, done.seconds / len(indices)
         return done.seconds, *self._values(done)
 
     def first(self, indices: np.ndarray) -> tuple[PyTree, Status]:
@@ -299,14 +302,17 @@ class Remote:
 
     def over(self, indices: np.ndarray) -> Iterator[tuple[np.ndarray, PyTree, Status]]:
         """Yield (positions among the indices, values, status) of tasks as they are finished, in any order."""
-        start = 0
-        if self._pace is None:
-            start = min(self.chunk, len(indices))
-            yield np.arange(start), *self.timed(indices[:start])[1:]
-        each = self.points_of_task(len(indices) - start)
-        pieces = (np.arange(i, min(i + each, len(indices))) for i in range(start, len(indices), each))
-        tasks = ((compute, (_short(indices[piece]),), piece) for piece in pieces)
-        for positions, done in self._done(tasks, indices):
+
+        def tasks():
+            start, each = 0, None
+            while start < len(indices):
+                # Of one chunk each until it is known how long a point takes (`_done`).
+                each = self.points_of_task(len(indices) - start) if self._pace is not None and each is None else each
+                piece = np.arange(start, min(start + (each or self.chunk), len(indices)))
+                start += len(piece)
+                yield compute, (_short(indices[piece]),), piece
+
+        for positions, done in self._done(tasks(), indices):
             yield positions, *self._values(done)
 
     def points_of_task(self, count: int) -> int:
@@ -329,27 +335,37 @@ class Remote:
         return jax.tree.unflatten(jax.tree.structure(like), done.leaves)
 
     def _done(self, tasks: Iterable[tuple[Callable, tuple, Any]], named_by: Any = None) -> Iterator[tuple[Any, Done]]:
-        """Yield (what a task is for, what it gave) as they are finished; what waits is cancelled at the end."""
-        futures, finished, lost = {}, queue.SimpleQueue(), []
-        try:
-            for function, args, purpose in tasks:
+        """Yield (what a task is for, what it gave) as they are finished; what waits is cancelled at the end.
+
+        Few are begun before one is finished, which tells how long a point takes.
+        """
+        futures, finished, lost, tasks = {}, queue.SimpleQueue(), [], iter(tasks)
+
+        def send(most: int | None):
+            for function, args, purpose in itertools.islice(tasks, most):
                 try:
                     future = self._executor.submit(Named(self._name, function), self._job, *args)
                 except RuntimeError as error:
                     raise Stopped(f"the executor takes no more tasks ({error})") from error
                 futures[future] = purpose
                 future.add_done_callback(finished.put)
+
+        try:
+            send(FIRST_TASKS if self._pace is None else None)
             while futures:
                 future = finished.get()
                 purpose, error = futures.pop(future), _error(future)
                 if error is None:
                     done = future.result()
                     self._workers.add(done.worker)
+                    if self._pace is None:
+                        self._compiling, self._pace = done.compiling, done.seconds / done.points
                     yield purpose, done
                 elif type(error).__name__ == "KilledWorker":
                     lost.append(purpose)
                 else:
                     raise error
+                send(None)
         finally:
             for future in futures:
                 future.cancel()
