@@ -438,6 +438,7 @@ def _short(indices: np.ndarray):
 
 
 def _pickled(run: Callable, what: Any) -> bytes:
+    _cloudpickle()
     try:
         return _bytes_of(what)
     except Exception as error:

@@ -115,6 +115,21 @@ def test_refused_in_words(threads, tmp_path, monkeypatch):
         assert words in refused(lambda: quiet(quick, on=threads))
 
 
+def test_without_the_extras(threads, tmp_path, monkeypatch):
+    """Without zarr and cloudpickle sweeps in memory run, and all else says what to install."""
+    for name in ("zarr", "cloudpickle", "fsspec", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert quiet(quick).ran == 320
+    for settings, extra in (
+        ({"store": tmp_path / "store"}, r'stores need zarr(.|\n)*pip install "lagjax\[data\]"'),
+        ({"store": "s3://bucket/store"}, "s3://bucket/store needs fsspec(.|\n)*pip install fsspec"),
+        ({"on": threads}, r'on= needs cloudpickle(.|\n)*pip install "lagjax\[cluster\]"'),
+    ):
+        with pytest.raises(ImportError, match=extra):
+            quiet(quick, **settings)
+    assert not list(tmp_path.iterdir())
+
+
 class Lost(ThreadPoolExecutor):
     """An executor that loses its third task in a way."""
 
