@@ -293,8 +293,7 @@ def from_sympy(
         method, lagrangian = lagrangian, lagrangian._L[0]
         for word, value in (("coordinates", coordinates), ("constraints", constraints), ("force", force)):
             fix = "lj.from_sympy(method, parameters=[m, g]), or pass the parts of it separately"
-            both = {"a LagrangesMethod": method, word: value}
-            must_not_meet(both, f"the method has its own {word}", fix, TypeError)
+            must_not_meet({"a LagrangesMethod": method, word: value}, f"the method has its own {word}", fix, TypeError)
         coordinates, constraints = list(method.q), _equations_of(method)
         force = _forces_of(method)
     if coordinates is None:

@@ -7,6 +7,7 @@ own is raised where it is found.
 
 import difflib
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -75,13 +76,14 @@ def must_be_function(given: Any, role: str, takes: str, fix: str = "", cause: st
     must(holds, f"{role} must be a function of {takes}", given, fix, cause, TypeError)
 
 
-def must_be_among(options: Iterable, given: Any, role: str, fix: str = "", cause: str = "") -> None:
-    """Raise unless an option is one of a few words, or None where that is among them."""
+def must_be_among(options: Iterable, given: Any, role: str, fix: str = "", cause: str = "") -> Any:
+    """Return an option; raise unless it is one of a few words, or None where that is among them."""
     options = [*options]
     if not any(given is x or isinstance(given, type(x)) and given == x for x in options):
         *most, last = map(repr, options)
         near = [*difflib.get_close_matches(str(given), [x for x in options if isinstance(x, str)], 1), options[0]][0]
         must(False, f"{role} must be {', '.join(most)} or {last}", given, fix or f"{role}={near!r}", cause)
+    return given
 
 
 def must_be_whole(given: Any, role: str, least: int = 1, most: float = np.inf, fix: str = "") -> None:
@@ -139,6 +141,12 @@ def must_name(
             fix = fix.replace("{}", str(near[0])) if names else "leave it out"
             there = f"there {'are' if len(names) != 1 else 'is'} {listed(names)}"
             raise error(words(f"{what} {name!r:.60}, which is no {kind}; {there}", fix, cause))
+
+
+def must_differ(names: Iterable[str], what: str, fix: str = "a name for each") -> None:
+    """Raise if a name occurs twice; `what`: whose they are, "two bodies", "an element and a constraint"."""
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise ValueError(words(f"{what} are called '{twice[0]}'", fix))
 
 
 def must_return(holds: Any, call: object, wanted: str, value: Any, fix: str, cause: str = "") -> None:

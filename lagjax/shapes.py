@@ -200,13 +200,11 @@ def _sizes(*lengths: Any) -> Any:
     """Three lengths; a function of params if one of them is."""
     if not any(map(callable, lengths)):
         found = tuple(map(float, lengths))
-        if not all(0 <= x < math.inf for x in found):
-            raise ValueError(
-                f"a radius, length or half axis of a shape must be a finite number from zero on, and is "
-                f"{next(x for x in found if not 0 <= x < math.inf)}.\n"
-                "Usual cause: a division by zero where it was computed, or a difference the wrong way round.\n"
-                "Fix: lj.shapes.sphere(ball, 0.5), or a function of params."
-            )
+        claim = "a radius, length or half axis of a shape must be a finite number from zero on"
+        fix = "lj.shapes.sphere(ball, 0.5), or a function of params"
+        cause = "a division by zero where it was computed, or a difference the wrong way round"
+        for x in found:
+            must(0 <= x < math.inf, claim, x, fix, cause)
         return found
     return _of_params(lengths)
 

@@ -275,14 +275,14 @@ def test_what_holds_goes_by_any_name():
 
 def test_said_by_name():
     """Invalid friction is refused by name."""
-    with pytest.raises(ValueError, match="friction is given, but sliding is not"):
-        lj.guards.touches(above, 0.5, friction=0.2)
-    with pytest.raises(ValueError, match="sliding is given, but friction is not"):
-        lj.guards.touches(above, 0.5, sliding=sliding)
-    with pytest.raises(ValueError, match="(?s)needs a restitution.*restitution=0.0"):
-        lj.guards.touches(above, friction=0.2, sliding=sliding)
-    with pytest.raises(TypeError, match="sliding must be a function"):
-        lj.guards.touches(above, 0.5, friction=0.2, sliding=1.0)  # pyright: ignore
+    for restitution, friction, slides, kind, said in (
+        (0.5, 0.2, None, ValueError, "friction is given, but sliding is not"),
+        (0.5, None, sliding, ValueError, "sliding is given, but friction is not"),
+        (None, 0.2, sliding, ValueError, "(?s)needs a restitution.*restitution=0.0"),
+        (0.5, 0.2, 1.0, TypeError, "sliding must be a function"),
+    ):
+        with pytest.raises(kind, match=said):
+            lj.guards.touches(above, restitution, friction, slides)  # pyright: ignore
     q, v = {"x": 0.0, "y": R, "phi": 0.0}, {"x": 1.0, "y": -1.0, "phi": 0.0}
     for wrong, said in (
         (lambda t, q, v, p: jnp.stack([v["x"], v["y"]]), r"one number, and returned shape \(2,\)"),

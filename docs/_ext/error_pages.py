@@ -85,6 +85,7 @@ RULES = {
     "must_be_like": "{role} must be like {of}, in structure and shapes: {of} has …, and it has ….",
     "must_be_single": "{what} is a batch of shape …: take one lane of it.",
     "must_have_values": "{what}, and JAX is tracing.",
+    "must_differ": "{what} are called ….",
     "must_name": "{what} …, which is no {kind}; there are ….", "must_not_meet": "… exclude each other: {why}.",
     "must_go_together": "… is given, but … is not: {why}.", "installed": "{user} needs {module}, an optional extra.",
 }  # fmt: skip

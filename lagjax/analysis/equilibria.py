@@ -41,7 +41,7 @@ from lagjax.analysis.degenerate import CREEPS_BELOW, nearest, soft_below
 from lagjax.jaxtools import compiled, is_eager, is_traced, numpy_of, stop_gradient
 from lagjax.mechanics import are_angles, invariance, listed, structure
 from lagjax.numerics import MOST, differentiable, lapack, least_squares_root, zero_below
-from lagjax.refusals import must_be_among, must_be_like, must_name
+from lagjax.refusals import must, must_be_among, must_be_like, must_name
 from lagjax.system import State, by_name, check_system, checked, coordinates, model_of
 
 AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.linspace(-3.0, 3.0, 20)}'
@@ -50,8 +50,7 @@ AS_STARTS = 'starts=[{"theta": 0.1}, {"theta": 3.0}], or starts={"theta": jnp.li
 def stacked(starts, what="starts") -> PyTree:
     """Starts as one tree whose leaves have a leading axis, from a list of states, such a tree, or one state."""
     if isinstance(starts, list):
-        if not starts:
-            raise ValueError(f"{what} is an empty list: a search needs a place to start from.\nFix: {AS_STARTS}.")
+        must(starts, f"{what} must hold a place to start from", starts, AS_STARTS)
         structures = {jtu.tree_structure(start) for start in starts}
         if len(structures) > 1:
             raise ValueError(f"the {what} differ in structure: each must be like q.\nFix: {AS_STARTS}.")
@@ -60,8 +59,7 @@ def stacked(starts, what="starts") -> PyTree:
         xp = numpy_of(starts)
         return jtu.tree_map(lambda *x: xp.stack([xp.asarray(y) for y in x]), *starts)
     leaves = jtu.tree_leaves(starts)
-    if not leaves:
-        raise ValueError(f"{what} has no coordinates.\nFix: {AS_STARTS}.")
+    must(leaves, f"{what} must have coordinates", starts, AS_STARTS)
     starts = jtu.tree_map(lambda x: numpy_of(x).asarray(x), coordinates.as_floats(starts))
     leaves = jtu.tree_leaves(starts)
     if all(x.ndim == 0 for x in leaves):
@@ -74,8 +72,7 @@ def stacked(starts, what="starts") -> PyTree:
             "Usual cause: one start whose coordinates are arrays, where several are expected.\n"
             f"Fix: a list of states, {what}=[q]."
         )
-    if () in counts or min(counts)[0] == 0:
-        raise ValueError(f"{what} contains no start.\nFix: {AS_STARTS}.")
+    must(() not in counts and min(counts)[0] > 0, f"{what} must hold a start", starts, AS_STARTS)
     return starts
 
 

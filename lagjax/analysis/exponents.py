@@ -447,8 +447,7 @@ def _check(ts):
     cause = "only the end time; between two distant times the fastest-growing tangent hides all others"
     well, claim = ts.ndim == 1 and len(ts) >= FEWEST, f"ts must be a vector of at least {FEWEST} times"
     must(well, claim, ts, "ts=jnp.linspace(0.0, 1000.0, 1001)", cause)
-    well = is_traced(ts) or np.all(np.asarray(ts[1:] > ts[:-1]))
-    must(well, "ts must increase throughout", ts, "ts=jnp.unique(ts)")
+    must(is_traced(ts) or np.all(np.asarray(ts[1:] > ts[:-1])), "ts must increase throughout", ts, "ts=jnp.unique(ts)")
 
 
 @compiled

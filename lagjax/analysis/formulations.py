@@ -463,8 +463,7 @@ def action(
 
 
 def _action_of_trajectory(system, path, params: PyTree, t0, t1, pieces):
-    fix = "jax.vmap(lambda traj: lj.action(system, traj))(trajectories)"
-    must_be_single(path.t.shape[:-1], "this trajectory", fix)
+    must_be_single(path.t.shape[:-1], "this trajectory", "jax.vmap(lambda traj: lj.action(system, traj))(trajectories)")
     params = path.params if params is None else params
     t, q, v = path.t, path.q, path.v
     s = coordinates.state(t[0], *jax.tree.map(lambda x: x[0], (q, v)), params)

@@ -24,7 +24,7 @@ from lagjax.display import labelled
 from lagjax.display import plots as plot
 from lagjax.integrate import Crossing, Crossings, Trajectory, angle_mask, crossings_of, curves, integrate
 from lagjax.jaxtools import is_traced
-from lagjax.refusals import must_be, must_be_function, must_go_together, must_name
+from lagjax.refusals import must_be, must_be_function, must_differ, must_go_together, must_name
 from lagjax.system import Hybrid, System, by_name, coordinates
 
 SECTION = "section"
@@ -191,11 +191,7 @@ def poincare(
     the surface).
     """
     others = crossings_of(events, None)
-    if SECTION in others:
-        raise ValueError(
-            f"an event in events= is named '{SECTION}', which is the name of the section itself.\n"
-            "Fix: another name in events=."
-        )
+    must_differ([SECTION, *others], "an event in events= and the section itself", "another name in events=")
     recorded = {SECTION: _recorded(section), **others}
     return PoincareSection(integrate(system, q0, v0, params, ts=ts, events=recorded, **settings))
 

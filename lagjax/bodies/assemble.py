@@ -1,6 +1,5 @@
 """A system of bodies: the sum of their kinetic energies, and the constraints of their joints."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +25,7 @@ from lagjax.bodies.joints import named
 from lagjax.bodies.loads import Acting, Load, check_loads
 from lagjax.display import CUBE, Anchor, Drawing, Shape
 from lagjax.jaxtools import numpy_of
-from lagjax.refusals import must_be, must_name
+from lagjax.refusals import must_be, must_differ, must_name
 from lagjax.shapes import line
 from lagjax.system import Holonomic, Nonholonomic, System
 
@@ -75,15 +74,14 @@ def multibody(
     """
     bodies, loads = check_bodies("lj.bodies.multibody", bodies), check_loads("lj.bodies.multibody", loads)
     _check_joints(joints)
-    _check_keywords(others)
+    fix = "bodies, joints, loads, lagrangian, or one of lj.System's, as {}="
+    must_name(others, OTHERS, "lj.bodies.multibody was given", "argument of it", fix, error=TypeError)
     driven, bodies = Driven.among(bodies), tuple(body for body in bodies if body.motion is None)
     units = {f"{body.name} is turned": body.unit for body in bodies}
     joints = named(joints or {})
     names = [body.name for body in (*bodies, *driven.bodies)]
-    twice = {name for name, count in Counter(names).items() if count > 1}
-    if twice or units.keys() & joints.keys():
-        name = sorted(twice or units.keys() & joints.keys())[0]
-        raise ValueError(f"two bodies or constraints are called '{name}'.\nFix: a name for each.")
+    must_differ(names, "two bodies")
+    must_differ([*units, *joints], "two constraints")
     beside = Acting(*(driven.seen_by_all(others.pop(name, None)) for name in ("force", "dissipation")))
     acting = beside.with_loads(loads, driven.placed)
 
@@ -164,11 +162,6 @@ def _check_joints(joints: Mapping | None):
             fix = "lj.bodies.revolute(a, b), lj.Holonomic(g) or lj.Nonholonomic(phi); loads are the third argument"
             cause = "a load among the joints, or a function without its kind"
             must_be(Holonomic | Nonholonomic, part, claim, fix, cause)
-
-
-def _check_keywords(others: Mapping):
-    fix = "bodies, joints, loads, lagrangian, or one of lj.System's, as {}="
-    must_name(others, OTHERS, "lj.bodies.multibody was given", "argument of it", fix, error=TypeError)
 
 
 def usual_shapes(bodies: Iterable[Body], functions: Iterable[Callable | None], params: PyTree) -> tuple[Shape, ...]:

@@ -11,7 +11,6 @@ always fork at most log2(n), as the largest branch comes last.
 places that are functions of params are called once for each function, however many links have it.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +24,7 @@ from jaxtyping import Array, Float, PyTree
 
 from lagjax.bodies.body import Body, Driven, Ground, Marker, check_takes_params, ground, valued
 from lagjax.bodies.joints import Joined, above, apart, aside, cross, tilt, turn
-from lagjax.refusals import must, must_name
+from lagjax.refusals import must, must_differ, must_name
 from lagjax.system import Holonomic
 
 # The freedoms that a joint leaves, from the rows that it has as a constraint.
@@ -125,9 +124,7 @@ def links_of(bodies: Sequence[Body], joints: Mapping[str, Holonomic | Sequence])
             held_by[body.name] = body.name, Joined(ground.at(), body.at(), ()), ("free",), quaternions
             entries.append(Entry(body.name, ("free",), None))
             quaternions += 1
-    names = [entry.name for entry in entries]
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
-        raise ValueError(f"a joint and a free body are called '{twice[0]}'.\nFix: a name for each.")
+    must_differ([entry.name for entry in entries], "a joint and a free body")
     return _in_order(bodies, held_by), entries
 
 

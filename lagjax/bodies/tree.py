@@ -38,7 +38,7 @@ from lagjax.bodies.motion import (
 )
 from lagjax.display import Drawing, Shape
 from lagjax.jaxtools import to_jax
-from lagjax.refusals import must_be
+from lagjax.refusals import must_be, must_differ
 from lagjax.system import Holonomic, Nonholonomic, System
 
 
@@ -107,10 +107,7 @@ class Tree:
         armature: Mapping[str, ArrayLike | Callable] | None = None,
     ):
         bodies = check_bodies("lj.bodies.Tree", bodies)
-        names = [body.name for body in bodies]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"two bodies are called '{twice}'.\nFix: a name for each.")
+        must_differ([body.name for body in bodies], "two bodies")
         example = "{'hinge': lj.bodies.revolute(lj.bodies.ground.at(), door.at())}, or {'links': [...]} for a list"
         must_be(Mapping, joints or {}, "the joints of lj.bodies.Tree must be a dict by name", example)
         self.bodies = bodies

@@ -310,8 +310,7 @@ class Drawing(NamedTuple):
 
 def _three(x: Any, params: PyTree, what: str) -> np.ndarray:
     found = np.asarray(x(params) if callable(x) else x, float)
-    well = found.shape == (3,) and np.all(np.isfinite(found))
-    must(well, f"{what} of a shape must be three finite numbers", found)
+    must(found.shape == (3,) and np.all(np.isfinite(found)), f"{what} of a shape must be three finite numbers", found)
     return found
 
 

@@ -38,7 +38,7 @@ from lagjax.integrate import integrate
 from lagjax.jaxtools import compiled, filled_up
 from lagjax.mechanics import listed
 from lagjax.numerics import Unknowns
-from lagjax.refusals import must_be, must_name, must_return
+from lagjax.refusals import must, must_be, must_be_whole, must_name, must_return
 
 # A number is determined if the undetermined directions hold no larger share than this of its squared slopes.
 NEGLIGIBLE_SHARE = 1e-8
@@ -76,8 +76,7 @@ class Candidate(NamedTuple):
 
     def at_best(self, count: int) -> tuple[Float[np.ndarray, " k"], float]:
         """The best `count` times to measure at, each once, and the standard deviation after these alone."""
-        if not 1 <= count <= len(self.t):
-            raise ValueError(f"'{self.name}' has {len(self.t)} times, and the best {count} of them were asked for.")
+        must_be_whole(count, f"the number of best times of '{self.name}'", most=len(self.t), fix="at_best(1)")
         chosen, sd = _exchange(self, count)
         return self.t[chosen], sd
 
@@ -367,8 +366,7 @@ def _candidate_runs(
     problem_for: Callable,
 ):
     """Candidates that are other runs, each with its own unknown start."""
-    if not candidates:
-        raise ValueError("candidates is empty.\nFix: leave it out, or {'a longer run': lj.Record(...)}.")
+    must(candidates, "candidates must hold a record", candidates, "leave it out, or {'a longer run': lj.Record(...)}")
     forms: dict[Any, list[str]] = {}
     for name, record in candidates.items():
         must_be(Record, record, f"candidate '{name}' must be a lj.Record", "lj.Record(t, q=np.zeros(len(t)), q0=...)")

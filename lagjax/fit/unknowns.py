@@ -182,8 +182,7 @@ def find(
 
     low, high = spread(bounds, (-np.inf, np.inf), "bounds")
     mean, sd = spread({name: pair for name, pair in priors.items() if pair is not None}, (0.0, np.inf), "priors")
-    if np.any(sd <= 0):
-        raise ValueError('the standard deviation of a prior must be positive.\nFix: priors={"g": (9.81, 0.01)}.')
+    must(np.all(sd > 0), "the standard deviation of a prior must be positive", sd, 'priors={"g": (9.81, 0.01)}')
     # Which network each number belongs to, counted from 1; 0 for one with a prior of its own, or with None for it.
     networks = _networks(params, chosen) if error else []
     of = spread({name: (i + 1, None) for i, name in enumerate(networks)}, (0, 0), "priors")[0]

@@ -77,23 +77,21 @@ def check_equal_steps(method: EqualSteps, dt0: Any, system: System | Hybrid, **o
             "Fix: leave method out; or events=, which are found inside the steps, and may end the motion."
         )
     for name, given in others.items():
-        both = {name: given, f"lj.{method.label}": method}
         why = "its steps have equal length throughout, and end at outputs alone"
-        must_not_meet(both, why, f"leave {name} out; or method=lj.Dopri8()")
+        must_not_meet({name: given, f"lj.{method.label}": method}, why, f"leave {name} out; or method=lj.Dopri8()")
 
 
 def check_jumps(jumps: Any) -> str:
     """Return `jumps`; raise unless it is one of its two values."""
     fix = 'leave jumps out (they are found), or jumps="ignored"'
-    must_be_among(("found", "ignored"), jumps, "jumps", fix, "times of jumps, which are jump_ts=")
-    return jumps
+    return must_be_among(("found", "ignored"), jumps, "jumps", fix, "times of jumps, which are jump_ts=")
 
 
 def check_outputs(outputs: Any) -> str | None:
     """Return `outputs`; raise unless it is None or one of two words."""
     fix = 'outputs="exact" (they are ends of steps), outputs="interpolated", or leave it out'
-    must_be_among(("exact", "interpolated", None), outputs, "outputs", fix, "the times of outputs, which are ts=")
-    return outputs
+    words = ("exact", "interpolated", None)
+    return must_be_among(words, outputs, "outputs", fix, "the times of outputs, which are ts=")
 
 
 def check_adjoint(adjoint: Any, drift: str, jump_ts: Any, recorded: bool):
@@ -145,9 +143,8 @@ def check_controller(controller: Any, max_step: Any, jump_ts: Any):
         ("max_step", max_step, "stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-9, dtmax=0.1)"),
         ("jump_ts", jump_ts, "stepsize_controller=diffrax.ClipStepSizeController(controller, jump_ts=jump_ts)"),
     ):
-        both = {name: given, "stepsize_controller": controller}
         why = "the one limits the steps that lagjax chooses, and the other replaces that choice"
-        must_not_meet(both, why, f"leave stepsize_controller out, or {fix}")
+        must_not_meet({name: given, "stepsize_controller": controller}, why, f"leave stepsize_controller out, or {fix}")
 
 
 def vector_of_times(ts: Any):
@@ -260,14 +257,19 @@ def _check_tolerance(value: Any, name: str, dtype: np.dtype):
             "stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01."
         )
     must(value >= 0, f"{name} must be a number >= 0", value, f"{name}=1e-9, or leave it out")
-    floor = ROUND_OFFS * float(jnp.finfo(dtype).eps)
-    if name == "rtol" and value < floor:
-        single = dtype == np.dtype("float32")
-        cause = "Usual cause: JAX works in float32 unless told otherwise.\n" if single else ""
+    if name == "rtol":
+        check_reach(value, name, dtype)
+
+
+def check_reach(value: float, name: str, dtype: np.dtype):
+    """Raise for a relative tolerance that a dtype cannot reach."""
+    floor, single = ROUND_OFFS * float(jnp.finfo(dtype).eps), dtype == np.dtype("float32")
+    if value < floor:
+        cause = "JAX works in float32 unless told otherwise" if single else "a wrong exponent"
         remedy = 'jax.config.update("jax_enable_x64", True) before the first array, or ' if single else ""
         raise ValueError(
             f"{name} = {value:.3g} is below what {dtype} can reach ({floor:.1g}).\n"
-            f"{cause}Fix: {remedy}{name}={10 * floor:.0e} or more."
+            f"Usual cause: {cause}.\nFix: {remedy}{name}={10 * floor:.0e} or more."
         )
 
 

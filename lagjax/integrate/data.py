@@ -26,7 +26,8 @@ PLAIN = "t", "q", "v", "multipliers", "stats", "scaled_error", "tolerance"
 
 def save(trajectory, path: str | os.PathLike) -> None:
     """Write a trajectory into a file: see `Trajectory.save`."""
-    _check_known(trajectory)
+    fix = "return it from the traced function, and save it then"
+    must_have_values(trajectory, "a trajectory is saved by its values", fix)
     writer, known = Writer(), described(trajectory)
     nodes = {name: writer.down(x, name) for name, x in parts(trajectory, result_in_names).items()}
     nodes["system"] = writer.down(_fields(known), "system")
@@ -59,11 +60,6 @@ def described(trajectory) -> UnknownSystem:
     state = middle_state(one.t, one.q, one.v, one.params)
     angles = tuple(map(bool, angle_mask(one)))
     return UnknownSystem(repr(system), angles, signature(one.any_system, state), tuple(state))
-
-
-def _check_known(trajectory):
-    fix = "return it from the traced function, and save it then"
-    must_have_values(trajectory, "a trajectory is saved by its values", fix)
 
 
 def _fields(module) -> dict:

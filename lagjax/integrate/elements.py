@@ -32,7 +32,7 @@ from lagjax.integrate.laws import (
 )
 from lagjax.integrate.meeting import Meeting, Met
 from lagjax.jaxtools import compiled, depends, is_linear, varies, without_init
-from lagjax.refusals import must_name, must_return
+from lagjax.refusals import must_differ, must_name, must_return
 from lagjax.system import (
     OF_POSITION,
     OF_STATE,
@@ -151,8 +151,7 @@ class ElementLaws:
         check_linear(sliding, *self.start)
         key = f"{name} friction" if own else name
         _check_name(key, self.plain)
-        if own and key in self.elements:
-            raise ValueError(f"'{key}' is the name of the friction of '{name}'.\nFix: another name for the element.")
+        must_differ([*[key] * own, *self.elements], f"an element and the friction of '{name}'", "another name for it")
         plane = jnp.shape(sliding.program.value) == (*shape, 2)
         both = source in self.plain.constraints
         if isinstance(normal, Traced) and not depends_on(normal, *OF_STATE[:-1]):
@@ -242,19 +241,15 @@ def _check_sliding(shape: tuple[int, ...], call: Call, value):
 
 
 def _check_name(name: str, plain: System):
-    if name in plain.constraints:
-        raise ValueError(
-            f"'{name}' is the name of an element and of a constraint, whose multipliers would have one name.\n"
-            "Fix: another name for one of them; a contact that always holds is a lj.Holonomic and no element."
-        )
+    fix = "another name for one of them; a contact that always holds is a lj.Holonomic and no element"
+    must_differ([name, *plain.constraints], "an element and a constraint, and the multipliers of both,", fix)
 
 
 def _check_output(call: Call, value, like: Array):
     found = getattr(value, "shape", () if isinstance(value, float | int) else None)
-    cause = "several outputs of one controller, or a missing return"
     fix = "an entry in q0 of that shape, as jnp.zeros(2) for two of them; or an element for each"
     wanted = f"its output in the shape of its entry in q0, {like.shape}"
-    must_return(found == like.shape, call, wanted, value, fix, cause)
+    must_return(found == like.shape, call, wanted, value, fix, "several outputs of one controller, or a missing return")
 
 
 def _check(call: Call, value, shape: tuple | None):

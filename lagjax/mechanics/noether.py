@@ -360,8 +360,7 @@ def _vector(axis) -> np.ndarray:
     if isinstance(axis, str):
         must(axis in AXES, "an axis must be 'x', 'y', 'z' or a vector", axis, '"z", or (0.0, 0.0, 1.0)')
         return np.eye(3)[AXES.index(axis)]
-    well = np.shape(axis) in ((2,), (3,))
-    must(well, "an axis must be 'x', 'y', 'z' or a vector", axis, '"z", or (0.0, 0.0, 1.0)')
+    must(np.shape(axis) in ((2,), (3,)), "an axis must be 'x', 'y', 'z' or a vector", axis, '"z", or (0.0, 0.0, 1.0)')
     return _array((*axis, 0.0)[:3])
 
 

@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from lagjax.bodies import Body, Ground, Marker, Pose, conjugate, product, rotation_matrix, usual_shapes
 from lagjax.display import CUBE, CYLINDER, SPHERE, Anchor, Faces, Shape, triangles
+from lagjax.refusals import must_differ
 
 CORNER = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
 
@@ -269,8 +270,7 @@ def merged(links: Mapping[str, RobotLink], joints: Iterable[RobotJoint]) -> Merg
         else:
             # A floating joint holds nothing: its position is the pose of its body, and goes by the body's name.
             name = joint.child if joint.kind == "floating" else joint.name
-            if name in moving:
-                raise ValueError(f"{joint.line}: a joint and a free body are both called '{name}'.\nFix: rename one.")
+            must_differ([name, *moving], f"{joint.line}: a joint and a free body", "rename one")
             moving[name] = joint._replace(name=name, parent=head, placement=here)
             head = joint.child
             frames[head] = head, unmoved()

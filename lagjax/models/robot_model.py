@@ -54,7 +54,7 @@ from lagjax.models.links_and_joints import (
     rate_squared,
     unmoved,
 )
-from lagjax.refusals import must, must_be, must_name
+from lagjax.refusals import must, must_be, must_differ, must_name
 from lagjax.shapes import axis, line
 from lagjax.system import Holonomic, System
 
@@ -200,8 +200,7 @@ class RobotModel:
                 name = name if len(x.joints) == 1 else made_up(name, own.keys() | self.joints.keys() | loops.keys())
                 own[name] = EQUATIONS[x.kind](x.a, x.b)
         own |= loops
-        if both := own.keys() & (joints or {}).keys():
-            raise ValueError(f"the file has a joint '{sorted(both)[0]}' already.\nFix: another name.")
+        must_differ([*own, *(joints or {})], "a joint of the file and another one", "another name")
         bodies, lagrangian = list(self.bodies.values()), others.pop("lagrangian", None)
         if any(joint.armature for joint in self.joints.values()):
             lagrangian = partial(self._with_rotors, lagrangian)

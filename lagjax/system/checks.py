@@ -374,10 +374,7 @@ def _check_constraint(call: Call, value):
     cause = "several equations in a tuple or a matrix, or a function without return"
     fix = "return jnp.stack([...]) of the equations, or give each a name of its own"
     must_return(shape is not None and len(shape) <= 1, call, "a scalar or a vector", value, fix, cause)
-    fix = "leave the constraint out where it has none"
-    must_return(
-        0 not in shape, call, "a scalar or a vector with at least one equation", value, fix, "an empty list of joints"
-    )
+    wanted, fix = "a scalar or a vector with at least one equation", "leave the constraint out where it has none"
+    must_return(0 not in (shape or ()), call, wanted, value, fix, "an empty list of joints")
     cause, fix = "an equation in place of its residual, x**2 + y**2 == l**2", "return x**2 + y**2 - l**2"
-    real = jnp.issubdtype(dtype, jnp.floating)
-    must_return(real, call, "real numbers that vanish where it holds", value, fix, cause)
+    must_return(jnp.issubdtype(dtype, jnp.floating), call, "real numbers that vanish where it holds", value, fix, cause)

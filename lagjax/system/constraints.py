@@ -538,10 +538,8 @@ jax.tree_util.register_pytree_node(Elements, _flatten, _unflatten)
 
 def _check_pair(friction, sliding):
     fix = 'lj.Contact(gap, friction=0.3, sliding=lambda t, q, v, params: v["x"])'
-    pair = {"friction": friction, "sliding": sliding}
-    must_go_together(pair, "friction needs a coefficient and a velocity", fix)
-    fix = 'sliding=lambda t, q, v, params: v["x"]'
-    must_be_function(sliding, "sliding", "(t, q, v, params)", fix, optional=True)
+    must_go_together({"friction": friction, "sliding": sliding}, "friction needs a coefficient and a velocity", fix)
+    must_be_function(sliding, "sliding", "(t, q, v, params)", 'sliding=lambda t, q, v, params: v["x"]', optional=True)
 
 
 def _check_above_zero(role: str, number, cause: str):

@@ -23,7 +23,7 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, PyTree
 
-from lagjax.integrate import ROUND_OFFS, Trajectory, arguments, integrate, nystrom_for, reporting, runs_backward
+from lagjax.integrate import Trajectory, arguments, integrate, nystrom_for, reporting, runs_backward
 from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of, to_jax
 from lagjax.mechanics import is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Tsit5
@@ -58,8 +58,7 @@ def chosen(methods: Any, system: System, start: State) -> dict[str, diffrax.Abst
         fix = f"methods=[{as_code(methods)}]" if isinstance(methods, diffrax.AbstractSolver) else FIX
         must(False, "methods must be a sequence of solvers, or a dict of them by name", methods, fix, error=TypeError)
     named = dict(methods) if isinstance(methods, Mapping) else _named(methods)
-    if not named:
-        raise ValueError("methods is empty: there is nothing to compare.\nFix: leave it out.")
+    must(named, "methods must hold something to compare", methods, "leave it out")
     for name, method in named.items():
         _check(name, method, system, start)
     return named
@@ -114,19 +113,8 @@ def ladder(tolerances: Any, dtype: Any) -> tuple[float, ...]:
     fix, cause = "tolerances=(1e-4, 1e-6, 1e-8)", "exponents instead of powers of ten"
     well = found.ndim == 1 and found.size and np.all(np.isfinite(found) & (found > 0))
     must(well, "tolerances must be a sequence of positive numbers", tolerances, fix, cause)
-    floor = ROUND_OFFS * float(np.finfo(dtype).eps)
     for value in found:
-        if value < floor:
-            cause = "JAX works in float32 by default" if np.dtype(dtype) == np.float32 else "a wrong exponent"
-            raise ValueError(
-                f"a tolerance of {value:.3g} is below what {np.dtype(dtype)} can reach ({floor:.1g}).\n"
-                f"Usual cause: {cause}.\nFix: tolerances down to {10 * floor:.0e}"
-                + (
-                    ', or jax.config.update("jax_enable_x64", True) before the first array.'
-                    if np.dtype(dtype) == np.float32
-                    else "."
-                )
-            )
+        arguments.check_reach(value, "tolerances", np.dtype(dtype))
     return tuple(float(value) for value in sorted(set(found), reverse=True))
 
 

@@ -578,8 +578,7 @@ def _checked(period: Any, periods: Any, error: Any, methods: Any, reference: Any
     well = methods is None or isinstance(methods, Iterable) and not isinstance(methods, (str, dict))
     fix = "methods=[lj.Nystrom12(), lj.Gauss(4)], or leave it out"
     must(well, "methods must be a sequence of solvers and methods of equal steps", methods, fix, error=TypeError)
-    if methods is not None and not list(methods):
-        raise ValueError("methods is empty: there is nothing to compare.\nFix: leave it out.")
+    must(methods is None or list(methods), "methods must hold something to compare", methods, "leave it out")
     for method in methods or ():
         arguments.check_method(method)
         if not isinstance(method, (EqualSteps, diffrax.AbstractAdaptiveSolver)):

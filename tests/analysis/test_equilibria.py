@@ -122,7 +122,7 @@ def test_starts_that_lead_out():
 @pytest.mark.parametrize(
     "settings, words",
     [
-        ({"starts": []}, "starts is an empty list"),
+        ({"starts": []}, "starts must hold a place to start from"),
         ({"starts": [1.0], "velocities": 1.0}, "L depends on 'q', which moves at a constant rate"),
         ({"starts": [1.0], "cyclic": "angle"}, "cyclic names 'angle', which is no coordinate; there is 'q'"),
         ({"starts": [1.0], "hold": "energy"}, "hold must be"),

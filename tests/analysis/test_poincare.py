@@ -152,7 +152,7 @@ REFUSED = {
     "no function": ({"section": 0.0}, TypeError, "a function of"),
     "terminal": ({"section": lj.Crossing(bottom)}, ValueError, "ends the motion at its first crossing"),
     "a vector": ({"section": lambda t, q, v, p: jnp.stack([q, v])}, ValueError, "event 'section' must return one"),
-    "the name": ({"section": bottom, "events": {"section": ALSO["turn"]}}, ValueError, "is named 'section'"),
+    "the name": ({"section": bottom, "events": {"section": ALSO["turn"]}}, ValueError, "called 'section'"),
     "no events": ({"section": bottom, "events": [ALSO["turn"]]}, TypeError, "by name"),
     "a coordinate": ({"section": bottom, "events": {"a": lj.turning_points("r")}}, ValueError, "'r', which is no"),
 }

@@ -216,7 +216,7 @@ WRONG_VALUES = [
     *((lambda x=x: a_rod(inertia=x), "three principal moments") for x in ((1, NAN, 1), (np.inf,) * 3, 1.0, (1.0, 2.0))),
     *((lambda x=x: a_rod(x), "mass of 'rod' must be a positive number") for x in (0.0, np.inf, "1", np.ones(1))),
     (lambda: lj.bodies.spherical(ROD.at((1.0, 0.0, 0.0)), ROD.at((-1.0, 0.0, 0.0))), "both places are on 'rod'"),
-    (lambda: lj.bodies.multibody([ROD, a_rod(2.0)]), "two bodies or constraints are called 'rod'"),
+    (lambda: lj.bodies.multibody([ROD, a_rod(2.0)]), "two bodies are called 'rod'"),
     *((lambda x=x: ROD.at(x), "a point of 'rod' must be three numbers") for x in ((1.0, 0.0), (0.0, 0.0, NAN))),
     *((lambda x=x: ROD.at(axis=x), "the axis of a marker on 'rod'") for x in ((0.0, 0.0, 0.0), (np.inf, 0.0, 0.0))),
     (lambda: lj.bodies.Pose.at((1.0, 2.0)), "position of a pose must be three numbers"),

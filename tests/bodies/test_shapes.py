@@ -88,7 +88,7 @@ def test_what_is_no_place():
     with pytest.raises(ValueError, match="six hexadecimal digits, not 'red'"):
         lj.shapes.sphere(A, 1.0, color="red")
     for radius in (np.nan, np.inf, -1.0):
-        with pytest.raises(ValueError, match=f"must be a finite number from zero on, and is {radius}"):
+        with pytest.raises(ValueError, match=f"must be a finite number from zero on, not {radius}"):
             lj.shapes.rod(A, (0.0, 0.0, 1.0), radius)
     with pytest.raises(ValueError, match="needs places"):
         lj.shapes.line()

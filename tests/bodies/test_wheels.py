@@ -355,14 +355,18 @@ def test_distances():
 
 def test_what_is_no_surface():
     """Surfaces that are none are refused with the way to write one."""
-    with pytest.raises(TypeError, match="must be a function of .r, params., not 1.0.\nFix: lj.bodies.Surface"):
-        lj.bodies.Surface(1.0)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="of lj.bodies.Surface"):
-        lj.bodies.Surface(lambda x, y, z: z)
-    with pytest.raises(TypeError, match="must be on a marker, not a Body"):
-        lj.bodies.Surface(lambda r, params: r[2], on=lj.bodies.Body("table", 1.0, (1.0, 1.0, 1.0)))
-    ball = lj.bodies.Body("ball", 1.0, (1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="both places are on 'ball'"):
-        lj.bodies.rolling_sphere(ball.at(), lj.bodies.Surface(lambda r, params: r[2], on=ball.at()), 1.0)
-    with pytest.raises(ValueError, match="three half axes, not 1.0"):
-        lj.bodies.rolling_ellipsoid(ball.at(), lj.bodies.ground.at(), 1.0)  # pyright: ignore[reportArgumentType]
+    ball, surface, flat = lj.bodies.Body("ball", 1.0, (1.0, 1.0, 1.0)), lj.bodies.Surface, lambda r, params: r[2]
+    place, ground = ball.at(), lj.bodies.ground.at()
+    for call, kind, words in (
+        (lambda: surface(1.0), TypeError, "must be a function of .r, params., not 1.0.\nFix: lj.bodies.Surface"),
+        (lambda: surface(lambda x, y, z: z), TypeError, "of lj.bodies.Surface"),
+        (lambda: surface(flat, on=ball), TypeError, "must be on a marker, not a Body"),
+        (
+            lambda: lj.bodies.rolling_sphere(place, surface(flat, on=place), 1.0),
+            ValueError,
+            "both places are on 'ball'",
+        ),
+        (lambda: lj.bodies.rolling_ellipsoid(place, ground, 1.0), ValueError, "three half axes, not 1.0"),
+    ):
+        with pytest.raises(kind, match=words):
+            call()

@@ -147,7 +147,7 @@ WRONG_SHAPES = {
                 r"has the shapes \(\) and \(\)"),
     "one size": (ValueError, lj.shapes.Drawing([lj.shapes.box(SWUNG, 0.3)], swung),
                  "the size of a shape must be three finite numbers, not 0.3"),
-    "a negative size": (ValueError, lj.shapes.Drawing([lj.shapes.sphere(SWUNG, -0.3)], swung), "from zero on, not "),
+    "a negative size": (ValueError, lj.shapes.Drawing([lj.shapes.sphere(SWUNG, lambda p: -0.3)], swung), "zero on"),
     "a body": (TypeError, SWUNG, "not Body"),
     "bodies": (TypeError, [SWUNG], "list of Body"),
     "an empty list": (TypeError, [], "not list"),

@@ -50,6 +50,8 @@ RULES = [
     (rules.must_name, ("psi", PAIR | {"psi": 0}, "hold names", "angle"), 
      (["y", "thte"], {"y": 0, "theta": 1}, "hold names", "angle", "hold='{}'", "a letter", TypeError), TypeError,
      "hold names 'thte', which is no angle; there are 'y' and 'theta'.\nUsual cause: a letter.\nFix: hold='theta'."),
+    (rules.must_differ, (["a", "b"], ""), (["b", "a", "b"], "two bodies"), ValueError,
+     "two bodies are called 'b'.\nFix: a name for each."),
     (rules.must_return, (True, "L(t, q)", "a number", 1.0, ""), 
      (False, "L(t, q)", "a number", jax.ShapeDtypeStruct((2,), "int32"), "jnp.sum", "a vector"), ValueError,
      "L(t, q) must return a number, and returned shape (2,), int32.\nUsual cause: a vector.\nFix: jnp.sum."),

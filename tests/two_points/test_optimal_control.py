@@ -21,9 +21,9 @@ def energy(t, q, v, u, params):
     return u["push"] ** 2
 
 
-def pushed(start=(0.0, 0.0), end=(1.0, 0.0), cost=energy, t_b=1.0, **options):
+def pushed(start=(0.0, 0.0), end=(1.0, 0.0), cost=energy, t_b=1.0, system=cart, **options):
     """A mass steered from a start to an end."""
-    return lj.steer(cart, {"push": 0.0}, start, end, cost, t_b=t_b, **options)
+    return lj.steer(system, options.pop("controls", {"push": 0.0}), start, end, cost, t_b=t_b, **options)
 
 
 @pytest.mark.slow
@@ -155,6 +155,9 @@ def test_what_cannot_be_is_said():
 
 def test_questions_that_are_wrong():
     """Each is answered in the user's names before anything is compiled."""
+    ring = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), {"ring": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - 1)},
+                     force=lambda t, q, v, p: p["push"] * q)  # fmt: skip
+    off = jnp.array([2.0, 0.0]), jnp.zeros(2)
     for options, words in (
         ({"cost": None}, "nothing to minimise"),
         ({"t_b": 0.0}, "the end must come after the start"),
@@ -167,21 +170,14 @@ def test_questions_that_are_wrong():
         ({"interpolation": "cubic"}, "'smooth', 'linear' or 'constant'"),
         ({"starts": 0}, "starts must be a whole number above zero, not 0"),
         ({"cost": lambda t, q, v, u, params: jnp.ones(2)}, "must return one number"),
+        ({"guess": {"q": 1.0}}, "guess must be a function of t, or an earlier Steering, not {"),
+        ({"start": (None, None)}, "neither q nor v"),
+        ({"controls": {"push": 0.0, "brake": 0.0}}, "nothing in the system reads the control 'brake'"),
+        ({"controls": 0.0}, "controls is no dict"),
+        ({"system": ring, "start": off, "end": (None, None)}, "the start is off the constraint 'ring' by 3"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises((TypeError, ValueError), match=words):
             pushed(**options)
-    with pytest.raises(TypeError, match="guess must be a function of t, or an earlier Steering, not {"):
-        pushed(guess={"q": 1.0})
-    with pytest.raises(TypeError, match="neither q nor v"):
-        pushed(start=(None, None))
-    with pytest.raises(ValueError, match="nothing in the system reads the control 'brake'"):
-        lj.steer(cart, {"push": 0.0, "brake": 0.0}, (0.0, 0.0), (1.0, 0.0), energy, t_b=1.0)
-    with pytest.raises(TypeError, match="controls is no dict"):
-        lj.steer(cart, 0.0, (0.0, 0.0), (1.0, 0.0), energy, t_b=1.0)
-    ring = lj.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), {"ring": lj.Holonomic(lambda t, q, p: jnp.sum(q**2) - 1)},
-                     force=lambda t, q, v, p: p["push"] * q)  # fmt: skip
-    with pytest.raises(ValueError, match="the start is off the constraint 'ring' by 3"):
-        lj.steer(ring, {"push": 0.0}, (jnp.array([2.0, 0.0]), jnp.zeros(2)), (None, None), energy, t_b=1.0)
 
 
 @pytest.mark.slow

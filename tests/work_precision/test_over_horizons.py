@@ -77,7 +77,7 @@ def test_bad_horizons():
         ({"error": 2.0}, ValueError, "between 0 and 1"),
         ({"methods": "Gauss"}, TypeError, "a sequence"),
         ({"methods": [lj.Gauss]}, TypeError, "missing brackets"),
-        ({"methods": []}, ValueError, "methods is empty"),
+        ({"methods": []}, ValueError, "methods must hold something"),
         ({"reference": (1.0, 2.0)}, TypeError, "a function of times"),
     ):
         with pytest.raises(error, match=words + "(?s:.*)Fix: "):

@@ -154,7 +154,7 @@ def test_nothing_in_reach_is_said(made_up, monkeypatch):
     [
         ({"methods": "Dopri8"}, TypeError, "methods must be a sequence of solvers"),
         ({"methods": lj.Dopri8()}, TypeError, r"Fix: methods=\[lj.Dopri8\(\)\]"),
-        ({"methods": []}, ValueError, "methods is empty"),
+        ({"methods": []}, ValueError, "methods must hold something"),
         ({"methods": [lj.Dopri8]}, TypeError, r"the class.*\n.*\n.*lj.Dopri8\(\)"),
         ({"methods": [lj.Dopri8(), "RK45"]}, TypeError, "method 'str'.*not 'RK45'"),
         ({"methods": [diffrax.Euler()]}, TypeError, r"does not estimate its error(.*\n)*.*HalfSolver\(diffrax.Euler"),

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lagjax.jaxtools import length, without_init
-from lagjax.refusals import must, must_be, must_be_function, must_be_whole, must_return
+from lagjax.refusals import must, must_be, must_be_function, must_be_whole, must_differ, must_return
 from lagjax.system import (
     OF_STATE,
     WITH_MULTIPLIERS,
@@ -239,11 +239,8 @@ def crossings_of(events: Any, event: Any) -> dict[str, Crossing]:
     for (path, condition), direction in zip(conditions, directions):
         if not asks_diffrax(condition):
             name = "event" + jtu.keystr(path)
-            if name in found:
-                raise ValueError(
-                    f"two events have the name '{name}', which lagjax gives to the diffrax.Event.\n"
-                    "Fix: use another name in events=, or give both there, as lj.Crossing."
-                )
+            fix = "another name in events=, or both there, as lj.Crossing"
+            must_differ([name, *found], "two events, one of them by lagjax as it is a diffrax.Event,", fix)
             found[name] = Crossing(Condition(condition), of_diffrax[direction])
     return found
 

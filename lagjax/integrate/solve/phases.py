@@ -44,6 +44,7 @@ from lagjax.integrate.solve.segments import Phase
 from lagjax.integrate.trajectory import SWITCHES, Trajectory
 from lagjax.mechanics import velocity_change
 from lagjax.numerics import EqualSteps
+from lagjax.refusals import must_differ
 from lagjax.system import (
     OF_STATE,
     Call,
@@ -162,10 +163,7 @@ def phases_in(hybrid: Hybrid, start: State, events: Mapping[str, Crossing]) -> t
                 "Fix: lj.Switch(..., when=lj.guards.releases(name)) if a contact lets go; or traj.multipliers at "
                 "outputs."
             )
-    if SWITCHES in events:
-        raise ValueError(
-            f"an event in events= is named '{SWITCHES}', the name of the switches in traj.events.\nFix: another name."
-        )
+    must_differ([SWITCHES, *events], "an event in events= and the switches in traj.events", "another name")
     return tuple(_phase(hybrid, i, start, events) for i in range(len(hybrid.systems)))
 
 

@@ -60,5 +60,5 @@ def test_best_times_against_all_choices(count):
             np.testing.assert_allclose(times[[0, 1, -1]], [0.0, 1.0 if count == 3 else 0.8, 2.0], atol=0.21)
             if count == 3:
                 np.testing.assert_allclose(sd, np.sqrt(6) * SIGMA, rtol=1e-10)
-        with pytest.raises(ValueError, match="11 times, and the best 12"):
+        with pytest.raises(ValueError, match="from 1 to 11, not 12"):
             candidate.at_best(12)

@@ -219,7 +219,7 @@ def test_falling():
     "more, error, words",
     [
         ({"shrink": "h"}, ValueError, "shrink names 'h', which is no fitted parameter; there .*'g'"),
-        ({"candidates": {}}, ValueError, "candidates is empty"),
+        ({"candidates": {}}, ValueError, "candidates must hold a record"),
         ({"candidates": {"a": T}}, TypeError, "candidate 'a' must be a lj.Record"),
         ({"candidates": {"a": lj.Record(T, q=T, **RUN)}}, ValueError, "'a' has no sigma, and the records"),
         ({"candidates": {"a": lj.Record(T, q=T * np.nan, sigma=1.0, **RUN)}}, ValueError, "are NaN"),

@@ -80,5 +80,5 @@ def test_refused():
     of_multipliers = lj.Crossing(lambda t, q, v, multipliers, params: v)
     with pytest.raises(ValueError, match="event 'push' takes multipliers"):
         lj.integrate(bouncing, 1.0, 0.0, ts=ts, events={"push": of_multipliers})
-    with pytest.raises(ValueError, match="is named 'switches'"):
+    with pytest.raises(ValueError, match="called 'switches'"):
         lj.integrate(bouncing, 1.0, 0.0, ts=ts, events={"switches": APEX})
