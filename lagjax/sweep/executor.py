@@ -42,8 +42,6 @@ NEEDS_CLOUDPICKLE = 'on= needs cloudpickle, an optional extra.\nFix: pip install
 # A task takes about so long; there are at least so many, so that no worker waits long for the last, and, of a sweep of
 # days, at most so many: each costs a scheduler a millisecond.
 TASK_SECONDS, FEWEST_TASKS, MOST_TASKS = 2.0, 64, 10_000
-# Tasks of one chunk, which are begun before it is known how long a point takes.
-FIRST_TASKS = 16
 # The sweeps that a worker process keeps compiled.
 KEPT = 4
 # How many tasks that were lost a message names.
@@ -244,7 +242,7 @@ class Remote:
         self.run, self.axes, self.chunk, self.workers, self.sort, self.layout = run, axes, chunk, workers, sort, layout
         self.devices, self.progress = jax.local_devices(), progress
         patience = STEPS_TOGETHER if layout == "vmap" else None
-        # Compiled for nothing here: it says what `run` returns, and identifies it.
+        # Traced only, for what `run` returns, and for what identifies it.
         self.program, _ = program_for(
             run, axes, chunk, self.devices[:1], layout, patience, robust=False, compiles=False
         )
@@ -267,15 +265,14 @@ class Remote:
                 answers = list(on.run(problem, job, on_error="return").values())
             else:
                 answers = [_answer(self._executor.submit(problem, job))]
-        for answer in answers:
-            if answer:
-                raise ValueError(
-                    answer
-                    if isinstance(answer, str)
-                    else f"the workers cannot be used: {type(answer).__name__}: {answer}.\n"
-                    "Usual cause: they have no lagjax, or another version.\n"
-                    "Fix: the same environment for the workers as here."
-                )
+        for answer in filter(None, answers):
+            raise ValueError(
+                answer
+                if isinstance(answer, str)
+                else f"the workers cannot be used: {type(answer).__name__}: {answer}.\n"
+                "Usual cause: they have no lagjax, or another version.\n"
+                "Fix: the same environment for the workers as here."
+            )
 
     @property
     def words(self) -> str:
@@ -293,8 +290,10 @@ class Remote:
     def timed(self, indices: np.ndarray) -> tuple[float, PyTree, Status]:
         """(seconds of computing, values, status) at no more than `chunk` indices, by one worker."""
         with waiting(self.progress, "a worker compiles"):
-            ((_, done),) = self._done([(compute, (_short(indices),), indices)])
-        return done.seconds, *self._values(done)
+            found = [done for _, done in self._done([(compute, (_short(indices),), indices)], indices)]
+        if not found:
+            raise Stopped("each worker process that computed its first points died")
+        return found[0].seconds, *self._values(found[0])
 
     def first(self, indices: np.ndarray) -> tuple[PyTree, Status]:
         """(values, status) at no more than `chunk` indices."""
@@ -351,7 +350,7 @@ class Remote:
                 future.add_done_callback(finished.put)
 
         try:
-            send(FIRST_TASKS if self._pace is None else None)
+            send(FEWEST_TASKS if self._pace is None else None)
             while futures:
                 future = finished.get()
                 purpose, error = futures.pop(future), _error(future)
