@@ -14,6 +14,7 @@ import concurrent.futures
 import importlib
 import inspect
 import io
+import itertools
 import os
 import platform
 import queue
@@ -66,10 +67,11 @@ class Job(NamedTuple):
 class Done(NamedTuple):
     """What a task gives back.
 
-    `seconds` of its work without `compiling`, `worker` (host, process); `leaves` of values and status, or None where
-    they are in a store.
+    `points` and `seconds` of its work, without `compiling`; `worker` (host, process); `leaves` of values and status, or
+    None where they are in a store.
     """
 
+    points: int
     seconds: float
     compiling: float
     worker: tuple[str, int]
@@ -156,7 +158,7 @@ def compute(job: Job, indices: np.ndarray | tuple[int, int]) -> Done:
     indices = np.arange(*indices) if isinstance(indices, tuple) else indices
     started = time.perf_counter()
     leaves = jax.tree.leaves(_results(opened.engine, indices))
-    return Done(time.perf_counter() - started, compiling, _worker(), leaves)
+    return Done(len(indices), time.perf_counter() - started, compiling, _worker(), leaves)
 
 
 def fill(job: Job, place: str, digest: str, numbers: list[int]) -> Done:
@@ -173,7 +175,7 @@ def fill(job: Job, place: str, digest: str, numbers: list[int]) -> Done:
         end = start + here.stop - here.start
         store.write(number, *jax.tree.map(lambda x, start=start, end=end: x[start:end], results))
         start = end
-    return Done(time.perf_counter() - started, compiling, _worker(), None)
+    return Done(start, time.perf_counter() - started, compiling, _worker(), None)
 
 
 def _store(place: str, digest: str):
@@ -240,7 +242,7 @@ class Remote:
         self.run, self.axes, self.chunk, self.workers, self.sort, self.layout = run, axes, chunk, workers, sort, layout
         self.devices, self.progress = jax.local_devices(), progress
         patience = STEPS_TOGETHER if layout == "vmap" else None
-        # Compiled for nothing here: it says what `run` returns, and identifies it.
+        # Traced only, for what `run` returns, and for what identifies it.
         self.program, _ = program_for(
             run, axes, chunk, self.devices[:1], layout, patience, robust=False, compiles=False
         )
@@ -263,15 +265,14 @@ class Remote:
                 answers = list(on.run(problem, job, on_error="return").values())
             else:
                 answers = [_answer(self._executor.submit(problem, job))]
-        for answer in answers:
-            if answer:
-                raise ValueError(
-                    answer
-                    if isinstance(answer, str)
-                    else f"the workers cannot be used: {type(answer).__name__}: {answer}.\n"
-                    "Usual cause: they have no lagjax, or another version.\n"
-                    "Fix: the same environment for the workers as here."
-                )
+        for answer in filter(None, answers):
+            raise ValueError(
+                answer
+                if isinstance(answer, str)
+                else f"the workers cannot be used: {type(answer).__name__}: {answer}.\n"
+                "Usual cause: they have no lagjax, or another version.\n"
+                "Fix: the same environment for the workers as here."
+            )
 
     @property
     def words(self) -> str:
@@ -289,9 +290,10 @@ class Remote:
     def timed(self, indices: np.ndarray) -> tuple[float, PyTree, Status]:
         """(seconds of computing, values, status) at no more than `chunk` indices, by one worker."""
         with waiting(self.progress, "a worker compiles"):
-            ((_, done),) = self._done([(compute, (_short(indices),), indices)])
-        self._compiling, self._pace = done.compiling, done.seconds / len(indices)
-        return done.seconds, *self._values(done)
+            found = [done for _, done in self._done([(compute, (_short(indices),), indices)], indices)]
+        if not found:
+            raise Stopped("each worker process that computed its first points died")
+        return found[0].seconds, *self._values(found[0])
 
     def first(self, indices: np.ndarray) -> tuple[PyTree, Status]:
         """(values, status) at no more than `chunk` indices."""
@@ -299,14 +301,17 @@ class Remote:
 
     def over(self, indices: np.ndarray) -> Iterator[tuple[np.ndarray, PyTree, Status]]:
         """Yield (positions among the indices, values, status) of tasks as they are finished, in any order."""
-        start = 0
-        if self._pace is None:
-            start = min(self.chunk, len(indices))
-            yield np.arange(start), *self.timed(indices[:start])[1:]
-        each = self.points_of_task(len(indices) - start)
-        pieces = (np.arange(i, min(i + each, len(indices))) for i in range(start, len(indices), each))
-        tasks = ((compute, (_short(indices[piece]),), piece) for piece in pieces)
-        for positions, done in self._done(tasks, indices):
+
+        def tasks():
+            start, each = 0, None
+            while start < len(indices):
+                # Of one chunk each until it is known how long a point takes (`_done`).
+                each = self.points_of_task(len(indices) - start) if self._pace is not None and each is None else each
+                piece = np.arange(start, min(start + (each or self.chunk), len(indices)))
+                start += len(piece)
+                yield compute, (_short(indices[piece]),), piece
+
+        for positions, done in self._done(tasks(), indices):
             yield positions, *self._values(done)
 
     def points_of_task(self, count: int) -> int:
@@ -329,27 +334,37 @@ class Remote:
         return jax.tree.unflatten(jax.tree.structure(like), done.leaves)
 
     def _done(self, tasks: Iterable[tuple[Callable, tuple, Any]], named_by: Any = None) -> Iterator[tuple[Any, Done]]:
-        """Yield (what a task is for, what it gave) as they are finished; what waits is cancelled at the end."""
-        futures, finished, lost = {}, queue.SimpleQueue(), []
-        try:
-            for function, args, purpose in tasks:
+        """Yield (what a task is for, what it gave) as they are finished; what waits is cancelled at the end.
+
+        Few are begun before one is finished, which tells how long a point takes.
+        """
+        futures, finished, lost, tasks = {}, queue.SimpleQueue(), [], iter(tasks)
+
+        def send(most: int | None):
+            for function, args, purpose in itertools.islice(tasks, most):
                 try:
                     future = self._executor.submit(Named(self._name, function), self._job, *args)
                 except RuntimeError as error:
                     raise Stopped(f"the executor takes no more tasks ({error})") from error
                 futures[future] = purpose
                 future.add_done_callback(finished.put)
+
+        try:
+            send(FEWEST_TASKS if self._pace is None else None)
             while futures:
                 future = finished.get()
                 purpose, error = futures.pop(future), _error(future)
                 if error is None:
                     done = future.result()
                     self._workers.add(done.worker)
+                    if self._pace is None:
+                        self._compiling, self._pace = done.compiling, done.seconds / done.points
                     yield purpose, done
                 elif type(error).__name__ == "KilledWorker":
                     lost.append(purpose)
                 else:
                     raise error
+                send(None)
         finally:
             for future in futures:
                 future.cancel()
@@ -422,6 +437,7 @@ def _short(indices: np.ndarray):
 
 
 def _pickled(run: Callable, what: Any) -> bytes:
+    _cloudpickle()
     try:
         return _bytes_of(what)
     except Exception as error:

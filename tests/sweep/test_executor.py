@@ -115,16 +115,31 @@ def test_refused_in_words(threads, tmp_path, monkeypatch):
         assert words in refused(lambda: quiet(quick, on=threads))
 
 
-class Lost(ThreadPoolExecutor):
-    """An executor that loses its third task in a way."""
+def test_without_the_extras(threads, tmp_path, monkeypatch):
+    """Without zarr and cloudpickle sweeps in memory run, and all else says what to install."""
+    for name in ("zarr", "cloudpickle", "fsspec", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert quiet(quick).ran == 320
+    for settings, extra in (
+        ({"store": tmp_path / "store"}, r'stores need zarr(.|\n)*pip install "lagjax\[data\]"'),
+        ({"store": "s3://bucket/store"}, "s3://bucket/store needs fsspec(.|\n)*pip install fsspec"),
+        ({"on": threads}, r'on= needs cloudpickle(.|\n)*pip install "lagjax\[cluster\]"'),
+    ):
+        with pytest.raises(ImportError, match=extra):
+            quiet(quick, **settings)
+    assert not list(tmp_path.iterdir())
 
-    def __init__(self, error):
+
+class Lost(ThreadPoolExecutor):
+    """An executor that loses one of its tasks in a way."""
+
+    def __init__(self, error, which=5):
         super().__init__(1)
-        self.error, self.count = error, 0
+        self.error, self.count, self.which = error, 0, which
 
     def submit(self, function, *args):
         self.count += 1
-        return super().submit(self.fail if self.count == 5 else function, *args)
+        return super().submit(self.fail if self.count == self.which else function, *args)
 
     def fail(self, *args):
         raise self.error
@@ -142,6 +157,9 @@ def test_what_is_lost_is_named():
     ):
         swept = quiet(quick, on=pool)
     assert swept.ran == 304 and swept.counts()["not run"] == 16
+    with Lost(KilledWorker(), 2) as pool, pytest.warns(UserWarning, match="16 points are not computed"):
+        with pytest.raises(executor.Stopped, match="each worker process that computed its first points died"):
+            quiet(quick, on=pool, store="memory://lagjax/dead")
     with Lost(multiprocessing.ProcessError("no")) as pool, pytest.raises(multiprocessing.ProcessError):
         quiet(quick, on=pool)
     from concurrent.futures.process import BrokenProcessPool
@@ -212,6 +230,7 @@ def test_workers_come_and_go(cluster, tmp_path, in_store, whole):
         swept = quiet(slow, LONG, on=client, store=store)
         # Three, and the one that takes the place of the dead, or the one that joined, or both.
         assert swept.ran == 4000 and int(swept.how.split()[0]) >= 4
+        assert "slow over k, x" in cluster.scheduler.task_prefixes
         same(swept, whole)
 
 
