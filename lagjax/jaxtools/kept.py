@@ -54,7 +54,7 @@ except ImportError:
     pass
 
 # The versions of jax and jaxlib with which the tests of this module were run.
-TRIED = {"0.10.1", "0.10.2", "0.11.2", "0.12.0.1"}
+TRIED = {"0.10.1", "0.10.2"}
 # What a version of JAX without these parts raises, and XLA for an executable that it does not take.
 REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
 # What an executable may call: JAX's own LAPACK. Anything else may be there in one process and not in the next.
