@@ -40,6 +40,18 @@ def slow(point):
     return jax.lax.fori_loop(0, 50_000, lambda i, x: jnp.sin(x) + point["k"], point["x"])
 
 
+def rest(x):
+    """Wait as long as the environment of a process says, which takes the same time on a busy machine."""
+    time.sleep(float(os.environ.get("REST", 0)))
+    return np.asarray(x)
+
+
+def rested(point):
+    """A sine, and a rest for each chunk."""
+    shape = jax.ShapeDtypeStruct((), point["x"].dtype)
+    return jnp.sin(point["k"] * jax.pure_callback(rest, shape, point["x"], vmap_method="broadcast_all"))
+
+
 def quiet(run, axes=AXES, **settings):
     """A sweep in chunks of 16, without a progress bar."""
     return lj.sweep(run, axes, **{"chunk": 16, "progress": False} | settings)
@@ -189,7 +201,7 @@ def test_a_pool_of_processes(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def whole():
     """A sweep of four thousand points in one process."""
-    return quiet(slow, LONG)
+    return quiet(rested, LONG)
 
 
 @pytest.fixture
@@ -197,6 +209,8 @@ def cluster(monkeypatch):
     """Dask's scheduler with three workers."""
     dask, distributed = pytest.importorskip("dask"), pytest.importorskip("distributed")
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
+    # As long as a new worker needs to start: of 250 chunks, a third each.
+    monkeypatch.setenv("REST", "0.1")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         settings = {"distributed.scheduler.allowed-failures": 2, "logging.distributed": "critical"}
@@ -219,18 +233,19 @@ def test_workers_come_and_go(cluster, tmp_path, in_store, whole):
 
         def update(self, count):
             before, self.done = self.done, self.done + count
-            if before < 1000 <= self.done:
+            if before < 500 <= self.done:
                 pids: Any = client.run(os.getpid)
                 os.kill(next(iter(pids.values())), signal.SIGKILL)
-            if before < 1500 <= self.done:
+            if before < 800 <= self.done:
                 cluster.scale(4)
 
     with Client(cluster) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr(import_module("lagjax.sweep.sweep"), "_meter", lambda total, progress: Eventful())
-        swept = quiet(slow, LONG, on=client, store=store)
+        patch.delenv("REST")
+        swept = quiet(rested, LONG, on=client, store=store)
         # Three, and the one that takes the place of the dead, or the one that joined, or both.
         assert swept.ran == 4000 and int(swept.how.split()[0]) >= 4
-        assert "slow over k, x" in cluster.scheduler.task_prefixes
+        assert "rested over k, x" in cluster.scheduler.task_prefixes
         same(swept, whole)
 
 
@@ -280,7 +295,7 @@ def test_workers_that_cannot(cluster, tmp_path, monkeypatch):
 def started(folder, what, *options):
     """A process of Dask's command line."""
     command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--scheduler-file", str(folder / "at.json")]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_ENABLE_X64": "1"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_ENABLE_X64": "1", "REST": "0.05"}
     return subprocess.Popen([*command, *options], env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
@@ -316,9 +331,9 @@ def test_the_scheduler_is_killed(tmp_path, whole):
                     with pytest.warns(
                         UserWarning, match="stopped: .*points are done and kept; the same call continues"
                     ):
-                        quiet(slow, LONG, on=client, store=store)
+                        quiet(rested, LONG, on=client, store=store)
                 else:
-                    swept = quiet(slow, LONG, on=client, store=store)
+                    swept = quiet(rested, LONG, on=client, store=store)
         finally:
             for process in (*workers, scheduler):
                 process.kill()
