@@ -31,7 +31,7 @@ TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()
 PRIVATE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 OPTIONAL = {"PIL", "google_crc32c", "ipywidgets", "matplotlib", "numcodecs", "pandas", "sympy", "tqdm", "xarray"}
-OPTIONAL |= {"casadi", "fsspec", "mujoco", "zarr"}
+OPTIONAL |= {"casadi", "cloudpickle", "fsspec", "imageio_ffmpeg", "mujoco", "zarr"}
 LATE = ("scipy.", "matplotlib")
 
 

@@ -8,7 +8,7 @@ tolerance and outputs. Both are measured alternately in the same run; values are
     again                   the same call with other numbers, eager, in seconds, compared with the jitted solve
     programs, traced        what the second call still compiles and traces: nothing
     a step                  a call's time divided by its number of steps
-    kept programs           the first answer of a new process, where an earlier one had the same question
+    kept programs           the the first answer of a new process beyond imports, where an earlier one had the same question
     instructions            of the largest program before XLA optimises it: the amount to compile
     import                  `import lagjax` after `import jax, diffrax`
 
@@ -33,6 +33,9 @@ import jax.numpy as jnp
 import numpy as np
 jax.config.update("jax_enable_x64", True)
 import lagjax as lj
+if CACHE != "off":
+    # Beyond imports: rooms are imported where they are first used.
+    [getattr(lj, name) for name in lj.__all__]
 # The first operation of a process starts JAX's backend, so that it counts for neither.
 jax.block_until_ready(jnp.arange(3.0) + 1.0)
 clock = getattr(time, CLOCK)

@@ -29,11 +29,11 @@ from lagjax.mechanics import (
     has_networks,
     is_free_of_velocities,
     listed,
+    residuals_and_slopes,
     structure,
-    to_manifold,
     within,
 )
-from lagjax.numerics import independent_rows
+from lagjax.numerics import DEPENDENT_BELOW, independent_rows
 from lagjax.system import (
     Hybrid,
     Model,
@@ -126,6 +126,8 @@ def _name(guard):
 
 # A state this near to the constraints is taken for a rounded state on them, and moved there.
 ROUNDED = 1e-4
+# It is on them if it is so many round-offs of the largest coordinate off, as what `lj.consistent_state` returns.
+ROUND_OFFS, NEWTON_STEPS = 1e3, 8
 
 
 @dataclass(frozen=True, repr=False)
@@ -335,14 +337,37 @@ def _on_the_constraints(model: Model, s) -> _Place:
     tolerance = jnp.asarray(ROUNDED, s.t.dtype)
     equations = equations_of(model)
     if within(equations, *s[:3], tolerance, tolerance):
-        moved = to_manifold(equations, *s[:3], tolerance, tolerance)
-        return _Place(s._replace(q=moved.q, v=moved.v))
+        return _Place(_returned(model, s))
     off = departures(model, s, ROUNDED, ROUNDED)
     try:
         q, v = consistent_state(model.system, *s)
     except ValueError as error:
         return _Place(s, f"by {off}, and no state near it is on them", str(error))
     return _Place(s._replace(q=q, v=v), f"by {off} as given; everything here describes the nearest state on them")
+
+
+def _returned(model: Model, s: coordinates.State) -> coordinates.State:
+    """A state near the constraints, moved onto them by Newton's method, by M and A as they are examined anyway.
+
+    Not by the program for motions: that would take longer to compile than all else here.
+    """
+    for _ in range(NEWTON_STEPS):
+        residuals, slopes = map(np.asarray, residuals_and_slopes(equations_of(model), *s[:3]))
+        x, u = map(np.asarray, model.vectors(s.q, s.v))
+        off = np.max(np.abs(residuals) / np.where(slopes > 0, slopes, np.inf), axis=1)
+        if np.all(off <= ROUND_OFFS * np.finfo(x.dtype).eps * np.max(np.abs([x, u]), axis=1)):
+            break
+        found = examined(model, s)
+        mass, rows = np.asarray(found.linear.mass, float), np.asarray(found.rows.jacobian, float)
+        length = np.linalg.norm(rows, axis=1, keepdims=True)
+        length = np.where(length > 0, length, 1.0)
+        mass, rows = mass / (np.max(np.abs(mass)) or 1.0), rows / length
+        matrix = np.block([[mass, rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+        wanted = np.concatenate([np.zeros((len(x), 2)), -residuals.T / length])
+        # Constraints that depend on each other are equations of it, too.
+        step = np.linalg.lstsq(matrix, wanted, rcond=DEPENDENT_BELOW[np.dtype(x.dtype)])[0][: len(x)].T.astype(x.dtype)
+        s = s._replace(q=model.tree(x + step[0]), v=model.tree(u + step[1]))
+    return s
 
 
 def _in_turns(model: Model, s):

@@ -111,27 +111,65 @@ def _span(root):
     return GROWTHS / abs(root.real) if root.real else 1.0
 
 
-def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: float, trail: float) -> Animation:
-    """A film of the motion with a mode of this amplitude added."""
-    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+def _count(seconds: float, rate: float, trail: float, who: str) -> int:
+    """How many frames a film has; raise if it is none."""
     count = round(seconds * rate) + 1 if np.isfinite(seconds * rate) else 0
     if count < 3 or not trail >= 0:
         raise ValueError(
             f"seconds = {seconds:g} at rate = {rate:g} frames a second, with a trail of {trail:g} s, is not a film.\n"
-            "Fix: mode.animate(positions, seconds=6.0), and a trail of zero or more seconds."
+            f"Fix: {who}.animate(positions, seconds=6.0), and a trail of zero or more seconds."
         )
-    s = mode.linearisation.state
+    return count
+
+
+def animated(mode, positions: Callable, amplitude: float, seconds: float, rate: float, trail: float) -> Animation:
+    """A film of the motion with a mode of this amplitude added."""
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+    count = _count(seconds, rate, trail, "mode")
     t = np.linspace(0.0, _span(complex(mode.root)), count)
-    growing = np.exp(complex(mode.root) * t)
+    return Animation(float(mode.linearisation.state.t) + t, _played(mode, positions, amplitude, t), rate,
+                     int(min(trail * rate, count)))  # fmt: skip
+
+
+def _played(mode, positions: Callable, amplitude: float, t: np.ndarray) -> dict[str, np.ndarray]:
+    """What is drawn of the motion with a mode added, at times t from its start."""
+    s, root = mode.linearisation.state, complex(mode.root)
+    growing = np.exp(root * t)
     growing = amplitude * growing / np.max(np.abs(growing))
-    if complex(mode.root) == 0:
+    if root == 0:
         # A shift is shown as one oscillation.
         growing = amplitude * np.sin(2 * np.pi * t / t[-1]).astype(complex)
     x, u, shape = (np.asarray(coordinates.vector(tree)) for tree in (s.q, s.v, mode.shape))
     path = x + t[:, None] * u + np.real(growing[:, None] * shape)
-    q = coordinates.like(s.q, path)
-    at = float(s.t) + t
-    return Animation(at, drawn(positions, at, q, s.params), rate, int(min(trail * rate, count)))
+    return drawn(positions, float(s.t) + t, coordinates.like(s.q, path), s.params)
+
+
+# In a film of all modes the fastest has at most so many periods: more are a blur.
+MOST_PERIODS = 20.0
+
+
+def animated_together(
+    modes, positions: Callable, amplitude: float, seconds: float, rate: float, trail: float
+) -> Animation:
+    """A film of all modes, one to the right of the other, in one time."""
+    check_arguments(Call("positions", positions, ("t", "q", "params")), "an argument left out that is not needed")
+    count = _count(seconds, rate, trail, "modes")
+    periods = [2 * np.pi / x for x in np.asarray(modes.frequency) if x > 0]
+    spans = [_span(complex(mode.root)) for mode in modes if complex(mode.root) != 0] or [1.0]
+    t = np.linspace(0.0, min(max(spans), MOST_PERIODS * min(periods, default=np.inf)), count)
+    found, right = {}, 0.0
+    for i, mode in enumerate(modes):
+        points = _played(mode, positions, amplitude, t)
+        every = np.concatenate([x.reshape(-1, x.shape[-1]) for x in points.values()])
+        low, high = every.min(axis=0), every.max(axis=0)
+        # A fifth of its largest extent between two of them.
+        away = np.zeros(len(low))
+        away[0] = right - low[0]
+        right += high[0] - low[0] + 0.2 * max(np.max(high - low), 1e-12)
+        root = complex(mode.root)
+        words = f"{i}: " + (f"frequency {root.imag:.4g}" if root.imag and not root.real else mode.label)
+        found |= {words + (f", {name}" if name else ""): x + away for name, x in points.items()}
+    return Animation(float(modes.linearisation.state.t) + t, found, rate, int(min(trail * rate, count)))
 
 
 VERDICTS = {
@@ -414,6 +452,18 @@ class NormalModes(eqx.Module):
         shape = jax.tree.map(lambda x: x[i], self.shapes)
         label = "" if is_traced(self.roots) else label_of(i % len(self), self)
         return Mode(self.roots[i], shape, self.energy[i], self.double[i], self.linearisation, label)
+
+    def animate(self, positions, *, amplitude=0.2, seconds: float = 10.0, rate: float = 25.0, trail: float = 0.0):
+        """Play all modes side by side, in one time, the first on the left; `modes[i].animate(...)` plays one.
+
+        **Arguments:** as for a single `Mode`; the film takes three periods of the slowest mode, or twenty of the
+        fastest. x of each is that of `positions`, moved to the right.
+
+        **Returns:** an `Animation`, in the colours and words of the modes.
+
+        **Raises:** `ValueError` for positions that are not points.
+        """
+        return animated_together(self, positions, amplitude, seconds, rate, trail)
 
     def plot(self):
         """Plot all roots, growth to the right and frequency upward; returns a matplotlib `Figure`.

@@ -27,7 +27,7 @@ Derivatives by q and v are those of the coordinates alone, and derivatives by ti
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -707,5 +707,5 @@ def _pose(body: Body, t, params: PyTree, dtype) -> Pose:
     pose = body.motion(t, params) if body.motion is not None else None
     fix = f'lj.bodies.Body("{body.name}", motion=lambda t, params: lj.bodies.Pose.at(angle=params["rate"] * t))'
     must_be(Pose, pose, f"the motion of '{body.name}' must return a lj.bodies.Pose", fix)
-    position, e = (jnp.asarray(x, dtype) for x in pose)
+    position, e = (jnp.asarray(x, dtype) for x in cast(Pose, pose))
     return Pose(position, e / jnp.sqrt(jnp.sum(e**2)))

@@ -2,7 +2,7 @@
 
 from lagjax.display import plots
 from lagjax.display.animation import Animation, Still, film, film_scripts
-from lagjax.display.page import Page, encoded, fragment, in_bytes
+from lagjax.display.page import Page, encoded, encoded_once, fragment, in_bytes
 from lagjax.display.painting import stills_in_space
 from lagjax.display.plots import COLOURS, DrawnAxes
 from lagjax.display.scenery import (

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lagjax.display import plots
-from lagjax.display.page import as_page, encoded, fragment, in_bytes, whole
+from lagjax.display import films, plots
+from lagjax.display.page import as_page, encoded_once, fragment, in_bytes, whole
 from lagjax.display.painting import film_in_space, stills_in_space
 from lagjax.display.plots import COLOURS
 from lagjax.display.scenery import InSpace
@@ -48,8 +48,19 @@ class Animation:
         self.t, self.points, self.rate, self.trail = t, points, rate, trail
 
     def save(self, path) -> None:
-        """Write a page that plays in any browser, without Python and without a network."""
-        as_page(path).write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
+        """Write a page (`.html`) that plays in any browser, without Python or a network; or the film (`.gif`, `.mp4`).
+
+        A GIF or MP4 is painted by matplotlib, a few frames a second; MP4 needs ffmpeg, of the system or by
+        `pip install imageio-ffmpeg`. In space it is seen from where the page shows it first.
+
+        **Raises:** `ValueError` for another kind of file, and for MP4 without ffmpeg; `ImportError` for a GIF or MP4
+        without matplotlib.
+        """
+        path = Path(path)
+        if path.suffix.lower() in films.SUFFIXES:
+            return films.write(path, self.t, self.points, self.rate, self.trail)
+        page = as_page(path, '; .save("{}.gif") and .save("{}.mp4") are films, too')
+        page.write_text(whole("Motion", self._repr_html_()), encoding="utf-8")
 
     def _repr_html_(self):
         points = self.points
@@ -86,7 +97,8 @@ def film(t: np.ndarray, points: dict[str, np.ndarray] | InSpace, rate: float, tr
     digits = max(0, math.ceil(-math.log10(abs(step))))
     about = "Motion" + "".join(f" of {name}" for name in [", ".join(filter(None, parts))] if name)
     spec = {"rate": rate, "trail": trail, "start": float(t[0]), "step": step, "digits": digits, "frames": len(t)}
-    spec |= {"about": about, "parts": [{"points": x.shape[2], "xy": encoded(x, "i2")} for x in parts.values()]}
+    coded = [{"points": x.shape[2], "xy": encoded_once(x, "i2", NOWHERE)} for x in parts.values()]
+    spec |= {"about": about, "parts": coded}
     start = f"t = {float(t[0]):.{digits}f}"
     body = (
         f'<div data-film=""><div class="parts">{_legend(parts)}</div>\n'

@@ -62,13 +62,13 @@ class Page:
         )
 
 
-def as_page(path) -> Path:
-    """The path of a page; raise for one whose name says that it is something else."""
+def as_page(path, others: str = "") -> Path:
+    """The path of a page; raise for one whose name says that it is something else. `others`: what else it can be."""
     path = Path(path)
     if path.suffix.lower() not in ("", ".html", ".htm"):
         raise ValueError(
             f"this is saved as a page (HTML), and '{path.name}' would be no {path.suffix} file.\n"
-            f'Fix: .save("{path.stem}.html"), which plays in any browser; for a film in a file, record the window.'
+            f'Fix: .save("{path.stem}.html"), which any browser shows{others.replace("{}", path.stem)}.'
         )
     return path
 
@@ -103,6 +103,40 @@ def fragment(body: str, spec: dict[str, Any], scripts: tuple[str, ...], last: st
 def encoded(x, dtype: str) -> tuple[str, str]:
     """An array in the form read by `decode`: its type, "f4", "f8", "i1", "i2" or "i4", and little-endian base64."""
     return dtype, b64encode(np.ascontiguousarray(x, dtype=f"<{dtype}").tobytes()).decode()
+
+
+# What a column of numbers is over lanes and frames: the same in all, at each time the same in all lanes, the same all
+# the time in each lane, or none of that.
+FIXED, OF_TIME, OF_LANE, FREE = "ftlv"
+
+
+def encoded_once(x, dtype: str, nothing: float = np.nan) -> tuple:
+    """An array (N, F, ...) over lanes and frames for `decode`, in which what is constant over either is there once.
+
+    Most of a film stands still: pivots, rails, a circle of sixty points. Behind the numbers are the letter of each
+    column (`FIXED` and so on), N, F, and the lanes without a motion, which are `nothing` throughout.
+    """
+    x = np.asarray(x, dtype=f"<{dtype}")
+    if not x.size:
+        return encoded(x, dtype)
+    lanes, frames = x.shape[:2]
+    columns = x.reshape(lanes, frames, -1)
+    empty = np.isnan(columns) if np.isnan(nothing) else columns == nothing
+    empty = empty.all(axis=(1, 2))
+    if empty.all():
+        return encoded(x, dtype)
+    known = columns[~empty]
+    of_time = np.all((known == known[:1]) | (np.isnan(known) & np.isnan(known[:1])), axis=(0, 1))
+    of_lane = np.all((known == known[:, :1]) | (np.isnan(known) & np.isnan(known[:, :1])), axis=(0, 1))
+    kinds = [FIXED if a and b else OF_TIME if a else OF_LANE if b else FREE for a, b in zip(of_time, of_lane)]
+    parts = [np.zeros(0, x.dtype)]
+    for kind in (FIXED, OF_TIME, OF_LANE, FREE):
+        where = [i for i, found in enumerate(kinds) if found == kind]
+        of_kind = known[:1, :, where] if kind in (FIXED, OF_TIME) else columns[:, :, where]
+        parts.append((of_kind[:, :1] if kind in (FIXED, OF_LANE) else of_kind).reshape(-1))
+    if len(text := encoded(np.concatenate(parts), dtype)[1]) > 0.9 * len(encoded(x, dtype)[1]):
+        return encoded(x, dtype)
+    return dtype, text, "".join(kinds), lanes, frames, np.flatnonzero(empty).tolist()
 
 
 def in_bytes(count: float) -> str:

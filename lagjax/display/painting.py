@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax.display.page import encoded
+from lagjax.display.page import encoded, encoded_once
 from lagjax.display.plots import COLOURS, figure, names_as_they_are
 from lagjax.display.scenery import Faces, InSpace, Shape
 
@@ -281,13 +281,13 @@ def film_in_space(
         "rate": rate, "trail": trail, "start": float(t[0]), "step": step, "digits": digits, "frames": len(t),
         "about": about, "view": _plain(view), "look": LOOK, "bodies": len(bodies),
         "grid": {"floor": grid.floor, "x": lines(grid.x), "y": lines(grid.y), "z": lines(grid.z)},
-        "poses": encoded(_poses(motion), "f4"),
+        "poses": encoded_once(_poses(motion), "f4"),
         "surfaces": [
             {"vertices": encoded(s.vertices, "f4"), "light": encoded(s.light, "f4"), "closed": s.closed,
              "faces": encoded(s.faces, "i2" if len(s.vertices) < 2**15 else "i4")} for s in surfaces
         ],
         "shapes": [_shape(shape, bodies, surfaces) for shape in motion.shapes],
-        "parts": [{"points": x.shape[-2], "xyz": encoded(x, "f4"), "color": colours[name]}
+        "parts": [{"points": x.shape[-2], "xyz": encoded_once(x, "f4"), "color": colours[name]}
                   for name, x in motion.points.items()],
     }  # fmt: skip
     named = [
@@ -380,21 +380,24 @@ def stills_in_space(motion: InSpace, chosen: InSpace, azimuth: float, elevation:
     """
     view, grid = view_of(*motion.extent(), azimuth, elevation)
     fig, axes = figure(size=(WIDTH * INCHES, view.height * INCHES))
-    axis = axes[0, 0]
-    axis.set(xlim=(0.0, WIDTH), ylim=(view.height, 0.0), aspect="equal")
-    axis.set_axis_off()
     count = len(next(iter((chosen.poses | chosen.points).values())))
     painted = trails(motion, view)
     for i in range(count):
         painted += marks(chosen.at(i), view, PALEST * (1 - i / (count - 1)) if count > 1 else 0.0)
     around, painted = surroundings(grid, view), sorted(painted, key=lambda mark: mark.nearness)
     # Seen from below, the floor is in front.
-    found = [*around, *painted] if elevation >= 0 else [*painted, *around]
+    painted_in(axes[0, 0], [*around, *painted] if elevation >= 0 else [*painted, *around], view)
+    return fig
+
+
+def painted_in(axis, found: list[Mark], view: View) -> None:
+    """Paint marks in this order into a matplotlib axis, with their texts."""
+    axis.set(xlim=(0.0, WIDTH), ylim=(view.height, 0.0), aspect="equal")
+    axis.set_axis_off()
     _paint(axis, [mark for mark in found if not mark.text])
     for mark in found:
         if mark.text:
             axis.text(*mark.at[0], mark.text, fontsize=8, ha=mark.align, va="center", color=mark.color)
-    return fig
 
 
 def _paint(axis, found: list[Mark]):

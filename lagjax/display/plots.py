@@ -330,19 +330,22 @@ def _ticks_of_decades(axis):
 
 
 @names_as_they_are()
-def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
+def fits(
+    panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]], curves: dict[str, tuple[np.ndarray, np.ndarray]]
+):
     """Draw measurements and the fit on the left, and the residuals on the right, one row per channel.
 
-    **Arguments:** `panels` by name: times (T,), measurements and residuals (T,) or (T, n).
+    **Arguments:** `panels` by name: times (T,), measurements and residuals (T,) or (T, n); `curves` by name: times and
+    values of the fit, where it is not to be drawn from sample to sample.
 
     **Returns:** a matplotlib `Figure`.
     """
     fig, axes = figure(len(panels), 2, size=(5.2, 2.3), sharex=True)
     for (left, right), (name, (t, measured, residuals)) in zip(axes, panels.items()):
-        fitted = measured + residuals
-        for i, (x, y) in enumerate(zip(measured.reshape(len(t), -1).T, fitted.reshape(len(t), -1).T)):
+        at, fitted = curves.get(name, (t, measured + residuals))
+        for i, (x, y) in enumerate(zip(measured.reshape(len(t), -1).T, fitted.reshape(len(at), -1).T)):
             left.plot(t, x, ".", color="#888888", markersize=3, label="measured" if i == 0 else None)
-            left.plot(t, y, linewidth=1.2, label="fit" if i == 0 else None, **style(i))
+            left.plot(at, y, linewidth=1.2, label="fit" if i == 0 else None, **style(i))
         for i, r in enumerate(residuals.reshape(len(t), -1).T):
             right.plot(t, r, ".", markersize=3, color=COLOURS[i % len(COLOURS)])
         right.axhline(0.0, color="black", linewidth=0.8)
@@ -355,14 +358,25 @@ def fits(panels: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]):
 
 
 @names_as_they_are()
-def lines(label: str, x, panels: dict[str, np.ndarray], bad):
-    """Draw values against one axis of a sweep, one panel per value; `bad` points are marked at the bottom."""
+def lines(label: str, x, panels: dict[str, np.ndarray], bad, by: tuple[str, np.ndarray] | None = None):
+    """Draw values against one axis of a sweep, one panel per value; `bad` points are marked at the bottom.
+
+    `by`: the name and values (k,) of a second axis: values and `bad` are then (k, N), one curve each.
+    """
     fig, axes = figure(len(panels), 1, size=(6.0, 2.8), sharex=True)
+    bad = np.atleast_2d(bad)
     for axis, (name, values) in zip(axes[:, 0], panels.items()):
-        axis.plot(x, values, marker="." if len(x) < 200 else "", **style(0))
-        if np.any(bad):
-            at = np.asarray(x)[bad]
-            axis.plot(at, np.zeros(len(at)), "x", color="#D55E00", transform=axis.get_xaxis_transform(), label="not ok")
+        for i, curve in enumerate(np.atleast_2d(values)):
+            named = None if by is None else f"{by[0]} = {by[1][i]:.4g}"
+            axis.plot(x, curve, marker="." if len(x) < 200 else "", label=named, **style(i))
+            if np.any(bad[i]):
+                at, mark = np.asarray(x)[bad[i]], {"color": COLOURS[1] if by is None else COLOURS[i % len(COLOURS)]}
+                first = not np.any(bad[:i])
+                axis.plot(at, np.zeros(len(at)), "x", transform=axis.get_xaxis_transform(), zorder=3,
+                          label="not ok" if first else None, **mark)  # fmt: skip
+        if by is not None:
+            axis.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        elif np.any(bad):
             axis.legend(fontsize=8, frameon=False)
         axis.set_ylabel(name)
     axes[-1, 0].set_xlabel(label)

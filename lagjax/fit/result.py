@@ -116,6 +116,10 @@ class Channel(NamedTuple):
     residuals: np.ndarray
 
 
+# A step is a gap if it is so many times the median one; a curve across gaps has so many points.
+GAP, DRAWN = 1.5, 512
+
+
 # Not an `eqx.Module`, which wraps a method each time it is looked up.
 @jtu.register_dataclass
 @dataclass(frozen=True, eq=False, repr=False)
@@ -442,13 +446,41 @@ class Fit:
         npz.write(path, "fit", contents, writer.arrays)
 
     def plot(self, record: int = 0):
-        """Draw data, fit and residuals of a record, one row per channel; returns a matplotlib `Figure`."""
-        return plot.fits({name: rest for name, *rest in self.channels(record) if rest[0] is not None})
+        """Draw data, fit and residuals of a record, one row per channel; returns a matplotlib `Figure`.
+
+        Where samples are missing the fitted motion is drawn between its neighbours: integrated once more, if the system
+        is known.
+        """
+        panels = {name: rest for name, *rest in self.channels(record) if rest[0] is not None}
+        known = not isinstance(self.problem.system, UnknownSystem)
+        gaps = known and any(_has_gaps(t, measured) for t, measured, _ in panels.values())
+        return plot.fits(panels, self._curves(record) if gaps else {})
+
+    def _curves(self, record: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """What the fitted motion predicts, by channel, at times closer than the samples; NaN between windows."""
+        windows = np.flatnonzero(np.asarray(self.problem.windows.record) == record)
+        states, _ = starts_at(self.problem, self.unknowns, windows)
+        count, curves = max(DRAWN // len(windows), 16), {}
+        for i, w in enumerate(windows):
+            of_window, (q, v) = self.problem.windows.ts[w], jax.tree.map(lambda x, i=i: x[i], states)
+            ts = np.linspace(of_window[0], of_window[self.problem.windows.last[w]], count)
+            params, options = self.problem.params(self.unknowns.shared, w), {"throw": False} | self.problem.options
+            predicted = self.problem.predicted(integrate(self.problem.system, q, v, params, ts=ts, **options))
+            for kind, tree in predicted.items():
+                for path, x in jtu.tree_leaves_with_path(tree) if kind != "end" else ():
+                    known = curves.setdefault(channel_name(kind, path), [])
+                    known.append((np.append(ts, np.nan), np.append(x, np.full_like(x[-1:], np.nan), axis=0)))
+        return {k: (np.concatenate([t for t, _ in x]), np.concatenate([y for _, y in x])) for k, x in curves.items()}
 
     def __repr__(self):
         if is_traced(self.cost):
             return f"Fit of {listed(list(self.names))}, being traced"
         return by_line("\n".join(lines_of(self)))
+
+
+def _has_gaps(t: np.ndarray, measured: np.ndarray) -> bool:
+    steps = np.abs(np.diff(t))
+    return len(t) > 1 and not (np.all(np.isfinite(measured)) and np.all(steps <= GAP * np.median(steps)))
 
 
 def _is_data(value: Any):

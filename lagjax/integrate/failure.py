@@ -20,6 +20,7 @@ from dataclasses import replace
 from typing import NamedTuple, NoReturn
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -223,12 +224,21 @@ def _jammed(laws, user: System, s: State) -> str:
     return f": {'; '.join(said)}" if said else ""
 
 
+# What a program that ends can say besides its result.
+INSIDE = """
+Usual cause: parameters or a start far from those meant, which a sampler, a search or a lane of a batch tries.
+Fix: throw=False: outputs are then NaN from there on, and traj.result says why. A sampler takes found.log_posterior of a
+fit (docs/fitting.md), -inf where a motion fails, or jnp.where(traj.result == lj.RESULTS.successful, density, -jnp.inf).
+"""
+
+
 @as_usual
 def raise_at_run_time(trajectory: Trajectory) -> Trajectory:
     """Return the trajectory; if it failed, the program that computes it ends with the message of its result."""
     code = _code_p.bind(jnp.asarray(trajectory.result._value))
     result = eqx.tree_at(lambda result: result._value, trajectory.result, code)
-    return result.error_if(trajectory, ~ended_well(result))
+    words = [words + INSIDE for words in RESULTS._index_to_message]
+    return eqxi.branched_error_if(trajectory, ~ended_well(result), code, words)
 
 
 def _batched(operands: Sequence, axes: Sequence):

@@ -23,7 +23,7 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.display import Animation, Drawing, InSpace, Shape, Still, plots, poses_in_q, stills_in_space
 from lagjax.jaxtools import compiled
 from lagjax.mechanics import Generator, NoetherCharge, conserved_momenta, conserves_jacobi_integral
-from lagjax.refusals import must, must_be_function, must_have_values, must_return
+from lagjax.refusals import must_be_function, must_have_values, must_return, shown, words
 from lagjax.system import Call, Traced, UnknownSystem, check_arguments, check_system, coordinates
 
 # States whose poses are computed together.
@@ -324,7 +324,7 @@ def _by_name(charges: Any) -> dict[str, Callable]:
         found = {getattr(charges, "__name__", "charge"): charges}
     else:
         fix = 'charges={"L_z": lj.noether_charge(system, lj.Generator.rotation("z"))}'
-        must(False, "charges must be True, or functions by name", charges, fix, error=TypeError)
+        raise TypeError(words(f"charges must be True, or functions by name, not {shown(charges)}", fix))
     for name, charge in found.items():
         must_be_function(charge, f"charge '{name}'", "(t, q, v, params)", "pass the function itself, not its value")
     return found

@@ -78,6 +78,10 @@ RESULTS._index_to_message[int(RESULTS.max_steps_reached._value)] = (
     "The maximum number of solver steps was reached: a long motion, a stiff one, or one that cannot go on. "
     "lj.integrate outside of jit, vmap and grad tells which."
 )
+RESULTS._index_to_message[int(RESULTS.dt_min_reached._value)] = (
+    "The steps became as short as round-off: a singularity, a velocity without bound, or forces that jump at each. "
+    "lj.integrate outside of jit, vmap and grad tells which."
+)
 ENDED_WELL = RESULTS.successful, RESULTS.event_occurred
 
 

@@ -237,7 +237,7 @@ class Trajectory(eqx.Module):
         >>> fall = lj.System(lambda t, q, v, params: 0.5 * v**2 - params["g"] * q)
         >>> traj = lj.integrate(fall, 0.0, 3.0, {"g": 10.0}, ts=[0.0, 0.2, 0.5])
         >>> traj.animate(lambda t, q, params: (2.0 * t, q))  # thrown, at 2 along x
-        Animation of 51 frames, 2 s, 9 kB: plays in a notebook, and with .save("motion.html") in a browser
+        Animation of 51 frames, 2 s, 10 kB: plays in a notebook, and with .save("motion.html") in a browser
 
         **Arguments:**
 

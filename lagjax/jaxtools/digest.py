@@ -161,6 +161,9 @@ class _Writer:
         elif name_in_library(type(x)) == "jax._src.util:HashablePartial":
             # In what `ravel_pytree` returns.
             self.all(b"partial", (x.f, x.args, x.kwargs))
+        elif type(x).__module__ == "jax._src.flattree":
+            # In the loops of jax 0.11 and later.
+            self.all(b"flat tree", (*self._named(type(x)), *sorted(vars(x).items())))
         elif (name := name_in_library(x)) is not None:
             self.add(b"library", name.encode())
         elif isinstance(x, types.FunctionType):

@@ -200,14 +200,9 @@ def _is_again(call: JaxprEqn, equation: JaxprEqn) -> bool:
     if len(call.outvars) != 1 or variables(equation) != call.outvars or equation.primitive is not call.primitive:
         return False
     alike = [x.aval for x in equation.outvars] == [x.aval for x in call.outvars] == [x.aval for x in variables(call)]
-    return alike and not equation.effects and _read_alike(bodies(equation), bodies(call))
-
-
-def _read_alike(some: list[Jaxpr], others: list[Jaxpr]) -> bool:
-    """Whether programs have the same text, which takes long to write and is written last."""
-    if [len(one.eqns) for one in some] != [len(one.eqns) for one in others]:
+    if not alike or equation.effects or len(bodies(equation)) != len(bodies(call)):
         return False
-    return all(one is other or str(one) == str(other) for one, other in zip(some, others))
+    return all(x is y or _meaning_inside(x) == _meaning_inside(y) for x, y in zip(bodies(equation), bodies(call)))
 
 
 def _as_loop(jaxpr: Jaxpr, chain: Sequence[JaxprEqn]) -> list[JaxprEqn]:

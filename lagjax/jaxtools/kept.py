@@ -40,6 +40,7 @@ from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
+from lagjax.jaxtools.jaxpr import anywhere
 from lagjax.jaxtools.outline import NoOutline
 from lagjax.jaxtools.tracing import HAPPENED
 
@@ -54,7 +55,7 @@ except ImportError:
     pass
 
 # The versions of jax and jaxlib with which the tests of this module were run.
-TRIED = {"0.10.1", "0.10.2", "0.11.2", "0.12.0.1"}
+TRIED = {"0.10.1", "0.10.2"}
 # What a version of JAX without these parts raises, and XLA for an executable that it does not take.
 REFUSED = (AttributeError, TypeError, ValueError, KeyError, LookupError, RuntimeError, NotImplementedError)
 # What an executable may call: JAX's own LAPACK. Anything else may be there in one process and not in the next.
@@ -173,6 +174,14 @@ class KeptProgram:
         """The program of arrays, or shapes, of this kind, compiled here."""
         return self._made(self._place(arrays), arrays)
 
+    def traced_for(self, arrays: list) -> Ready:
+        """What is known of the program of arrays, or shapes, of this kind, without compiling it: it has no call."""
+        return self._described(self._jit.trace(arrays))
+
+    def _described(self, traced: Any) -> Ready:
+        outputs = [ShapedArray(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.jaxpr.out_avals]
+        return Ready(_without_call, self._structure, outputs, self._said.facts(traced.jaxpr))
+
     def _place(self, arrays: list) -> tuple[Path, str] | None:
         """The folder and the digest of the program; None if it is not kept."""
         where = folder.place()
@@ -193,13 +202,11 @@ class KeptProgram:
         before = HAPPENED.copy()
         traced = self._jit.trace(arrays)
         compiled = traced.lower().compile()
-        facts = self._said.facts(traced.jaxpr)
-        outputs = [ShapedArray(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.jaxpr.out_avals]
-        made = Ready(compiled, self._structure, outputs, facts, compiled)
+        made = self._described(traced)._replace(call=compiled, compiled=compiled)
         if HAPPENED != before:
             TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
         elif place is not None:
-            self._write(place, made, arrays)
+            self._write(place, made, arrays, at_once=_sorts(traced.jaxpr.jaxpr))
         return made
 
     def _loaded(
@@ -215,8 +222,9 @@ class KeptProgram:
             _refuse(error)
             return None
 
-    def _write(self, place: tuple[Path, str], made: Ready, arrays: list) -> None:
-        """Write the program, in another thread."""
+    def _write(self, place: tuple[Path, str], made: Ready, arrays: list, at_once: bool) -> None:
+        """Write the program, in another thread; what is kept of it can be made out `at_once`."""
+        parts = _parts_now(made.compiled) if at_once else None
 
         def write() -> None:
             try:
@@ -225,7 +233,7 @@ class KeptProgram:
                 again = jtu.tree_structure(self._said.tree(outline, arrays))
                 if again != made.structure:
                     raise NotKept("its results are of a structure that has no outline")
-                header, program = _parts_of(made.compiled)
+                header, program = parts or _parts_of(made.compiled)
                 if folder.write(*place, {"outline": outline, "facts": made.facts, **header}, program):
                     TALLY.found["written"] += 1
             except (NotKept, NoOutline) as reason:
@@ -234,6 +242,22 @@ class KeptProgram:
                 TALLY.not_kept[f"{type(error).__name__}: {str(error)[:200]}"] += 1
 
         LATER.do(write)
+
+
+# In its first run such a program of XLA's before jax 0.12 takes a form that cannot be written.
+_sorts = anywhere(lambda equation: equation.primitive.name in ("sort", "top_k"))
+
+
+def _parts_now(call: Any) -> tuple[dict[str, Any], bytes] | None:
+    """`_parts_of`, or None where that says why not: it is asked again."""
+    try:
+        return _parts_of(call)
+    except (NotKept, *REFUSED):
+        return None
+
+
+def _without_call(arrays: list) -> list:
+    raise AssertionError("this program was traced only, and is not compiled")
 
 
 class Unusable(Exception):

@@ -13,8 +13,8 @@ coordinates, is thus told apart: beyond its zero it is positive again.
 Source: Golub & Van Loan, *Matrix Computations*, §8.1.5 (the law of inertia).
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 
 from lagjax.mechanics.equations import equations_of
 from lagjax.mechanics.lagrangian import balance_matrix, is_determined, of_states, with_first_order
-from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, combinations, examined, missed
+from lagjax.mechanics.saddle_point import SINGULAR_BELOW, Examined, examined, missed
 from lagjax.refusals import listed
 from lagjax.system import Model, State, constraints, coordinates
 
@@ -67,6 +67,51 @@ def indefinite_mass(model: Model, start: State, end: State) -> IndefiniteMass | 
     return IndefiniteMass(cause, fix, found is not None)
 
 
+def indefinite_in_words(mass: Any, rows: Any, names: Callable[[], list[str]], again: bool = False) -> str | None:
+    """Say of M and A at one state that an eigenvalue is below zero; None where none is, or M is not finite.
+
+    `names()`: those of the coordinates. `again`: M was definite at another state or with other parameters, and is
+    looked at again only where one of its diagonal entries is not above zero, which takes two microseconds.
+    """
+    mass = np.asarray(mass)
+    # A definite M is so in all directions.
+    if mass.diagonal().min() > 0 and (again or len(mass) == 1 or _has_root(mass)):
+        return None
+    eps, mass, rows = np.finfo(mass.dtype).eps, np.asarray(mass, float), np.asarray(rows, float)
+    if not (np.all(np.isfinite(mass)) and np.all(np.isfinite(rows))):
+        return None
+    values, directions = _in_free_directions(mass, rows)
+    round_off = ROUND_OFFS * eps * np.max(np.abs(values), initial=0.0)
+    if not np.any(values < -round_off):
+        return None
+    most = names()[int(np.argmax(np.abs(directions[:, 0])))]
+    every = not np.any(values > round_off)
+    cause = "L = V - T, or a mass below zero" if every else "the sign of one term of the kinetic energy, or of one mass"
+    return (
+        f"the mass matrix is {'negative definite' if every else 'not positive definite'} where the motion starts: its "
+        f"smallest eigenvalue is {values[0]:.3g}, most in '{most}'. The motion is that of the equations as they are, "
+        f"{'and forces act the other way round' if every else 'and velocities may grow without end'}.\n"
+        f"Usual cause: {cause}.\n"
+        "Fix: L = T - V with T above zero: lj.mass_matrix(system, t, q, v, params, by_name=True) says where it is not. "
+        'If it is meant, as in spacetime: warnings.filterwarnings("ignore", "the mass matrix is").'
+    )
+
+
+def _has_root(matrix: np.ndarray) -> bool:
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(matrix)[-1, -1]))
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _in_free_directions(mass: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The eigenvalues of M in the directions that constraints leave free, and these directions as columns."""
+    _, sizes, right = np.linalg.svd(rows)
+    free = right[int(np.sum(sizes > 1e-9 * np.max(sizes, initial=0.0))) :].T
+    values, vectors = np.linalg.eigh(free.T @ mass @ free)
+    return values, free @ vectors
+
+
 class _Eigenvalues:
     """The eigenvalues of M at a state, in the directions that constraints leave free; not `known` if not finite."""
 
@@ -76,15 +121,13 @@ class _Eigenvalues:
         self.t, self.known, self.below = s.t, bool(np.all(np.isfinite(mass)) and np.all(np.isfinite(rows))), 0
         if not self.known:
             return
-        _, sizes, right = np.linalg.svd(rows)
-        free = right[int(np.sum(sizes > 1e-9 * np.max(sizes, initial=0.0))) :].T
-        values, vectors = np.linalg.eigh(free.T @ mass @ free)
+        values, directions = _in_free_directions(mass, rows)
         self.known = values.size > 0
         if self.known:
             round_off = ROUND_OFFS * np.finfo(found.linear.mass.dtype).eps * np.max(np.abs(values))
             self.below, self.above = int(np.sum(values < -round_off)), int(np.sum(values > round_off))
             self.smallest = float(values[0])
-            self.name = model.names[int(np.argmax(np.abs(free @ vectors[:, 0])))]
+            self.name = model.names[int(np.argmax(np.abs(directions[:, 0])))]
 
     def differs(self, first: "_Eigenvalues") -> bool:
         """Whether an eigenvalue has another sign than at `first`, beyond round-off."""
@@ -275,12 +318,14 @@ def _violated_by_velocities(model: Model, s: State, names: Sequence[str]):
 
 def dependencies(jacobian: Array, independent: Array, names: Sequence[str]) -> list[tuple[str, ...]]:
     """Each dependent constraint equation, followed by those that it is a combination of, by name."""
-    size = np.linalg.norm(jacobian, axis=1)
-    share = np.abs(combinations(jacobian, independent)) * size[None, :]
+    rows, chosen = np.asarray(jacobian, float), np.flatnonzero(independent)
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = rows / np.where(size > 0, size, 1.0)
     groups = []
     for i in np.flatnonzero(~np.asarray(independent)):
-        others = np.flatnonzero(share[i] > SHARE * size[i])
-        groups.append((names[i], *(names[j] for j in others)))
+        # Of rows of length one, whatever their units.
+        share = np.abs(np.linalg.lstsq(rows[chosen].T, rows[i], rcond=None)[0])
+        groups.append((names[i], *(names[j] for j in chosen[share > SHARE])))
     return groups
 
 

@@ -299,7 +299,7 @@ class Equations(eqx.Module):
         # The different ways of not being regular are not told apart here.
         verdict = Verdict(
             a, multipliers, finite, ~regular, jnp.asarray(False), largest_of_rows(here.mass),
-            (known.residuals[0], known.jacobian[0]),
+            (known.residuals[0], known.jacobian[0]), (here.mass, here.jacobian),
         )  # fmt: skip
         return (model.tree(x), model.tree(u)), verdict
 

@@ -74,7 +74,7 @@ class Verdict(NamedTuple):
     """A solution of the equations at one state, as vectors or by name, and whether it is valid.
 
     `mass`: the largest entry of each row of M. `given`: residuals and A at the state before it was returned to the
-    constraints, where they are known.
+    constraints, where they are known. `whole`: M and A, where they are formed.
     """
 
     a: PyTree[Array]
@@ -84,6 +84,7 @@ class Verdict(NamedTuple):
     contradictory: Bool[Array, ""]
     mass: Float[Array, " n"]
     given: tuple[Float[Array, "2 m"], Float[Array, "m n"]] | None = None
+    whole: tuple[Float[Array, "n n"], Float[Array, "m n"]] | None = None
 
 
 def slightly_off(y: Array):
@@ -207,7 +208,9 @@ class Dense(NamedTuple):
         singular = dense.reciprocal_condition(found.matrix) <= SINGULAR_BELOW[np.dtype(found.matrix.dtype)]
         finite, contradictory = jnp.all(jnp.isfinite(solution)), jnp.any(found.contradictory)
         singular = singular | ~found.unique
-        return Verdict(found.a, found.multipliers, finite, singular, contradictory, largest_of_rows(found.linear.mass))
+        mass, rows = found.linear.mass, found.rows.jacobian
+        size = largest_of_rows(mass)
+        return Verdict(found.a, found.multipliers, finite, singular, contradictory, size, None, (mass, rows))
 
     def solution_or_nan(self, *state):
         """The solution as vectors, NaN where constraints contradict each other."""

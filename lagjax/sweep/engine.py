@@ -169,11 +169,13 @@ def compiled(
     patience: int | None,
     robust: bool,
     point: tuple[Meaning, PyTree],
+    compiles: bool = True,
 ) -> Program:
     """Compile a sweep's program for chunks of some length, split between the devices; or find one that is kept.
 
     Only the names, shapes and dtypes of the axes matter, and the meaning and the structure of one `point`. Motions are
-    given up after `patience` steps, if given. Unless `robust`, motions are assumed to be regular.
+    given up after `patience` steps, if given. Unless `robust`, motions are assumed to be regular. Without `compiles` it
+    says what it gives, and cannot be called.
     """
     meaning, structure = point
     at_point = point_of(run)
@@ -211,8 +213,8 @@ def compiled(
         ),
         None,
     )
-    ready = program.ready_for(shaped)
-    memory = ready.compiled.memory_analysis()
+    ready = program.ready_for(shaped) if compiles else program.traced_for(shaped)
+    memory = ready.compiled.memory_analysis() if compiles else None
     working = 0 if memory is None else memory.temp_size_in_bytes + memory.output_size_in_bytes
 
     @as_usual
@@ -240,6 +242,7 @@ def program_for(
     patience: int | None = None,
     robust: bool = True,
     progress: bool | None = False,
+    compiles: bool = True,
 ) -> tuple[Program, float]:
     """The program, and the seconds it took to compile; 0 if it was in the cache."""
     seconds = 0.0
@@ -248,7 +251,7 @@ def program_for(
         nonlocal seconds
         started = time.perf_counter()
         with waiting(progress, "compiling"):
-            program = compiled(run, axes, chunk, devices, layout, patience, robust, (meaning, structure))
+            program = compiled(run, axes, chunk, devices, layout, patience, robust, (meaning, structure), compiles)
         seconds = time.perf_counter() - started
         return program
 
@@ -262,7 +265,7 @@ def program_for(
         )
     meaning = Meaning((meaning_of(program.jaxpr), structure, tuple(map(content_of, program.consts))))
     settings = (tuple(jax.config.values.items()), jax.sharding.get_abstract_mesh())
-    key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, settings
+    key = meaning, axes.names, chunk, tuple(devices), layout, patience, robust, compiles, settings
     return program_of(key, make), seconds
 
 
@@ -332,6 +335,9 @@ class Engine:
     The first program assumes regular motions, which compiles in two thirds of the time; the robust program is compiled
     only when a point turns out to need it.
     """
+
+    # Blocks of a new store: at least so many for each process.
+    shares = CHUNKS_EACH
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ from lagjax.files import MALFORMED, Explained, parsed
 from lagjax.sweep.axes import Axes, Blocks
 from lagjax.sweep.engine import NOT_RUN, STATUS_TYPES, Program, Status, digest, nothing
 from lagjax.sweep.labels import STORE_GROUP, labels_of, named_leaves, status_attributes
-from lagjax.sweep.objects import Coder, Files, Spec, consolidated, needed
+from lagjax.sweep.objects import Encoder, Files, Spec, consolidated, needed
 
 META = "zarr.json"
 # Stores of other formats are not read.
@@ -293,7 +293,7 @@ def create(
 def axis_files(arrays: dict[str, Spec], whole: dict[str, np.ndarray]) -> dict[str, bytes]:
     """The files of arrays of one chunk each, given by the places of the arrays."""
     given = {place: (arrays[place], x) for place, x in whole.items() if arrays[place].key()}
-    return {f"{place}/{spec.key()}": Coder(spec).encoded((0,) * x.ndim, x) for place, (spec, x) in given.items()}
+    return {f"{place}/{spec.key()}": Encoder(spec)((0,) * x.ndim, x) for place, (spec, x) in given.items()}
 
 
 def _places(axes: Axes, program: Program, times: dict[str, np.ndarray]):

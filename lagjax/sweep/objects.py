@@ -1,9 +1,9 @@
 """The files of a store, wherever it is: a folder, or a URL that fsspec opens; and the blocks of an array in them.
 
-Zarr makes and reads the bytes of blocks, in memory. What it does not promise is here: a file is written whole or not at
-all, a missing one is an error and no block of fill values, and no more is made of a file than its block has numbers
-for, since it may come from anyone. Zarr's shards would put several blocks into one file, which its writers then could
-not write independently of each other.
+Zarr makes the files of blocks, in memory. What it does not promise is here: a file is written whole or not at all, a
+missing one is an error and no block of fill values, and no more is made of a file than its block has numbers for, since
+it may come from anyone. Zarr's shards would put several blocks into one file, which their writers then could not write
+independently of each other.
 """
 
 import math
@@ -11,7 +11,6 @@ import os
 import uuid
 import warnings
 from collections.abc import Iterable
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,22 +29,26 @@ class Files:
     def __init__(self, place: str | os.PathLike):
         self.place: Path | str = place if isinstance(place, str) and "://" in place else Path(place)
         self._fs, self._root = _opened(self.place) if isinstance(self.place, str) else (None, "")
-        self._folder = Path(self.place)
+        self._folder, self._sizes = Path(self.place), None
 
     def at(self, name: str) -> str:
         """Where a file is, for messages."""
         return f"{str(self.place).rstrip('/')}/{name}"
 
-    def sizes(self) -> dict[str, int]:
-        """The lengths of all files by name, as they are now.
+    def sizes(self, again: bool = False) -> dict[str, int]:
+        """The lengths of all files by name, as they were when they were listed first, or are now with `again`.
 
         **Raises:** `ValueError` for a link, or anything else that is neither a folder nor a file.
         """
+        if self._sizes is not None and not again:
+            return self._sizes
         if self._fs is None:
-            return dict(_in_folder(self._folder))
-        self._fs.invalidate_cache()
-        found = self._fs.find(self._root, detail=True)
-        return {name.removeprefix(self._root).lstrip("/"): about["size"] for name, about in found.items()}
+            self._sizes = dict(_in_folder(self._folder))
+        else:
+            self._fs.invalidate_cache()
+            found = self._fs.find(self._root, detail=True)
+            self._sizes = {name.removeprefix(self._root).lstrip("/"): about["size"] for name, about in found.items()}
+        return self._sizes
 
     def read(self, names: Iterable[str]) -> dict[str, Any]:
         """The contents of some files, each bytes, or the error that it gave."""
@@ -59,6 +62,8 @@ class Files:
 
     def write(self, contents: dict[str, bytes]) -> None:
         """Write files, each whole or not at all."""
+        if self._sizes is not None:
+            self._sizes |= {name: len(content) for name, content in contents.items()}
         if self._fs is not None:
             self._fs.pipe({f"{self._root}/{name}": content for name, content in contents.items()})
             return
@@ -169,29 +174,20 @@ class Spec(NamedTuple):
         )  # fmt: skip
 
 
-class Coder:
-    """The blocks of an array as the bytes of their files, and back."""
+class Encoder:
+    """Makes the files of an array's chunks: zarr writes them in memory."""
 
     def __init__(self, spec: Spec):
         self.spec, self._files = spec, {}
+        self._array = spec.made(self._files)
 
-    @cached_property
-    def _array(self):
-        return self.spec.made(self._files)
-
-    def encoded(self, place: tuple[int, ...], x: np.ndarray) -> bytes:
+    def __call__(self, place: tuple[int, ...], x: np.ndarray) -> bytes:
         """The file of a chunk, at the place that `Spec.key` names; b"" for an empty array."""
         if not self.spec.key():
             return b""
         region = tuple(slice(i * k, i * k + n) for i, k, n in zip(place, self.spec.chunk, x.shape))
         self._array[region] = x
         return self._files.pop(self.spec.key(place)).to_bytes()
-
-    def decoded(self, contents: dict[str, bytes]) -> np.ndarray:
-        """The array whose chunks have these contents, by `Spec.key`; fill values in all others."""
-        from zarr.buffer import cpu
-
-        return self.spec.made({key: cpu.Buffer.from_bytes(content) for key, content in contents.items()})[...]
 
 
 def needed() -> Any:
@@ -219,26 +215,33 @@ def most_of(spec: Spec) -> int:
     return spec.chunk_bytes + spec.chunk_bytes // 64 + 1024
 
 
-def wrong_with(content: Any, spec: Spec) -> str:
-    """What is wrong with the content of a file of a chunk, in words; "" if it can be decoded."""
+def decoded(content: Any, spec: Spec) -> np.ndarray:
+    """The numbers of a file of a chunk, by its content, or by the error that reading it gave.
+
+    No more is made of it than its chunk has numbers for, where zarr would make as much as the file says.
+
+    **Raises:** `Damaged`, which says what is wrong.
+    """
     if isinstance(content, FileNotFoundError):
-        return "is missing"
+        raise Damaged("is missing")
     if isinstance(content, OSError):
-        return f"cannot be read ({content.strerror or content})"
-    if isinstance(content, Exception) or not CHECKSUM < len(content) <= most_of(spec):
-        return "is not as it was written"
-    body = memoryview(content)[:-CHECKSUM]
-    # No more is made of it than its block has numbers for; zarr would make as much as the file says.
-    room = np.zeros(spec.chunk_bytes, np.uint8) if spec.compressed else np.frombuffer(body, np.uint8)
-    try:
-        if checksum_of(body) == ending(content) and len(room) == spec.chunk_bytes:
-            if spec.compressed:
-                _zstd().decode(body, out=room)
-            if spec.dtype.kind != "b" or room.max(initial=0) <= 1:
-                return ""
-    except (ValueError, RuntimeError):
-        pass
-    return "is not as it was written"
+        raise Damaged(f"cannot be read ({content.strerror or content})")
+    if not isinstance(content, Exception) and CHECKSUM < len(content) <= most_of(spec):
+        body = content[:-CHECKSUM]
+        room = np.zeros(spec.chunk_bytes, np.uint8) if spec.compressed else np.frombuffer(body, np.uint8)
+        try:
+            if checksum_of(body) == ending(content) and len(room) == spec.chunk_bytes:
+                if spec.compressed:
+                    _zstd().decode(body, out=room)
+                if spec.dtype.kind != "b" or room.max(initial=0) <= 1:
+                    return room.view(spec.dtype.newbyteorder("<")).reshape(spec.chunk)
+        except (ValueError, RuntimeError):
+            pass
+    raise Damaged("is not as it was written")
+
+
+class Damaged(ValueError):
+    """What is wrong with a file, in words."""
 
 
 def ending(content: bytes) -> int:
@@ -246,14 +249,14 @@ def ending(content: bytes) -> int:
     return int.from_bytes(content[-CHECKSUM:], "little")
 
 
-def checksum_of(data: bytes | memoryview) -> int:
+def checksum_of(data: bytes) -> int:
     """The checksum of some bytes."""
     try:
         # A dependency of zarr, which uses it for the same checksums.
         from google_crc32c import value
     except ImportError as error:
         raise ImportError(NEEDS_ZARR) from error
-    return value(bytes(data))
+    return value(data)
 
 
 def _zstd():

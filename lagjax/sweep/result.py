@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
-from lagjax.display import COLOURS, Page, encoded, film, film_scripts, fragment, in_bytes, labelled
+from lagjax.display import COLOURS, Page, encoded, encoded_once, film, film_scripts, fragment, in_bytes, labelled
 from lagjax.display import plots as plot
 from lagjax.files import Table
 from lagjax.integrate import RESULTS, Trajectory, film_of_lanes
@@ -189,7 +189,7 @@ def _panel(panel: Panel, codes: np.ndarray):
     ran = panel.x[codes != NOT_RUN]
     shared = len(ran) > 0 and np.array_equal(ran, np.broadcast_to(ran[0], ran.shape), equal_nan=True)
     x = ran[0] if shared else panel.x
-    curves = [{"name": name, "y": encoded(y, _precision(y))} for name, y in panel.curves.items()]
+    curves = [{"name": name, "y": encoded_once(y[..., None], _precision(y))} for name, y in panel.curves.items()]
     spec = {"label": panel.label, "across": panel.across, "length": panel.x.shape[1]}
     return spec | {"x": encoded(x, _precision(x)), "curves": curves}
 
@@ -241,13 +241,14 @@ def _film(
             "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds."
         )
     at, points, kept = film_of_lanes(trajs, positions, seconds, rate, trail, [code == EVENT for code in codes])
-    size = BASE64_FACTOR * sum((2 if x.shape[-1] == 2 else 4) * x.size for x in points.values())
+    body, spec = film(at, points, rate, kept)
+    size = sum(len(part.get("xy", part.get("xyz"))[1]) for part in spec["parts"])
     if size > 1e6 * megabytes:
         raise ValueError(
             f"the film would take {in_bytes(size)}, but the page may have {megabytes:g} MB.\n"
             "Fix: fewer points, a lower rate such as rate=10.0, or fewer seconds; or a larger megabytes=..."
         )
-    return film(at, points, rate, kept)
+    return body, spec
 
 
 RESTORED = "Fix: lj.sweep(run, axes, store=path), which restores it."
@@ -368,6 +369,8 @@ class Sweep:
     def plot(self, value: str | Callable | None = None):
         """Draw values over the axes: lines over one, a map over two, a map for each value of the first over three.
 
+        Of two axes, one with up to seven values is drawn as a curve for each of them.
+
         **Arguments:** `value`: the name of a leaf, or a function of `values` that returns an array in the shape of the
         axes; by default every leaf with one number per point. Line plots mark points that are not `ok`; NaN is grey in
         maps. A `Trajectory` over one axis is drawn against time, one curve per point.
@@ -392,6 +395,10 @@ class Sweep:
                 f"a figure can show three axes, and this sweep has {len(axes)}: {', '.join(axes)}.\n"
                 "Fix: choose a part with swept.to_xarray().isel(...) and plot that."
             )
+        if len(axes) == 2 and min(map(len, axes.values())) <= len(plot.COLOURS):
+            (few, values), (name, x) = sorted(axes.items(), key=lambda axis: len(axis[1]))
+            turned = {key: y if few == next(iter(axes)) else y.T for key, y in (panels | {"": self.ok}).items()}
+            return plot.lines(name, x, {key: turned[key] for key in panels}, ~turned[""], (few, values))
         return plot.maps(axes, panels)
 
     def to_html(

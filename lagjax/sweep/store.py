@@ -46,7 +46,7 @@ from lagjax.integrate import (
     trajectory_from,
 )
 from lagjax.sweep.axes import Axes, Blocks
-from lagjax.sweep.engine import LOST, NOT_RUN, Program, Status, is_motion
+from lagjax.sweep.engine import LOST, NOT_RUN, Program, Status, is_motion, nothing
 from lagjax.sweep.labels import flags, motions_in, named_leaves, shapes_of
 from lagjax.sweep.metadata import (
     ANOTHER_FUNCTION,
@@ -63,7 +63,7 @@ from lagjax.sweep.metadata import (
     of_axis,
     restore,
 )
-from lagjax.sweep.objects import CHECKSUM, Coder, Files, Spec, ending, most_of, wrong_with
+from lagjax.sweep.objects import Damaged, Encoder, Files, Spec, decoded, ending, most_of
 from lagjax.system import UnknownSystem
 
 # The largest number of files that a message names.
@@ -112,7 +112,7 @@ class Store:
         self._status: dict[str, str] = {name: places["status"][name] for name in Status._fields}
         names = *self._values.values(), *self._status.values()
         self.arrays: dict[str, Spec] = {name: self._specs[name] for name in names}
-        self._coders: dict[str, Coder] = {}
+        self._encoders: dict[str, Encoder] = {}
 
     @property
     def place(self) -> Any:
@@ -126,17 +126,17 @@ class Store:
 
     def missing(self) -> np.ndarray:
         """The numbers of the blocks that are not marked."""
-        return np.flatnonzero(~self._marks(self.files.sizes()).marked)
+        return np.flatnonzero(~self._marks(self.files.sizes(again=True)).marked)
 
     def _marks(self, sizes: dict[str, int]):
         spec, damaged = self._specs[MARKS], []
         of_files, names = np.zeros(spec.shape, np.uint64), [self._file(MARKS, i) for i in range(len(self.blocks))]
         contents = self.files.read(name for name in names if 0 < sizes.get(name, 0) <= most_of(spec))
         for number, name in enumerate(names):
-            if name in sizes and wrong_with(contents.get(name, b""), spec):
+            try:
+                of_files[number] = decoded(contents.get(name, b""), spec)[0] if name in sizes else 0
+            except Damaged:
                 damaged.append(number)
-            elif name in sizes:
-                of_files[number] = np.frombuffer(contents[name][:-CHECKSUM], "<u8").reshape(spec.chunk[1:])
         return Marks(sizes, of_files, damaged)
 
     def write(self, number: int, values: PyTree, status: Status) -> np.ndarray:
@@ -144,7 +144,7 @@ class Store:
         shape = tuple(x.stop - x.start for x in self.blocks.region(number))
         contents, marks = {}, []
         for name, x in zip(self.arrays, [x for _, x in named_leaves(values)] + list(status)):
-            content = self._coder(name).encoded(self.blocks.place(number), x.reshape(shape + x.shape[1:]))
+            content = self._encoder(name)(self.blocks.place(number), x.reshape(shape + x.shape[1:]))
             marks.append((len(content), ending(content)))
             if content:
                 contents[self._file(name, number)] = content
@@ -152,14 +152,14 @@ class Store:
         return self._mark(number, np.asarray(marks, np.uint64))
 
     def _mark(self, number: int, marks: np.ndarray):
-        content = self._coder(MARKS).encoded((number, 0, 0), marks[None])
+        content = self._encoder(MARKS)((number, 0, 0), marks[None])
         self.files.write({self._file(MARKS, number): content})
         return marks
 
-    def _coder(self, name: str):
-        if name not in self._coders:
-            self._coders[name] = Coder(self._specs[name])
-        return self._coders[name]
+    def _encoder(self, name: str):
+        if name not in self._encoders:
+            self._encoders[name] = Encoder(self._specs[name])
+        return self._encoders[name]
 
     def unmark(self, numbers: Iterable[int]):
         """Mark some blocks as not written."""
@@ -182,7 +182,7 @@ class Store:
         return dict(sorted(found.items()))
 
     def _contents(self, name: str, numbers: Iterable[int], marks: "Marks", read: bool = True):
-        """Yield (number, content, what is wrong) of an array's files in marked blocks; content None without `read`."""
+        """Yield (number, chunk, what is wrong) of an array's files in marked blocks; without `read` of no good ones."""
         spec, which = self._specs[name], [*self.arrays].index(name)
         there, files = [], {i: self._file(name, i) for i in numbers if marks.of_files[i, which, 0] > 0}
         for number, file in files.items():
@@ -200,11 +200,13 @@ class Store:
             some = there[start : start + together]
             contents = self.files.read(files[i] for i in some)
             for number in some:
-                content = contents[files[number]]
-                wrong = wrong_with(content, spec)
-                if not wrong and ending(content) != marks.of_files[number, which, 1]:
-                    wrong = "is not as it was written"
-                yield number, content, wrong and f"{self.files.at(files[number])} {wrong}"
+                try:
+                    chunk, wrong = decoded(contents[files[number]], spec), ""
+                    if ending(contents[files[number]]) != marks.of_files[number, which, 1]:
+                        wrong = "is not as it was written"
+                except Damaged as error:
+                    chunk, wrong = None, str(error)
+                yield number, chunk, wrong and f"{self.files.at(files[number])} {wrong}"
 
     def _file(self, name: str, number: int):
         """The file of a block; "" for an empty array."""
@@ -219,15 +221,12 @@ class Store:
 
     def read(self, number: int) -> list[np.ndarray]:
         """The values of a block, each (points, ...)."""
-        lead, found = len(self.blocks.shape), []
-        shape = tuple(x.stop - x.start for x in self.blocks.region(number))
+        found, shape = [], tuple(x.stop - x.start for x in self.blocks.region(number))
         for name in self._values.values():
-            spec = self._specs[name]._replace(shape=self._specs[name].chunk)
-            file = self._file(name, number)
-            contents = {spec.key(): self.files.read([file])[file]} if file else {}
-            # Blocks at the end of an axis are filled up to their whole shape.
-            x = Coder(spec).decoded(contents)[tuple(map(slice, shape))]
-            found.append(x.reshape(math.prod(shape), *x.shape[lead:]))
+            spec, file = self._specs[name], self._file(name, number)
+            x = decoded(self.files.read([file])[file], spec) if file else np.zeros(spec.chunk, spec.dtype)
+            x = x[tuple(map(slice, (*shape, *spec.shape[len(shape) :])))]
+            found.append(x.reshape(math.prod(shape), *x.shape[len(shape) :]))
         return found
 
     def axes(self) -> Axes:
@@ -242,9 +241,10 @@ class Store:
         place = self.about["places"]["axes"][name]
         spec, x = self._specs[place], None
         file = f"{place}/{spec.key()}"
-        content = self.files.read([file])[file]
-        if not wrong_with(content, spec):
-            x = self._coder(place).decoded({spec.key(): content})
+        try:
+            x = decoded(self.files.read([file])[file], spec)
+        except Damaged:
+            x = None
         if x is None or of_axis(x) != self.about["fingerprint"]["axes"][name]:
             raise ValueError(
                 f"the values of the axis '{name}' in {self.files.at(place)} are damaged.\n"
@@ -270,6 +270,7 @@ class Store:
 
         Values are (points, ...), in the structure of `like` or in a dictionary by name; NaN or 0 in missing blocks.
         """
+        self.files.sizes(again=True)
         named, _, lost = self._read(self._values)
         if like is not None:
             named = jax.tree.unflatten(jax.tree.structure(like), [named[name] for name, _ in named_leaves(like)])
@@ -284,16 +285,16 @@ class Store:
         everywhere = range(len(self.blocks))
         arrays, lost = {}, self.damage(everywhere, False, marks)
         for name, place in places.items():
-            contents = {}
-            for number, content, wrong in self._contents(place, everywhere, marks):
-                if wrong:
-                    lost.setdefault(number, wrong)
-                elif number not in lost:
-                    contents[number] = content
             spec = self.arrays[place]
-            contents = {spec.key(self.blocks.place(number)): content for number, content in contents.items()}
-            found = self._coder(place).decoded(contents)
-            arrays[name] = found.reshape(self.size, *spec.shape[len(self.blocks.shape) :])
+            found, inner = np.full(spec.shape, nothing(spec.dtype), spec.dtype), spec.shape[len(self.blocks.shape) :]
+            for number, chunk, wrong in self._contents(place, everywhere, marks):
+                if chunk is None or wrong:
+                    lost.setdefault(number, wrong)
+                else:
+                    # Blocks at the end of an axis are filled up to their whole shape.
+                    region = self.blocks.region(number)
+                    found[region] = chunk[tuple(slice(x.stop - x.start) for x in region) + tuple(map(slice, inner))]
+            arrays[name] = found.reshape(self.size, *inner)
         missing = set(np.flatnonzero(~marks.marked).tolist()) - {*marks.damaged}
         return arrays, missing, lost
 
@@ -357,6 +358,7 @@ def open_store(
     wanted, place = fingerprint(axes, program, layout), files.place
     if not is_begun(files.sizes()):
         create(files, axes, program, wanted, *new_store())
+        files.sizes(again=True)
     store = Store(files, of_own_sweep=True)
     _check_belongs(place, store.about["fingerprint"], wanted, accept)
     wrong = restore(files, files.sizes(), metadata_of(store.about))

@@ -1,9 +1,9 @@
-"""The entry point of sweeps: compile once, run on all devices, keep what was done; how a store is filled."""
+"""The entry point of sweeps: compile once, run on all devices or workers, keep what was done; how a store is filled."""
 
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,14 +16,16 @@ from jaxtyping import ArrayLike, PyTree
 from lagjax.display import meter
 from lagjax.sweep.axes import Axes, Blocks, axes_of, divided
 from lagjax.sweep.engine import CHUNKS_EACH, GOOD, LAYOUTS, Engine, Program, Status, chunk_length, not_run, usable_cores
+from lagjax.sweep.executor import FEWEST_TASKS, Remote, Stopped
 from lagjax.sweep.labels import labels_of, named_leaves, shapes_of
 from lagjax.sweep.metadata import check_file_names, in_words, versions
 from lagjax.sweep.objects import Files
 from lagjax.sweep.result import Stored, Sweep, of_store
 from lagjax.sweep.store import Store, chunk_of, description_of, open_store, warn_of_damage
 
-# A block of a store is written about this often, and holds no more bytes than this.
-BLOCK_SECONDS, BLOCK_BYTES = 2.0, 256e6
+# A block of a store is written about this often, and holds no more bytes than this. Long sweeps have longer blocks, so
+# that there are no more of them than this.
+BLOCK_SECONDS, BLOCK_BYTES, MOST_BLOCKS = 2.0, 256e6, 10_000
 # The last call of the program for a group of blocks is padded with unused points: at most one call in this many.
 FULL_CHUNKS = 16
 # Two versions may differ by this much, relative to the largest value, before a warning is given.
@@ -51,23 +53,24 @@ def new_store(engine: Any, axes: Axes, shares: int) -> NewStore:
     return NewStore(blocks, _times(engine, axes, one), description_of(engine.program.values, one))
 
 
-def _block(engine: Engine, axes: Axes, shares: int, seconds: float):
+def _block(engine: Any, axes: Axes, shares: int, seconds: float):
     """Points per block: a few seconds' worth, at least `shares` blocks, and no more bytes than allowed."""
     chunk = engine.program.chunk
     wanted = max(1, round(BLOCK_SECONDS * engine.workers / max(seconds, 1e-6))) * chunk
+    wanted = max(wanted, -(-axes.size // (MOST_BLOCKS * chunk)) * chunk)
     fair = max(1, axes.size // (shares * chunk)) * chunk
     fits = max(1, int(BLOCK_BYTES / (engine.program.bytes_of_point * chunk))) * chunk
     return min(wanted, fair, fits)
 
 
-def _times(engine: Engine, axes: Axes, one: PyTree):
+def _times(engine: Any, axes: Axes, one: PyTree):
     labels = labels_of(axes, engine.program.values).values
     named = dict(named_leaves(one))
     times = [key for key, label in labels.items() if label.times and np.ndim(named[key]) == 1]
     return {key: np.asarray(named[key]) for key in times if _is_fixed(engine, axes, key)}
 
 
-def _is_fixed(engine: Engine, axes: Axes, key: str):
+def _is_fixed(engine: Any, axes: Axes, key: str):
     """Whether a leaf of what `run` returns does not depend on the point: `vmap` with `out_axes=None` decides."""
 
     def leaf(point: dict[str, Any]):
@@ -105,8 +108,11 @@ class Filling:
 
 
 def groups_of_blocks(engine: Any, store: Store, numbers: list[int]) -> Iterator[list[int]]:
-    """Groups of blocks to compute together: their points fill the chunks of the program and fit into memory."""
-    points = min(FULL_CHUNKS * engine.program.chunk, int(BLOCK_BYTES / engine.program.bytes_of_point))
+    """Groups of blocks to compute together: their points fill the program's chunks, or a task, and fit into memory."""
+    full = FULL_CHUNKS * engine.program.chunk
+    if isinstance(engine, Remote):
+        full = engine.points_of_task(store.blocks.size(numbers))
+    points = min(full, int(BLOCK_BYTES / engine.program.bytes_of_point))
     group, count = [], 0
     for number in numbers:
         here = store.blocks.points(number)
@@ -121,8 +127,9 @@ def groups_of_blocks(engine: Any, store: Store, numbers: list[int]) -> Iterator[
 
 def compare_versions(engine: Any, store: Store) -> None:
     """If other versions began the store, recompute some of its points and warn if they differ."""
-    stored, number = store.about["fingerprint"], store.first()
-    if stored["program"] == engine.program.digest or number is None:
+    stored = store.about["fingerprint"]
+    number = None if stored["program"] == engine.program.digest else store.first()
+    if number is None:
         return
     indices = np.r_[store.blocks.points(number)][: engine.program.chunk]
     found, status = engine.first(indices)
@@ -164,6 +171,7 @@ def sweep(
     devices: list | None = None,
     sort: bool | None = None,
     workers: int | None = None,
+    on: Any = None,
     progress: bool | None = None,
 ) -> Sweep:
     """Call `run` at every point of a grid, in parallel, and label what it returns.
@@ -188,11 +196,15 @@ def sweep(
 
     **Long sweeps:**
 
-    - `store`: a directory, or any URL that fsspec opens (`"s3://bucket/name"`), to which blocks of points are written as
-      they are finished (zarr). When the same sweep is called again, only missing points are computed; a store of another sweep is refused. Stored files are read once
-      and checked against their checksums; damaged blocks cause a warning and are computed again.
+    - `store`: a directory, or any URL that fsspec opens (`"s3://bucket/name"`), to which blocks of points are written
+      as they are finished (zarr). When the same sweep is called again, only missing points are computed; a store of
+      another sweep is refused. Stored files are read once and checked against their checksums; damaged blocks cause a
+      warning and are computed again.
     - `accept_versions`: continue a store that other versions of lagjax, jax or diffrax began. Whether `run` is still
       the same function is then unknown: a few points are computed again, with a warning if they differ.
+    - `on`: the workers that compute the points, by their executor: a `distributed.Client` of Dask, a pool of processes
+      or of MPI, anything with `submit` and futures. They write to the store themselves. Workers that have other
+      versions are refused. Needs `pip install "lagjax[cluster]"`.
     - `part`: (k, n): this process computes every n-th block from the k-th on; by default taken from `jax.distributed`.
     - `progress`: show points done, rate and time left (tqdm); by default in a terminal or a notebook.
 
@@ -204,7 +216,8 @@ def sweep(
     - `sort`: first run a few points, then all points in the order of the steps they are expected to take, so that a few
       long lanes do not hold up the rest; by default with `"vmap"`, from 16,000 points on.
     - `devices`: JAX devices between which each chunk is split; by default all.
-    - `workers`: chunks computed at the same time; by default one per CPU core, or two.
+    - `workers`: chunks computed at the same time; by default one per CPU core, or two; with `on`, by each of its tasks,
+      one.
 
     A second call compiles nothing if the axes have the same names, shapes and dtypes, whatever their values and
     lengths, and `run` is the same function, or one with the same code that reads the same values from outside.
@@ -220,19 +233,27 @@ def sweep(
             "Fix: lambda point: lj.integrate(system, q0, v0, params | point, ts=ts).q."
         )
     grid = axes_of(axes, paired)
+    if on is not None and devices is not None:
+        raise ValueError("with on= the devices are those of each worker.\nFix: leave devices out.")
     devices = jax.local_devices() if devices is None else list(devices)
-    part = (jax.process_index(), jax.process_count()) if part is None else part
+    here = (jax.process_index(), jax.process_count()) if on is None else (0, 1)
+    part = here if part is None else part
     _check(layout, part, store)
     platform = devices[0].platform
     cores = usable_cores() if platform == "cpu" else 2
-    workers = (cores if len(devices) == 1 else 2) if workers is None else workers
+    if workers is None:
+        workers = 1 if on is not None else cores if len(devices) == 1 else 2
     files = None if store is None else Files(store)
     if chunk is None and files is not None:
         # A store keeps its chunk length, even when it is continued on another number of cores.
         chunk = chunk_of(files)
     if chunk is None:
-        chunk = chunk_length(grid.size, workers, CHUNK.get(platform, CHUNK["gpu"]))
-    engine = Engine(run, grid, chunk, workers, sort, layout, devices, progress)
+        tasks = workers if on is None else FEWEST_TASKS // CHUNKS_EACH
+        chunk = chunk_length(grid.size, tasks, CHUNK.get(platform, CHUNK["gpu"]))
+    if on is None:
+        engine = Engine(run, grid, chunk, workers, sort, layout, devices, progress)
+    else:
+        engine = Remote(on, run, grid, chunk, workers, sort, layout, progress)
     if files is not None:
         labels = labels_of(grid, engine.program.values)
         check_file_names("axis", labels.axes)
@@ -243,7 +264,7 @@ def sweep(
     return _in_store(engine, grid, files, part, accept_versions)
 
 
-def _in_memory(engine: Engine, indices: np.ndarray, before: PyTree):
+def _in_memory(engine: Any, indices: np.ndarray, before: PyTree):
     started, axes = time.perf_counter(), engine.axes
     values, status = not_run(engine.program, axes.size) if before is None else jax.tree.map(np.copy, before)
     done = 0
@@ -257,8 +278,8 @@ def _in_memory(engine: Engine, indices: np.ndarray, before: PyTree):
                     whole[at] = new
                 done += len(positions)
                 shown.update(len(positions))
-        except KeyboardInterrupt:
-            _tell_interrupted(done, len(indices), "swept.resweep() runs the rest.")
+        except (KeyboardInterrupt, Stopped) as why:
+            _tell_interrupted(why, done, len(indices), "swept.resweep() runs the rest.")
     compiling, seconds = engine.seconds_since(started)
     again = _Again((engine.chunk, engine.workers, engine.sort, engine.layout), engine)
     return Sweep(axes, values, status, engine.words, done, compiling, seconds, again)
@@ -267,7 +288,7 @@ def _in_memory(engine: Engine, indices: np.ndarray, before: PyTree):
 class _Again:
     """Runs points of a sweep in memory again; a pickle has neither the engine that ran it nor `run`."""
 
-    def __init__(self, settings: tuple[int, int, bool | None, str], engine: Engine | None = None):
+    def __init__(self, settings: tuple[int, int, bool | None, str], engine: Any = None):
         self._settings, self._engine = settings, engine
 
     def __deepcopy__(self, memo: dict):
@@ -290,7 +311,7 @@ class _Again:
         return _again(swept, engine, which)
 
 
-def _again(swept: Sweep, engine: Engine, which: np.ndarray):
+def _again(swept: Sweep, engine: Any, which: np.ndarray):
     lead = len(swept.axes.shape)
     flat = jax.tree.map(lambda x: x.reshape(swept.axes.size, *x.shape[lead:]), (swept.values, swept.status))
     there, here = shapes_of(swept.values, lead), shapes_of(engine.program.values, 0)
@@ -302,34 +323,42 @@ def _again(swept: Sweep, engine: Engine, which: np.ndarray):
     return _in_memory(engine, which, flat)
 
 
-def _in_store(engine: Engine, axes: Axes, files: Files, part: tuple[int, int], accept_versions: bool):
+def _in_store(engine: Any, axes: Axes, files: Files, part: tuple[int, int], accept_versions: bool):
     started = time.perf_counter()
-    new = partial(new_store, engine, axes, CHUNKS_EACH * part[1])
+    new = partial(new_store, engine, axes, engine.shares * part[1])
     store = open_store(files, axes, engine.program, engine.layout, part, accept_versions, new)
     compare_versions(engine, store)
     k, n = part
     missing = [number for number in store.missing().tolist() if number % n == k]
     done = 0
+    groups = groups_of_blocks(engine, store, missing)
     with _meter(store.blocks.size(missing), engine.progress) as shown:
         try:
-            for numbers in groups_of_blocks(engine, store, missing):
-                filling = Filling(engine, store, numbers)
-                for positions, values, status in engine.over(filling.indices):
-                    filling.take(positions, values, status)
-                    shown.update(len(positions))
-                done += len(filling.indices)
-        except KeyboardInterrupt:
+            for count in engine.fill(store, groups) if isinstance(engine, Remote) else _filled(engine, store, groups):
+                shown.update(count)
+                done += count
+        except (KeyboardInterrupt, Stopped) as why:
             # A block that was written just before the interruption counts as well.
             done = store.blocks.size(set(missing) - set(store.missing().tolist()))
-            _tell_interrupted(done, store.blocks.size(missing), "the same call continues from there.")
+            _tell_interrupted(why, done, store.blocks.size(missing), "the same call continues from there.")
 
     here = f"{engine.words}, in {files.place}"
+    files.sizes(again=True)
     status, _, lost = store.status()
     if lost:
         fix = "Fix: this call without part, or with the part to which these blocks belong."
         warn_of_damage(files.place, lost.values(), fix, stacklevel=3)
     compiling, seconds = engine.seconds_since(started)
     return Sweep(axes, Stored(store, engine.program.values), status, here, done, compiling, seconds, of_store)
+
+
+def _filled(engine: Engine, store: Store, groups: Iterable[list[int]]) -> Iterator[int]:
+    """Compute groups of blocks, and write each block as soon as it is complete; yield the points that are done."""
+    for numbers in groups:
+        filling = Filling(engine, store, numbers)
+        for positions, values, status in engine.over(filling.indices):
+            filling.take(positions, values, status)
+            yield len(positions)
 
 
 def _check(layout: str, part: tuple[int, int], store: Any):
@@ -375,8 +404,9 @@ def _free_memory():
     return fields.get("MemAvailable")
 
 
-def _tell_interrupted(done: int, total: int, then: str):
-    warnings.warn(f"interrupted: {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
+def _tell_interrupted(why: BaseException, done: int, total: int, then: str):
+    words = f"stopped: {why}:" if isinstance(why, Stopped) else "interrupted:"
+    warnings.warn(f"{words} {done:,} of {total:,} points are done and kept; {then}", stacklevel=4)
 
 
 def _meter(total: int, progress: bool | None):

@@ -189,6 +189,17 @@ def test_it_draws_itself():
     assert 0.09 < np.max(np.abs(moved)) <= 0.1 + 1e-12
     with pytest.raises(ValueError, match="not a film"):
         modes[0].animate(lambda t, q, params: (q["R"], q["r"]), seconds=0.0)
+    # Side by side, each in its own time, the slower one first.
+    film = modes.animate(lambda t, q, params: (q["R"], q["r"]), amplitude=0.1)
+    assert isinstance(film.points, dict) and film.t[-1] == pytest.approx(6 * np.pi / float(modes.frequency[0]))
+    for i, (name, points) in enumerate(film.points.items()):
+        off = points[:, 0] - points[:, 0].mean(axis=0)
+        most = off[:, np.argmax(np.ptp(off, axis=0))]
+        swing = np.cos(float(modes.frequency[i]) * film.t)
+        swing -= swing.mean()
+        assert name.startswith(f"{i}: frequency ") and abs(np.corrcoef(most, swing)[0, 1]) > 0.999
+    slow, fast = film.points.values()
+    assert np.max(slow[:, 0, 0]) < np.min(fast[:, 0, 0])
 
 
 # Matrices on the constraint surface; verdicts of forces that are not conservative.

@@ -90,7 +90,7 @@ def test_which_lanes_need_the_robust_program(axes, kinds, compiled, monkeypatch)
     """Lanes that a first program does not settle are those of a robust one, which is compiled only for them."""
     monkeypatch.setattr(engine, "program_of", lambda key, make: make())
 
-    def made(run, axes, chunk, devices, layout, patience, robust):
+    def made(run, axes, chunk, devices, layout, patience, robust, point, compiles=True):
         compiled["robust" if robust else "regular"] += 1
 
         def call(point, count):

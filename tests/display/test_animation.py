@@ -1,14 +1,16 @@
 """A film is one piece of HTML that contains its numbers and needs nothing else."""
 
-import base64
 import re
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from lagjax.display import films
 from lagjax.display.animation import FIELD, MARKED_UP_TO, Animation
-from tests.display.web_page.test_page import told
+from tests.display.web_page.test_page import decoded, told
 
 T = np.linspace(0.0, 2.0, 51)
 CIRCLE = np.stack([3 * np.cos(T), 3 * np.sin(T)], axis=1)[:, None]
@@ -24,10 +26,7 @@ def page():
 def numbers(page):
     """The data of the script, one array (F, k, 2) per part."""
     film = told(page)
-    decoded = lambda part: np.frombuffer(base64.b64decode(part["xy"][1]), "<i2").reshape(
-        film["frames"], part["points"], 2
-    )
-    return [decoded(part) for part in film["parts"]]
+    return [decoded(part["xy"], film["frames"], part["points"], 2) for part in film["parts"]]
 
 
 def picture(page):
@@ -72,8 +71,8 @@ def test_outlines_have_no_marks():
 def test_saves_a_page(tmp_path, page):
     """The saved page contains the same film, which needs nothing from outside."""
     Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.html")
-    with pytest.raises(ValueError, match=r'(?s)would be no .gif file.*Fix: .save."motion.html"'):
-        Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.gif")
+    with pytest.raises(ValueError, match=r'(?s)would be no .avi file.*Fix: .save."motion.html"'):
+        Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.avi")
     text = (tmp_path / "motion.html").read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>") and page in text and len(page) < 15_000
     assert re.findall(r"(?:src|href|url|import|fetch)\b", page) == []
@@ -90,3 +89,27 @@ def test_any_size(size):
     data = told(Animation(T, in_space, 25.0, 10)._repr_html_())
     assert np.isfinite(data["view"]["scale"]) and len({label for _, label in data["grid"]["x"]}) >= 3
     assert told(Animation(T[:1], {"": in_space[""][:1]}, 25.0, 10)._repr_html_())["frames"] == 1
+
+
+def test_a_film_of_pixels(tmp_path, monkeypatch):
+    """A GIF has all frames at its rate; a dot is where its point is, in its colour; MP4 says what it needs."""
+    few = slice(0, 51, 25)
+    Animation(T[few], {"": POINTS["tip"][few]}, 25.0, 10).save(tmp_path / "motion.gif")
+    with Image.open(tmp_path / "motion.gif") as film:
+        assert (film.format, getattr(film, "n_frames"), film.info["duration"]) == ("GIF", 3, 40)
+        places = []
+        for i in range(3):
+            film.seek(i)
+            off = np.asarray(film.convert("RGB"), float) - [0x00, 0x72, 0xB2]
+            rows, columns = np.nonzero(np.abs(off).max(axis=2) < 20)
+            places.append((columns.mean(), -rows.mean()))
+    way, of_dot = np.diff(places, axis=0), np.diff(POINTS["tip"][few, 0], axis=0)
+    np.testing.assert_allclose(way / way[0, 1], of_dot / of_dot[0, 1], atol=0.05)
+    in_space = {"": np.concatenate([CIRCLE, CIRCLE[..., :1]], axis=-1)[few]}
+    Animation(T[few], in_space, 25.0, 10).save(tmp_path / "space.gif")
+    with Image.open(tmp_path / "space.gif") as film:
+        assert getattr(film, "n_frames") == 3
+    monkeypatch.setattr(films, "which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ValueError, match=r'Fix: pip install imageio-ffmpeg, .* or .save."motion.gif"'):
+        Animation(T, POINTS, 25.0, 10).save(tmp_path / "motion.mp4")

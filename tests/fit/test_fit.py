@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 import lagjax as lj
 from lagjax.fit.result import caveats
 from lagjax.scenes import rolling_hoop
+from tests import systems
 from tests.counting import compiles
 from tests.fit.cases import CASES, FREE, GUESS, HUNG, PENDULUM, TS, hung, noisy, pendulum, swing, swung
 
@@ -43,6 +44,22 @@ def test_finds_parameters_and_start(swinging, capsys):
     course = engine._course(found.problem, True, False, np.zeros((0, 2)), False)
     with engine._step_meter(found.problem, course, False) as tell:
         assert not tell
+
+
+@pytest.mark.slow
+def test_the_curve_goes_across_gaps():
+    """Without samples in the middle, as NaN or left out, the curve is the motion there; twin: not the chord."""
+    ts = np.linspace(0.0, 6.0, 61)
+    system, params = systems.pendulum, systems.PARAMS
+    q = np.array(lj.integrate(system, 1.0, 0.0, params, ts=ts).q)
+    missing, full = (ts > 2.0) & (ts < 4.0), q.copy()
+    q[missing] = np.nan
+    for record in (lj.Record(ts, q=q), lj.Record(ts[~missing], q=q[~missing])):
+        found = lj.fit(system, record, params | {"g": 9.0}, free="g", progress=False)
+        _, line, *_ = found.plot().axes[0].lines
+        t, drawn = np.asarray(line.get_data())[:, :-1]
+        np.testing.assert_allclose(np.interp(ts, t, drawn)[missing], full[missing], atol=1e-3)
+    assert np.max(np.abs(np.interp(ts, ts[~missing], full[~missing]) - full)) > 0.5
 
 
 def test_prints_and_plots(swinging, monkeypatch):

@@ -182,3 +182,33 @@ def test_a_program_that_ended_a_process(place):
     with folder.tried(place, DIGEST) as entry:
         assert entry is None
     assert not mark.exists() and found(place) is None
+
+
+AT_ONCE = """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("folder", sys.argv[1])
+folder = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(folder)
+path, digest, program = folder.Path(sys.argv[2]), sys.argv[3], bytes(range(256)) * 40
+for turn in range(8):
+    with folder.tried(path, digest) as entry:
+        if entry is not None and (entry[0]["name"] != "motion" or bytes(entry[1]) != program):
+            sys.exit(f"turn {turn}: {entry[0]}")
+    if entry is None or turn % 3 == 0:
+        folder.write(path, digest, {"name": "motion"}, program)
+    if turn == 4:
+        folder.drop(path, 0)
+"""
+
+
+@pytest.mark.slow
+def test_many_processes_on_one_entry(tmp_path):
+    """Two hundred processes read, write and drop one program at once; each reads a whole one, or none."""
+    path = tmp_path / "programs"
+    path.mkdir(mode=0o700)
+    ask = [sys.executable, "-c", AT_ONCE, str(folder.__file__), str(path), DIGEST]
+    started = [subprocess.Popen(ask, stderr=subprocess.PIPE, text=True) for _ in range(200)]
+    said = [process.communicate()[1] for process in started]
+    assert [process.returncode for process in started] == [0] * 200, said
+    left = {file.name for file in path.iterdir()}
+    assert left <= {DIGEST + folder.SUFFIX} and folder.read(path, DIGEST) is not None

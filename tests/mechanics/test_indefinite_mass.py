@@ -1,11 +1,14 @@
 """A mass matrix with an eigenvalue below zero is named, with its numbers; what only touches zero is not."""
 
+import warnings
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lagjax as lj
-from lagjax.mechanics import indefinite_mass
+from lagjax.mechanics import indefinite_in_words, indefinite_mass
 from lagjax.system import coordinates, model_of
 
 
@@ -57,7 +60,47 @@ def test_negative_from_the_start_is_no_crossing():
     assert said(opposite, *states, {"held": lj.Holonomic(lambda t, q, params: q[1])}) is None
 
 
+def test_what_is_said_at_a_start():
+    """Negative definite or indefinite, by the name of the worst coordinate; twins: definite, or so where it is free.
+
+    The last one has positive 2 x 2 minors, and the eigenvalue 1 - 2 * 0.6.
+    """
+    hold, free = np.array([[0.0, 1.0]]), np.zeros((0, 2))
+    of = lambda mass, rows=free: indefinite_in_words(np.asarray(mass), rows, lambda: ["a", "b", "c"]) or ""
+    assert not of(np.diag([1.0, 2.0])) and not of(np.diag([1.0, -2.0]), hold) and not of(np.diag([1.0, 0.0]))
+    assert "is negative definite where" in of(np.diag([-1.0, -2.0])) and "L = V - T" in of([[-1.0]], np.zeros((0, 1)))
+    assert "not positive definite where the motion starts: its smallest eigenvalue is -2, most in 'b'" in of(
+        np.diag([1.0, -2.0])
+    )
+    assert "is -0.2" in of(1.6 * np.eye(3) - 0.6, np.zeros((0, 3)))
+    assert not of(np.diag([1.0, np.nan])) and "'b'" in of(np.diag([1.0, -2.0]), hold[:, ::-1])
+    single = np.float32([[1.0, 1.0], [1.0, 1.0 - 1e-7]])
+    assert not of(single) and of(np.asarray(single, float))
+    again = lambda mass: indefinite_in_words(mass, free, lambda: ["a", "b"], again=True)
+    assert again(np.diag([1.0, -2.0])) is not None and again(np.array([[1.0, 2.0], [2.0, 1.0]])) is None
+
+
 @pytest.mark.slow
+def test_a_motion_warns_once():
+    """A mass below zero warns at the first motion of its kind, and by params at a later one; twin: above it never."""
+    ball, ts = lj.System(lambda t, q, v, p: 0.5 * p["m"] * v**2 - q), np.array([0.0, 1.0])
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        traj = lj.integrate(ball, 0.0, 0.0, {"m": 2.0}, ts=ts)
+        assert given == []
+        up = lj.integrate(ball, 0.0, 0.0, {"m": -2.0}, ts=ts)
+        lj.integrate(ball, 0.0, 0.0, {"m": -3.0}, ts=ts)
+        (one,) = given
+        assert "negative definite" in str(one.message) and one.filename == __file__
+        jax.jit(lambda m: lj.integrate(ball, 0.0, 0.0, {"m": m}, ts=ts).q)(-2.0)
+    assert len(given) == 1 and float(up.q[-1]) == -float(traj.q[-1]) == 0.25
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the mass matrix is")
+        lj.integrate(lj.System(lambda t, q, v, p: -0.5 * v**2), 0.0, 1.0, ts=ts)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the mass matrix is")
 def test_the_message_of_a_motion_that_meets_it():
     """½ q v² from (1, -1) ends at t = 2/3; twins: a collision with positive mass, a stiff system with negative."""
     ts = np.array([0.0, 2.0])

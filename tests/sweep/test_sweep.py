@@ -185,12 +185,17 @@ def test_whole_trajectories(released):
 
 
 def test_repr_and_pictures(released):
-    """repr shows counts by status and the hardest point; plots are a line, a map or small multiples, or an error."""
+    """repr shows counts by status and the hardest point; plots are lines, a map or small multiples, or an error."""
     swept = quiet(lambda point: {"end": jnp.sqrt(point["g"] - 2 * point["angle"])})
     shown = repr(swept)
     for part in ("21: g (3) x angle (7)", "successful", "The state became NaN", "first not ok", "points/s"):
         assert part in shown
-    assert len(swept.plot().axes) == 2
+    (panel,) = swept.plot().axes
+    shown = [text.get_text() for text in panel.get_legend().get_texts()]
+    assert panel.get_xlabel() == "angle" and shown == ["g = 1", "not ok", "g = 4", "g = 9"]
+    np.testing.assert_array_equal(panel.lines[0].get_ydata(), swept.values["end"][0])
+    many = quiet(lambda p: p["a"] * p["b"], {"a": np.arange(8.0), "b": np.arange(9.0)})
+    assert len(many.plot().axes) == 2
     assert len(quiet(lambda point: point["g"] ** 2, {"g": np.arange(5.0)}).plot().axes) == 1
     three = quiet(lambda p: p["a"] * p["b"] * p["c"], {k: np.arange(1.0, 4.0) for k in "abc"})
     assert len(three.plot().axes) == 4

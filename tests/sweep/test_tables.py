@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
+from lagjax.sweep.objects import Files
 from lagjax.sweep.store import Store
 
 AXES = {"k": np.arange(1, 4), "x": np.linspace(0.1, 1.0, 7), "w": np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])}
@@ -101,7 +102,7 @@ def test_paired_axes(tmp_path):
 
 def test_blocks_end_with_the_axes(store):
     """Blocks are boxes with consecutive flat indices that cover the grid once; the last of a row may be shorter."""
-    blocks = Store(store).blocks
+    blocks = Store(Files(store)).blocks
     lengths = {x.stop - x.start for x in map(blocks.points, range(len(blocks)))}
     assert blocks.block == (1, 4, 2) and lengths == {6, 8}
     indices = np.arange(42).reshape(blocks.shape)

@@ -1,6 +1,5 @@
 """The page of a sweep contains the values of every lane, and says what failed and what is left out."""
 
-import base64
 import re
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import lagjax as lj
-from tests.display.web_page.test_page import told
+from tests.display.web_page.test_page import decoded, told
 from tests.systems import motion
 
 AXES = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array([-1, 0, 4, 9])}
@@ -37,7 +36,7 @@ def swept():
 def array(encoded, dtype, *shape):
     """Decode an array of the page, and check its dtype."""
     assert encoded[0] == dtype
-    return np.frombuffer(base64.b64decode(encoded[1]), f"<{dtype}").reshape(shape)
+    return decoded(encoded, *shape)
 
 
 def test_the_values_of_every_lane(swept):

@@ -97,7 +97,8 @@ def solved(
     system: System, q0: PyTree, v0: PyTree, params: PyTree, ts: Float[Array, " T"], guards: Guards | None,
     settings: Settings, adjoint: diffrax.AbstractAdjoint, sizes_so_far: Float[Array, "2 n"] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the fields of the trajectory of one system by name, with `settled`: whether the robust solve would agree.
+    """Return the fields of the trajectory of one system by name; with `settled`, whether the robust solve would agree,
+    and `whole`, M and A at the start.
 
     `sizes_so_far` (2, n): the largest coordinates and velocities of the earlier legs, where this is not the first one.
     """
@@ -142,7 +143,8 @@ def solved(
 class Start(NamedTuple):
     """The first state, moved onto the constraints; `against`: which reasons to refuse it hold, by names of `RESULTS`.
 
-    `atol`: as given, or by the state's size; `scales`: those of the motion, if tolerances are relative to its size.
+    `atol`: as given, or by the state's size; `scales`: those of the motion, if tolerances are relative to its size;
+    `whole`: M and A, where they are formed.
     """
 
     q: PyTree[Float[Array, "..."]]
@@ -151,6 +153,7 @@ class Start(NamedTuple):
     refused: Bool[Array, ""]
     atol: Float[Array, " 2"]
     scales: Scales | None
+    whole: tuple[Float[Array, "n n"], Float[Array, "m n"]] | None
 
 
 def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Settings, sizes_so_far) -> Start:
@@ -163,7 +166,7 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
         if project:
             q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
         verdict = equations.verdict(t, q, v)
-    a, _, finite, singular, contradictory, mass, known = stop_gradient(verdict)
+    a, _, finite, singular, contradictory, mass, known, whole = stop_gradient(verdict)
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
         off_constraints = ~within(equations, *given[:3], START_TOLERANCES * rtol, START_TOLERANCES * atol, known)
@@ -187,7 +190,7 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
         "tolerance_too_small": jnp.asarray(too_small),
         "unordered": jnp.any(ts[1:] < ts[:-1]) | ~jnp.all(jnp.asarray([True, *(length > 0 for length in lengths)])),
     }
-    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), atol, scales)
+    return Start(q, v, against, jnp.any(jnp.stack([*against.values()])), atol, scales, whole)
 
 
 class Solution(NamedTuple):
@@ -386,6 +389,7 @@ def _result(equations: Equations, start: Start, solution: Solution, outputs, gua
         "tolerance": (settings.rtol, _absolute(stop_gradient((motion.q, motion.v)), start.scales, settings)),
         "scaled_error": jnp.where(ended_well(result), change, jnp.inf),
         "result": result,
+        "whole": start.whole,
         "settled": ended_well(result) | _among(result, UNAFFECTED) if regular else jnp.asarray(True),
         "events": {} if located is None else by_name(guards, located, end.t[None], ~start.refused),
     }

@@ -52,9 +52,9 @@ from lagjax.jaxtools import (
     stop_gradient,
     takes_for_regular,
 )
-from lagjax.mechanics import has_networks, is_free_of_velocities
+from lagjax.mechanics import has_networks, indefinite_in_words, is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Nystrom8, Nystrom12, Tsit5, evaluations_a_step, in_our_form
-from lagjax.system import Model, State, model_of, replace_fields
+from lagjax.system import Model, State, model_of, replace_fields, warn
 
 # The adjoints that can differentiate our methods as they do diffrax's own.
 FOLLOWED = type(None), diffrax.ForwardMode, diffrax.RecursiveCheckpointAdjoint, diffrax.DirectAdjoint
@@ -82,10 +82,13 @@ def trajectory_of(problem: Problem) -> Trajectory:
     arrays, static = of(settings)
     programs = program_of((_Programs, static), lambda: _Programs(static, len(ts), not _may_hold_too_much(problem)))
     try:
-        found = programs.run(arrays, len(ts), shown)
+        found, whole = programs.run(arrays, len(ts), shown)
+        if whole is not None and not programs.has_warned:
+            programs.has_warned = _warned_of_mass(whole, problem, programs.has_looked)
+            programs.has_looked = True
         if not settings.repeated_up_to:
             return found
-        return with_errors(lambda s: programs.run(of(s)[0], len(ts), shown, settled=True), found, settings, ts)
+        return with_errors(lambda s: programs.run(of(s)[0], len(ts), shown, settled=True)[0], found, settings, ts)
     except jax.errors.JaxRuntimeError:
         return _trajectory_of(problem)[0]
 
@@ -110,11 +113,18 @@ def _inside(problem: Problem) -> Trajectory:
 def _traced(problem: Problem, regular: bool, repeats: bool) -> Trajectory:
     settings = replace(problem.settings, robust=not regular)
     problem = problem._replace(settings=settings)
-    found, settled = _trajectory_of(problem)
+    found, settled, _ = _trajectory_of(problem)
     if repeats:
         still = stop_gradient(problem[:-1])
         found = with_errors_inside(lambda s: _trajectory_of(Problem(*still, s))[0], found, settings, problem.ts)
     return report_settled(found, settled) if regular else found
+
+
+def _warned_of_mass(whole: tuple, problem: Problem, again: bool) -> bool:
+    """Whether the mass matrix at the start is not positive definite; and say so."""
+    if words := indefinite_in_words(*whole, lambda: model_of(problem.system, *problem.start).names, again):
+        warn(words, UserWarning)
+    return bool(words)
 
 
 def _may_hold_too_much(problem: Problem) -> bool:
@@ -126,7 +136,7 @@ def _may_hold_too_much(problem: Problem) -> bool:
 
 class _Programs:
     """The programs of one kind of motion: with the equations assumed regular (None once they turned out not to be), and
-    with the robust solve."""
+    with the robust solve. `has_looked`, `has_warned`: at, and of, a mass matrix that is not definite."""
 
     def __init__(self, static: HashablePart, count: int, regular: bool):
         def of(robust: bool) -> KeptProgram:
@@ -135,37 +145,39 @@ class _Programs:
 
         self.regular: KeptProgram | None = of(False) if regular else None
         self.robust = of(True)
+        self.has_looked = self.has_warned = False
 
     @as_usual
-    def run(self, arrays: list, count: int, shown: bool | None, settled: bool = False) -> Trajectory:
+    def run(self, arrays: list, count: int, shown: bool | None, settled: bool = False) -> tuple[Trajectory, Any]:
         """The trajectory with `count` outputs, by the robust solve if it is not settled; unless `settled` is given.
+        And M and A at its start, where they are formed.
 
         A program announces that it compiles, as `shown` says (see `waiting`).
         """
         while True:
             program = self.regular or self.robust
             with nullcontext() if program.is_ready else waiting(shown, "compiling"):
-                found, rows, well = program(arrays)
+                found, rows, well, whole = program(arrays)
             if program is self.robust:
                 jax.block_until_ready((found, rows))
             if program is self.robust or settled or well:
                 break
             self.regular = None
         if len(found.t) == count:
-            return found
+            return found, whole
         # In NumPy: JAX would compile a program for each number of outputs.
-        return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows)))
+        return replace(found, **jax.device_put(jtu.tree_map(lambda x: np.asarray(x)[:count], rows))), whole
 
 
 def _of_arrays(static: HashablePart, robust: bool, count: int, arrays: list):
-    """The trajectory with the first `count` outputs, all padded outputs, and whether it is settled."""
+    """The trajectory with the first `count` outputs, all padded outputs, whether it is settled, and M and A."""
     problem = Problem(*static.combine(arrays))
     # With guards to be watched a program is long anyway, and compiles a third faster without copies.
     unroll_up_to = 0 if problem.system.in_phases else UNROLL_AT_ONCE_UP_TO
     settings = replace(problem.settings, robust=robust, unroll_up_to=unroll_up_to)
-    found, settled = one_by_one(_trajectory)(problem._replace(settings=settings))
+    found, settled, whole = one_by_one(_trajectory)(problem._replace(settings=settings))
     rows = found.rows()
-    return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled
+    return replace(found, **jtu.tree_map(lambda x: x[:count], rows)), rows, settled, whole
 
 
 # The classes of what a motion gives, besides those of the user's states.
@@ -219,7 +231,7 @@ def _trajectory_of(problem: Problem):
 
 
 def _trajectory(problem: Problem):
-    """The trajectory, and whether it is settled: the robust solve would give the same."""
+    """The trajectory; whether it is settled, as the robust solve would give the same; and M and A where it starts."""
     system, *motion, settings = problem
     start, model = problem.start, model_of(system, *problem.start)
     s, method = settings, method_of(settings, model)
@@ -266,9 +278,9 @@ def _trajectory(problem: Problem):
     else:
         fields, _ = solve_arrays(x, fixed, settings.adjoint, True)
     arrays, described = _described(problem, how)
-    settled = fields.pop("settled")
+    settled, whole = fields.pop("settled"), fields.pop("whole", None)
     of = HybridTrajectory if system.in_phases else Trajectory
-    return of(t=problem.ts, **fields, arrays=arrays, static=described), settled
+    return of(t=problem.ts, **fields, arrays=arrays, static=described), settled, whole
 
 
 def followed(settings: Settings, model: Model, start: State) -> list[Jumps | None]:

@@ -1,6 +1,5 @@
 """A film in space is one piece of HTML: its numbers are the poses, its first frame stands without a script."""
 
-import base64
 import re
 import xml.etree.ElementTree as ET
 
@@ -9,7 +8,7 @@ import pytest
 
 from lagjax.display import CUBE, SPHERE, Anchor, Animation, InSpace, Shape, film, film_scripts, stills_in_space
 from lagjax.display.painting import marks, trails, view_of
-from tests.display.web_page.test_page import NASTY, told
+from tests.display.web_page.test_page import NASTY, decoded, told
 
 T = np.linspace(0.0, 2.0, 51)
 TURN = np.stack([np.cos(T), 0 * T, 0 * T, np.sin(T)], axis=1)
@@ -34,11 +33,6 @@ def page():
     return Animation(T, MOTION, 25.0, 10)._repr_html_()
 
 
-def numbers(pair, *shape):
-    """An array of the script's data."""
-    return np.frombuffer(base64.b64decode(pair[1]), f"<{pair[0]}").reshape(shape)
-
-
 def test_needs_nothing_from_outside(page):
     """No URL except the SVG namespace, no name that ends the script; each shape and surface is there once."""
     assert re.findall(r"(?:src|href|url|import|fetch)\b", page) == []
@@ -52,11 +46,11 @@ def test_needs_nothing_from_outside(page):
 def test_numbers_are_the_motion(page):
     """Poses and points to single precision; the anchors by the numbers of their bodies."""
     data = told(page)
-    found = numbers(data["poses"], 51, 2, 7)
+    found = decoded(data["poses"], 51, 2, 7)
     known = np.stack(list(POSES.values()), axis=1)
     np.testing.assert_allclose(found[..., :3], known[..., :3], rtol=1e-7)
     np.testing.assert_allclose(found[:, 0, 3:], TURN, rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(numbers(data["parts"][0]["xyz"], 51, 1, 3), POINTS["tip"], rtol=1e-7)
+    np.testing.assert_allclose(decoded(data["parts"][0]["xyz"], 51, 1, 3), POINTS["tip"], rtol=1e-7)
     assert [a["body"] for a in data["shapes"][2]["anchors"]] == [None, 1]
 
 
@@ -73,7 +67,7 @@ def test_several_lanes():
     """Points by lane, NaN in one without a motion, which has no say in the size; the plane keeps its script."""
     lanes = {"": np.stack([POINTS["tip"], np.full_like(POINTS["tip"], np.nan)])}
     _, data = film(T, lanes, 25.0, 10)
-    found = numbers(data["parts"][0]["xyz"], 2, 51, 1, 3)
+    found = decoded(data["parts"][0]["xyz"], 2, 51, 1, 3)
     assert np.isnan(found[1]).all() and np.isfinite(data["view"]["scale"]) and "space.js" in film_scripts(data)
     _, plane = film(T, {"": lanes[""][..., :2]}, 25.0, 10)
     assert "film.js" in film_scripts(plane) and "space.js" not in film_scripts(plane)
