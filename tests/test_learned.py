@@ -1,6 +1,7 @@
 """The tools for learned Lagrangians, and the pitfalls that they avoid."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -169,7 +170,7 @@ def test_a_missing_force_is_found_from_unfitted_starts():
     params = {"force": Network((1.0, 2.0), key=jax.random.key(1), width=32, depth=2)}
     cut = {"window": 1.0, "joined": False, "rtol": 1e-6, "atol": 1e-6}
     loss = lj.fit_loss(system, records, params, **cut)
-    adam = optax.scale_by_adam()
+    adam: Any = optax.scale_by_adam()
 
     @jax.jit
     def train(unknowns, rate):
@@ -186,7 +187,8 @@ def test_a_missing_force_is_found_from_unfitted_starts():
         return jax.lax.scan(step, (unknowns, adam.init(unknowns)), (keys, decay))[0][0]
 
     def missed(unknowns):
-        force = jax.vmap(lambda q, v: loss.params(unknowns)["force"]((q, v)))(q[30:].ravel(), v[30:].ravel())
+        found: Any = loss.params(unknowns)
+        force = jax.vmap(lambda q, v: found["force"]((q, v)))(q[30:].ravel(), v[30:].ravel())
         true = friction(q[30:].ravel(), v[30:].ravel())
         return np.sqrt(np.mean((force - true) ** 2) / np.mean(true**2))
 
