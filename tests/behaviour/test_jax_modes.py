@@ -165,7 +165,7 @@ def test_all_doors_under_strict_promotion():
     assert np.allclose(slopes[2], -0.8 * np.sin(1.6) / 4, rtol=1e-6)
     assert np.allclose(swept, np.cos([0.9, 1.8]), atol=1e-7)
     assert np.isclose(found.params["k"], 4.0, rtol=1e-4) and all(np.isfinite(x).all() for x in slope)
-    assert np.allclose(rest.q, 0.0, atol=1e-9) and np.allclose(swings.frequencies, 2.0)
+    assert np.allclose(rest.q, 0.0, atol=1e-9) and np.allclose(swings.frequency, 2.0)
     # It falls for sqrt(2 / g), and rises at half the speed.
     rise = lambda g: 0.5 * np.sqrt(2 * g) * (0.6 - np.sqrt(2 / g)) - 0.5 * g * (0.6 - np.sqrt(2 / g)) ** 2
     assert np.isclose(bounced, rise(9.81), atol=1e-7)
