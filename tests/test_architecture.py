@@ -155,7 +155,7 @@ def lines_of_code(source):
     tree, told = tree_of(source), set()
     for node in (tree, *of_kind(source, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
         if ast.get_docstring(node, clean=False) is not None:
-            told |= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+            told |= set(range(node.body[0].lineno, int(node.body[0].end_lineno or 0) + 1))
     layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
     tokens = [x for x in tokenize.generate_tokens(io.StringIO(source).readline) if x.type not in layout]
     return len({line for x in tokens for line in range(x.start[0], x.end[0] + 1)} - told)

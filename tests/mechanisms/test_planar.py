@@ -19,7 +19,7 @@ def test_andrews_against_the_printed_equations():
     """M, f, g, G and the acceleration level from the Lagrangian are Hairer & Wanner's at a random state."""
     rng = np.random.default_rng(5)
     q, v = rng.uniform(-1, 1, 7), rng.uniform(-100, 100, 7)
-    params = andrews.params
+    params = dict(andrews.params)
     mass, force, jacobian, gamma = equations(andrews, q=Angles(*q), v=Angles(*v))
     M, f, g, G = published.andrews(q, v, params)
     G_rate = published.andrews(q + 1e-30j * v, v + 0j, params)[3].imag / 1e-30
@@ -59,7 +59,7 @@ def test_driven_crank():
 
 def test_torque_of_the_motor():
     """At a state the motor's multiplier is the closed form's torque."""
-    params = driven_crank.params | {"rate": 3.0}
+    params = dict(driven_crank.params) | {"rate": 3.0}
     q, v, torque = driven_crank_exact(0.3, params)
     found = at_a_state(driven_crank.system, 0.3, q, v, params).multipliers["motor"]
     np.testing.assert_allclose(found, torque, rtol=1e-12)

@@ -43,7 +43,7 @@ def test_bricard_has_one_constraint_too_many():
 
 def test_its_accelerations():
     """At a state off its start, and in motion, slider and balls accelerate as the two equations have it."""
-    p, parts = governor.params | {"k": 50.0, "c": 3.0}, GovernorParts
+    p, parts = dict(governor.params) | {"k": 50.0, "c": 3.0}, GovernorParts
     tree = lambda x: parts(x[0], x[1], x[2:5], x[5:])
     field, y = published.governor_field(p), np.array([0.4, 0.7, 0.45, 1.5, -0.8])
     found = at_a_state(governor.system, 0.0, *map(tree, published.governor_state(p, field, y)), p).a

@@ -37,7 +37,7 @@ def test_throws(system):
     found = lj.connect(system, START, TARGET, 0.0, 1.0, 10.0, starts=6)
     ups = [float(x.start_velocity["y"]) for x in (found, *found.others)]
     np.testing.assert_allclose([height(up, 10.0) for up in ups], 0.3, atol=1e-12)
-    assert sorted(len(x.trajectory.switches) for x in (found, *found.others)) == [0, 1, 1]
+    assert sorted(len(getattr(x.trajectory, "switches")) for x in (found, *found.others)) == [0, 1, 1]
     assert abs(height(ups[1], 10.1) - 0.3) > 1e-3
     assert found.converged and "there are" in found.kind and np.isnan(found.action)
 

@@ -1,5 +1,7 @@
 """Elements in phases of a hybrid: contacts, friction and sampled controls that are there in some phases only."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +29,7 @@ off_ice = lj.Hybrid({"ice": lj.System(kinetic), "rough": rough}, [lj.Switch("ice
 def test_a_block_that_leaves_friction():
     """It is braked by 2 until 0.5, and then goes on as fast as it is there. Twin: friction stays."""
     ts = np.array([0.0, 0.1, 2.0])
-    traj = lj.integrate(onto_ice, 0.0, 3.0, 0.5, ts=ts)
+    traj: Any = lj.integrate(onto_ice, 0.0, 3.0, 0.5, ts=ts)
     fast = np.sqrt(9 - 2 * ROUGH * 0.5)
     leaves = (3 - fast) / ROUGH
     np.testing.assert_allclose(traj.q, [0.0, 0.3 - 0.01, 0.5 + fast * (2 - leaves)], rtol=1e-13)
@@ -39,7 +41,7 @@ def test_a_block_that_leaves_friction():
 def test_a_block_that_enters_friction():
     """It slides from 0.5 on, and sticks at 0.5 + v²/4; between outputs, in derivatives and in the ledger too."""
     ts = np.array([0.0, 0.1, 2.0])
-    traj = lj.integrate(off_ice, 0.0, 2.0, 0.5, ts=ts)
+    traj: Any = lj.integrate(off_ice, 0.0, 2.0, 0.5, ts=ts)
     np.testing.assert_allclose(traj.q, [0.0, 0.2, 1.5], rtol=1e-13)
     np.testing.assert_allclose(np.asarray(traj.switches.t)[:2], [0.25, 1.25], rtol=1e-13)
     np.testing.assert_array_equal(traj.modes, [[-1], [-1], [2]])
@@ -93,7 +95,7 @@ def test_two_floors():
         return lj.integrate(two_floors, *given, d, ts=ts, start=start, throw=False, estimate_error=False)
 
     d, start = np.array([0.2, 0.9, 1.05, 1.05]), np.array([0, 0, 0, 1])
-    found = run(d, start)
+    found: Any = run(d, start)
     right = [[height(t, 0.8, x) for t in ts] for x in (*d[:3], 0.0)]
     np.testing.assert_allclose(found.q["y"], right, atol=1e-11)
     np.testing.assert_array_equal(found.phase[:, 1], [1, 0, 0, 1])
@@ -161,7 +163,7 @@ kicked = lj.Hybrid(
 def test_a_kick_of_a_block_that_rests(up, way):
     """A reset on a closed contact: it slides at once; or flies for 2 up/g, and is slowed by μ up as it lands."""
     at_rest = {"x": 0.0, "y": 0.0}
-    traj = lj.integrate(kicked, at_rest, at_rest, up, ts=np.array([0.0, 0.4, 0.6, 3.0]))
+    traj: Any = lj.integrate(kicked, at_rest, at_rest, up, ts=np.array([0.0, 0.4, 0.6, 3.0]))
     np.testing.assert_allclose(traj.q["x"], [0.0, 0.0, 0.15 - 0.015 * (up == 0), way], rtol=1e-12)
     np.testing.assert_array_equal(traj.modes[1:3, 2], [-1, int(up == 0)])
 
@@ -183,7 +185,7 @@ def test_derivatives_through_two_floors():
 def test_kept_and_said(tmp_path):
     """A file, a table and an explanation know the elements of phases; a coefficient below zero is refused by name."""
     at_rest = {"x": 0.0, "y": 0.0}
-    traj = lj.integrate(kicked, at_rest, at_rest, 2.0, ts=np.array([0.0, 0.4, 3.0]))
+    traj: Any = lj.integrate(kicked, at_rest, at_rest, 2.0, ts=np.array([0.0, 0.4, 3.0]))
     traj.save(tmp_path / "kick")
     again = lj.load_trajectory(tmp_path / "kick", system=kicked)
     np.testing.assert_array_equal(again.at(0.7).q["x"], traj.at(0.7).q["x"])

@@ -1,5 +1,7 @@
 """What one loop of legs lets stand side by side: jumps of forces and elements, phases, sampled controls."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +43,7 @@ def bounced(h, H, a):
 def test_a_bounce_through_a_downdraft(system):
     """A ball that falls out of a downdraft onto a floor; one jump is followed. Twin: in another it ends elsewhere."""
     p = {"H": np.array(0.5), "a": np.array(2.0)}
-    traj = lj.integrate(system, 1.0, 0.0, p, ts=np.array([0.0, 0.3, T]))
+    traj: Any = lj.integrate(system, 1.0, 0.0, p, ts=np.array([0.0, 0.3, T]))
     np.testing.assert_allclose(traj.q[-1], bounced(1.0, 0.5, 2.0), rtol=1e-13)
     assert len(traj.switches) == 1 and traj.stats["num_jumps"] == 1
     assert abs(traj.q[-1] - bounced(1.0, 0.5, 2.1)) > 1e-4
@@ -60,7 +62,7 @@ def test_derivatives_of_both(system, mode):
     found, right = (mode(f, (0, 1, 2))(1.0, 0.5, 2.0) for f in (height, bounced))
     np.testing.assert_allclose(found, right, rtol=1e-10)
     lanes = np.array([1.0, 1.05, 0.95])
-    found = jax.vmap(height, (0, None, None))(lanes, 0.5, 2.0)
+    found: Any = jax.vmap(height, (0, None, None))(lanes, 0.5, 2.0)
     np.testing.assert_allclose(found, bounced(lanes, 0.5, 2.0), rtol=1e-12)
 
 
@@ -69,7 +71,7 @@ def test_lanes_that_are_not_in_step(system):
     """One lane has a jump and then a bounce, while the other bounces twice: each has its own switches."""
     p, ts = {"H": np.array(0.5), "a": np.array(2.0)}, np.array([0.0, 0.7])
     run = jax.vmap(lambda h: lj.integrate(system, h, 0.0, p, ts=ts, estimate_error=False, throw=False))
-    found = run(np.array([1.0, 0.45]))
+    found: Any = run(np.array([1.0, 0.45]))
     v1 = np.sqrt(2 * (G + 2.0) * 0.5)
     v2 = np.sqrt([v1**2 + 2 * G * 0.5, 2 * G * 0.45])
     first, second = v1 / (G + 2.0) + (v2[0] - v1) / G, v2[1] / G
@@ -105,7 +107,7 @@ def test_pulses_and_jumps_in_two_phases():
         lj.Switch("below", to="above", when=lambda t, q, v, p: -q),
     ]
     system = lj.Hybrid({"above": above, "below": below}, leaves, most_switches=4)
-    traj = lj.integrate(system, 1.0, 0.0, ts=np.array([0.0, 1.0, 3.0]))
+    traj: Any = lj.integrate(system, 1.0, 0.0, ts=np.array([0.0, 1.0, 3.0]))
     # It coasts for 0.1 at -0.3, falls to zero, to -0.2, turns, and comes back as fast.
     v0 = np.sqrt(0.3**2 + 2 * (1 - 0.3**2 / 2 - 0.03))
     v1 = np.sqrt(v0**2 - 2 * 2 * 0.2)
@@ -139,5 +141,5 @@ def test_what_could_slide_beside_springs_is_said():
     force = lambda t, q, v, p: {"x": -jnp.sign(v["x"]), "y": 0.0}
     system = lj.System(energy, force=force, elements=mat)
     with pytest.warns(lj.JumpWarning, match="could slide, beside friction or springs"):
-        traj = lj.integrate(system, {"x": 0.0, "y": 1.0}, {"x": 2.0, "y": 0.0}, ts=np.array([0.0, 0.4]))
+        traj: Any = lj.integrate(system, {"x": 0.0, "y": 1.0}, {"x": 2.0, "y": 0.0}, ts=np.array([0.0, 0.4]))
     np.testing.assert_allclose(traj.q["x"][-1], 2 * 0.4 - 0.08, rtol=1e-9)
