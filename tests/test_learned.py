@@ -1,11 +1,13 @@
 """The tools for learned Lagrangians, and the pitfalls that they avoid."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import lagjax as lj
@@ -149,3 +151,47 @@ def test_same_motion():
     free, quartic = lj.System(lambda t, q, v, params: 0.5 * v**2), lj.System(lambda t, q, v, params: v**4)
     found = same_motion(free, quartic, Q, V + 3)
     assert found.same and np.isnan(found.ratio) and "not proportional" in repr(found)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore::lagjax.FitWarning")
+def test_a_missing_force_is_found_from_unfitted_starts():
+    """The recipe of `docs/learned.md` on its bead, whose friction L lacks; twin: with the starts of the windows fitted
+    first, and the rate that the page had for them, they absorb most of that force."""
+    known = lambda t, q, v, p: 0.5 * v**2 + 0.5 * jnp.sin(q) ** 2 + 2.0 * jnp.cos(q)
+    friction = lambda q, v: -0.4 * v * (1 + jnp.cos(q))
+    truth = lj.System(known, force=lambda t, q, v, p: friction(q, v))
+    system = lj.System(known, force=lambda t, q, v, p: p["force"]((q, v)))
+    random, ts, steps = np.random.default_rng(0), np.linspace(0.0, 4.0, 81), 200
+    starts = random.uniform([-1.5, -2.0], [1.5, 2.0], (36, 2))
+    moved = lambda q, v: (lambda traj: (traj.q, traj.v))(lj.integrate(truth, q, v, ts=ts))
+    q, v = map(np.asarray, jax.jit(jax.vmap(moved))(*starts.T))
+    records = [lj.Record(ts, q=x + 0.01 * random.normal(size=len(ts)), sigma=0.01) for x in q[:30]]
+    params = {"force": Network((1.0, 2.0), key=jax.random.key(1), width=32, depth=2)}
+    cut = {"window": 1.0, "joined": False, "rtol": 1e-6, "atol": 1e-6}
+    loss = lj.fit_loss(system, records, params, **cut)
+    adam: Any = optax.scale_by_adam()
+
+    @jax.jit
+    def train(unknowns, rate):
+        def step(carry, given):
+            (unknowns, state), (key, decay) = carry, given
+            batch = jax.random.choice(key, loss.windows, (32,), replace=False)
+            changes, state = adam.update(jax.grad(loss)(unknowns, batch), state, unknowns)
+            by = {"params": 2e-2 * decay, "starts": rate * decay}
+            moved = {part: jax.tree.map(lambda x, c: x - by[part] * c, unknowns[part], changes[part]) for part in by}
+            return (moved, state), None
+
+        keys = jax.random.split(jax.random.split(jax.random.key(0))[0], steps)
+        decay = 0.5 * (1 + jnp.cos(jnp.pi * jnp.arange(steps) / steps))
+        return jax.lax.scan(step, (unknowns, adam.init(unknowns)), (keys, decay))[0][0]
+
+    def missed(unknowns):
+        found: Any = loss.params(unknowns)
+        force = jax.vmap(lambda q, v: found["force"]((q, v)))(q[30:].ravel(), v[30:].ravel())
+        true = friction(q[30:].ravel(), v[30:].ravel())
+        return np.sqrt(np.mean((force - true) ** 2) / np.mean(true**2))
+
+    first = lj.fit(system, records, params, free=[], progress=False, **cut).sampling["starts"]
+    assert missed(train(loss.guess, 2e-3)) < 0.25
+    assert missed(train(loss.guess | {"starts": jnp.asarray(first)}, 5e-3)) > 0.45

@@ -31,6 +31,7 @@ checked numerically: the accelerations at the state, and the matrices there and 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -584,9 +585,15 @@ def linearised(kind: LinearisationKind, model: Model, s: State) -> Linearisation
     return _linearised(kind, model, s)[0]
 
 
-@compiled
 def _linearised(kind: LinearisationKind, model: Model, s: State) -> tuple[Linearisation, Steadiness]:
     """The linearisation, and how far the state is from a steady motion."""
+    linearisation, steadiness = _without_state(kind, model, s)
+    return replace(linearisation, state=linearisation.state._replace(params=s.params)), steadiness
+
+
+# The parameters may hold functions, as networks do, and a program returns arrays only.
+@compiled
+def _without_state(kind: LinearisationKind, model: Model, s: State) -> tuple[Linearisation, Steadiness]:
     parts = parts_of(kind, model, s)
     # `transfer` is P⁺ V: the positions η of displacements along the velocity directions.
     along = parts.position @ parts.transfer
@@ -610,7 +617,7 @@ def _linearised(kind: LinearisationKind, model: Model, s: State) -> tuple[Linear
         multipliers=parts.multipliers,
         residual=steadiness.residual,
         sound=sound,
-        state=s,
+        state=s._replace(params=None),
         parts=parts,
         kind=kind,
         names=tuple(coordinates.names(s.q)),

@@ -230,10 +230,13 @@ def cut(records: Sequence[Record], window: float | None, dtype: Any) -> Windows:
     for r, record in enumerate(records):
         t, span = record.t, record.t[-1] - record.t[0]
         must(window is None or window > 0, "window must be a positive length of time", window)
-        if window is not None and window < 2 * np.max(np.diff(t)):
+        longest = np.max(np.diff(t))
+        if window is not None and window < 2 * longest:
+            # Rounded to three digits it is still long enough.
+            enough = max(20 * np.median(np.diff(t)), 2.1 * longest)
             raise ValueError(
-                f"window = {window:.6g} is shorter than two intervals of a record, of {np.max(np.diff(t)):.6g}.\n"
-                f"Fix: a window with several samples, such as window={20 * np.median(np.diff(t)):.3g}."
+                f"window = {window:.6g} is shorter than two intervals of a record, of {longest:.6g}.\n"
+                f"Fix: a window with several samples, such as window={enough:.3g}."
             )
         count = 1 if window is None else max(1, math.ceil(span / window * (1 - 1e-9)))
         edges = np.searchsorted(t, t[0] + span / count * np.arange(count) * (1 - 1e-12))

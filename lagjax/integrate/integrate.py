@@ -151,10 +151,10 @@ def integrate(
       1000 tolerances, or by less over thousands of steps, or by 1e-5 with fixed steps. For batches look at
       `scaled_error` yourself.
     - Warns of what is hardly ever intended: a mass matrix that is not positive definite at the start, in directions
-      that constraints leave free, once for each kind of motion, of one system outside of `jit` and `vmap` (where it is
-      meant: `warnings.filterwarnings("ignore", "the mass matrix is")`); a `dissipation` that is odd in v, as a force
-      is; once in a process
-      (`lj.PrecisionWarning`), float32 that is used only because nothing else was requested.
+      that constraints leave free, once for each kind of motion (not inside `jit` and `vmap`, nor where no mass matrix
+      is formed, as for trees and bands, nor with elements, phases or jumps that are followed; where it is meant:
+      `warnings.filterwarnings("ignore", "the mass matrix is")`); a `dissipation` that is odd in v, as a force is; once
+      in a process (`lj.PrecisionWarning`), float32 that is used only because nothing else was requested.
 
     Order and accuracy: those of `method`; `tests/behaviour/test_orders.py` measures them.
 

@@ -40,6 +40,7 @@ from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
 from lagjax.jaxtools.digest import NotKept, digest_of, trace_context
+from lagjax.jaxtools.jaxpr import anywhere
 from lagjax.jaxtools.outline import NoOutline
 from lagjax.jaxtools.tracing import HAPPENED
 
@@ -205,7 +206,7 @@ class KeptProgram:
         if HAPPENED != before:
             TALLY.not_kept[f"while it was traced, {' and '.join(HAPPENED - before)}"] += 1
         elif place is not None:
-            self._write(place, made, arrays)
+            self._write(place, made, arrays, at_once=_sorts(traced.jaxpr.jaxpr))
         return made
 
     def _loaded(
@@ -221,8 +222,9 @@ class KeptProgram:
             _refuse(error)
             return None
 
-    def _write(self, place: tuple[Path, str], made: Ready, arrays: list) -> None:
-        """Write the program, in another thread."""
+    def _write(self, place: tuple[Path, str], made: Ready, arrays: list, at_once: bool) -> None:
+        """Write the program, in another thread; what is kept of it can be made out `at_once`."""
+        parts = _parts_now(made.compiled) if at_once else None
 
         def write() -> None:
             try:
@@ -231,7 +233,7 @@ class KeptProgram:
                 again = jtu.tree_structure(self._said.tree(outline, arrays))
                 if again != made.structure:
                     raise NotKept("its results are of a structure that has no outline")
-                header, program = _parts_of(made.compiled)
+                header, program = parts or _parts_of(made.compiled)
                 if folder.write(*place, {"outline": outline, "facts": made.facts, **header}, program):
                     TALLY.found["written"] += 1
             except (NotKept, NoOutline) as reason:
@@ -240,6 +242,18 @@ class KeptProgram:
                 TALLY.not_kept[f"{type(error).__name__}: {str(error)[:200]}"] += 1
 
         LATER.do(write)
+
+
+# In its first run such a program of XLA's before jax 0.12 takes a form that cannot be written.
+_sorts = anywhere(lambda equation: equation.primitive.name in ("sort", "top_k"))
+
+
+def _parts_now(call: Any) -> tuple[dict[str, Any], bytes] | None:
+    """`_parts_of`, or None where that says why not: it is asked again."""
+    try:
+        return _parts_of(call)
+    except (NotKept, *REFUSED):
+        return None
 
 
 def _without_call(arrays: list) -> list:

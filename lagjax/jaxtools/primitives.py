@@ -273,7 +273,7 @@ def primitive(
     new.def_impl(as_usual(evaluate))
     new.def_abstract_eval(shapes)
     # What such a primitive evaluates in Python becomes part of a program only here.
-    lowered = one_by_one(compiled or evaluate)
+    lowered = as_usual(one_by_one(compiled or evaluate))
     mlir.register_lowering(new, mlir.lower_fun(lowered, multiple_results=several))
     for rules, rule in (
         (ad.primitive_jvps, jvp),

@@ -90,15 +90,20 @@ def as_usual(function: Callable) -> Callable:
 
     It compiles: one by one, the operations of a motion take minutes. It does not look for NaN: trial steps, outputs
     that a motion did not reach and slots for events that did not happen are NaN. It may make constants for a program.
+    It may add a bool to an integer, or a count to a time: strict promotion is for the user's functions, which are
+    traced before.
     """
 
     @wraps(function)
     def without_debugging(*args, **kwargs):
         config: Any = jax.config
         looks = config.jax_debug_nans or config.jax_debug_infs
-        if not (looks or config.jax_disable_jit or config.jax_transfer_guard_host_to_device not in (None, "allow")):
+        guarded = config.jax_transfer_guard_host_to_device not in (None, "allow")
+        strict = config.jax_numpy_dtype_promotion != "standard"
+        if not (looks or config.jax_disable_jit or guarded or strict):
             return function(*args, **kwargs)
         with ExitStack() as usual:
+            usual.enter_context(jax.numpy_dtype_promotion("standard"))
             usual.enter_context(jax.disable_jit(False))
             usual.enter_context(jax.transfer_guard("allow"))
             if looks:

@@ -115,3 +115,58 @@ def test_failures_sweeps_and_fits_in_a_mode(mode):
     assert np.isclose(swept.values[0], np.cos(TS[-1]), atol=1e-8) and np.isnan(swept.values[1])
     assert np.allclose(stiff.q, np.cos(TS), atol=1e-6)
     assert np.isclose(found.params["k"], 1.5**2 * m, rtol=1e-4)
+
+
+NET = lj.learned.Network(1.0, key=jax.random.key(0), width=16, depth=1)
+WITH_NET = lj.System(
+    lambda t, q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2, force=lambda t, q, v, params: params["net"](q)
+)
+BOUNCING = lj.System(
+    lambda t, q, v, params: 0.5 * v**2 - params["g"] * q,
+    elements={"floor": lj.Contact(lambda t, q, params: q, restitution=0.5)},
+)
+
+
+def pushed(k):
+    """A spring beside a network that is zero, with a control that is held: no push."""
+    controls = {"push": np.zeros(40)}
+    system = lj.System(WITH_NET.lagrangian, force=lambda t, q, v, params: params["net"](q) + params["push"])
+    return lj.rollout(system, 1.0, 0.0, {"k": k, "net": NET}, controls, 0.02)[1]
+
+
+def test_a_rollout_under_strict_promotion():
+    """A step of fixed length counts, and a network's steps too, whatever dtypes may be added where the user works."""
+    with jax.numpy_dtype_promotion("strict"):
+        q = pushed(4.0)
+        raises_in(MODES["strict dtypes"][0], jax.dtypes.TypePromotionError, lambda: jnp.asarray(q) * jnp.arange(41))
+    assert np.allclose(q, np.cos(2.0 * 0.02 * np.arange(41)), atol=1e-7)
+
+
+@pytest.mark.exhaustive
+def test_all_doors_under_strict_promotion():
+    """Steps, slopes of both modes, sweeps, fits, losses of networks, equilibria, modes, and a contact: closed forms."""
+    t = np.linspace(0.0, 2.0, 9)
+    with jax.numpy_dtype_promotion("strict"):
+        state = lj.step(WITH_NET, 0.0, 1.0, 0.0, {"k": 4.0, "net": NET}, 1e-3)
+        a, _ = lj.accelerations(WITH_NET, 0.0, 1.0, 0.0, {"k": 4.0, "net": NET})
+        end = lambda k: lj.integrate(WITH_NET, 1.0, 0.0, {"k": k, "net": NET}, ts=TS, rtol=1e-9, atol=1e-9).q[-1]
+        slopes = [mode(end)(4.0) for mode in (jax.grad, jax.jacfwd)] + [jax.grad(lambda k: pushed(k)[-1])(4.0)]
+        swept = lj.sweep(lambda at: end(at["k"]), {"k": np.array([1.0, 4.0])}, progress=False).values
+        records = [lj.Record(t, q=np.cos(2.0 * t), sigma=1e-3)] * 2
+        found = lj.fit(WITH_NET, records, {"k": 3.5, "net": NET}, free=["k"], progress=False)
+        loss = lj.fit_loss(WITH_NET, records, {"k": 4.0, "net": NET}, window=1.0)
+        slope = jax.tree.leaves(jax.grad(loss)(loss.guess))
+        rest = lj.equilibria(WITH_NET, {"k": 4.0, "net": NET}, starts=[0.3])
+        swings = lj.normal_modes(WITH_NET, 0.0, 0.0, 0.0, {"k": 4.0, "net": NET})
+        height = lambda g: lj.integrate(BOUNCING, 1.0, 0.0, {"g": g}, ts=np.array([0.0, 0.6])).q[-1]
+        bounced, up = height(9.81), [mode(height)(9.81) for mode in (jax.grad, jax.jacfwd)]
+    assert np.allclose([a, state[1]], [-4.0, np.cos(2e-3)], atol=1e-9)
+    assert np.allclose(slopes[:2], -0.9 * np.sin(1.8) / 4, rtol=1e-6)
+    assert np.allclose(slopes[2], -0.8 * np.sin(1.6) / 4, rtol=1e-6)
+    assert np.allclose(swept, np.cos([0.9, 1.8]), atol=1e-7)
+    assert np.isclose(found.params["k"], 4.0, rtol=1e-4) and all(np.isfinite(x).all() for x in slope)
+    assert np.allclose(rest.q, 0.0, atol=1e-9) and np.allclose(swings.frequency, 2.0)
+    # It falls for sqrt(2 / g), and rises at half the speed.
+    rise = lambda g: 0.5 * np.sqrt(2 * g) * (0.6 - np.sqrt(2 / g)) - 0.5 * g * (0.6 - np.sqrt(2 / g)) ** 2
+    assert np.isclose(bounced, rise(9.81), atol=1e-7)
+    assert np.allclose(up, (rise(9.82) - rise(9.80)) / 0.02, rtol=1e-4)

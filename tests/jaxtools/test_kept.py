@@ -211,6 +211,18 @@ def test_a_program_is_found(place):
     assert traced == [2, 2]
 
 
+def test_a_program_that_sorts(place, monkeypatch):
+    """It is written as it was before its first run; twin: afterwards, this XLA may have no form for it."""
+    later = []
+    monkeypatch.setattr(LATER, "do", later.append)
+    x, y = np.array([3.0, 1.0, 2.0]), np.zeros(3)
+    for sorts in (lambda jaxpr: False, kept._sorts):
+        monkeypatch.setattr(kept, "_sorts", sorts)
+        assert program(lambda x, y: jnp.sort(x))([x, y]).tolist() == [1.0, 2.0, 3.0]
+        later.pop()()
+    assert kept.TALLY.found == {"written": 1} and "LessThan" in str(kept.TALLY.not_kept)
+
+
 def test_never_another_program(place, monkeypatch):
     """Another function, a damaged file and another processor are compiled anew, with their own results."""
     x, y, traced = np.array([1.0, 2.0, 4.0]), np.ones(3), []

@@ -5,6 +5,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.fit.arguments import problem_of
+from lagjax.fit.records import cut
 from tests.fit.cases import PENDULUM, pendulum
 
 T = np.linspace(0.0, 1.0, 20)
@@ -80,3 +81,13 @@ def test_records(make, words):
     """A record that makes no sense raises an error that says why."""
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_the_window_that_is_proposed_is_taken():
+    """With a gap in the record too, where twenty ordinary intervals are not enough."""
+    t = np.append(np.linspace(0.0, 1.0, 11), [3.0, 3.1])
+    record = lj.Record(t, q=np.cos(t), q0=1.0, v0=0.0)
+    with pytest.raises(ValueError) as refused:
+        cut([record], 0.5, float)
+    proposed = float(str(refused.value).split("window=")[1].rstrip("."))
+    assert cut([record], proposed, float).count == 1 and proposed > 20 * 0.1
