@@ -173,7 +173,10 @@ def points_there(path):
 def kill_when(process, path, count):
     """`kill -9` once `count` blocks are marked."""
     deadline = time.monotonic() + 120
-    while not path.exists() or len(Store(Files(path)).blocks) - len(Store(Files(path)).missing()) < count:
+    while (
+        not (path / "lagjax" / "zarr.json").exists()
+        or len(Store(Files(path)).blocks) - len(Store(Files(path)).missing()) < count
+    ):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)

@@ -124,7 +124,7 @@ def test_the_system_given_again(store):
     other = lj.System(lambda t, q, v, params: 0.5 * v["x"] ** 2 - 0.6 * params["k"] ** params["power"] * q["x"] ** 2)
     with pytest.raises(ValueError, match="this system is not the one of .*store(.|\n)*the Lagrangian: its"):
         lj.open_sweep(store, system=other, classes=[Pair])
-    with pytest.raises(TypeError, match="system must be a lj.System, not int"):
+    with pytest.raises(TypeError, match="system must be a lj.System, not 3"):
         lj.open_sweep(store, system=3, classes=[Pair])
     with pytest.raises(ValueError, match="run returns"):
         lj.open_sweep(store, run=swing)
