@@ -5,23 +5,20 @@ in there, with the digest of what they mean; the kinds of their results are in t
 never run: it is the key to a program. Derivatives and lanes of what has a name are further names.
 """
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.core import ShapedArray
 from jax.interpreters import ad
 from jaxtyping import PyTree
 
 from lagjax.jaxtools import folder
 from lagjax.jaxtools.cache import FACTS, HashablePart, compiler_options, hashable_partition, program_of
 from lagjax.jaxtools.digest import NotKept, digest_of, surroundings
-from lagjax.jaxtools.kept import KeptProgram, Said, as_data, kept_here, kind, kinds_in
+from lagjax.jaxtools.kept import KeptProgram, Said, as_data, kept_here, kind, kinds_from, outline_of
 from lagjax.jaxtools.outline import NoOutline, outlined, parts_of, rebuilt
 from lagjax.jaxtools.primitives import front, is_float, jitted, no_tangent, one_by_one, primitive
 from lagjax.jaxtools.tracing import HAPPENED, as_usual, is_eager, is_traced
@@ -105,15 +102,13 @@ def _found(function: Callable, said: Said, arrays: list, path: Any, digest: str)
     entry = folder.read(path, digest)
     if entry is not None:
         header, _ = entry
-        return jtu.tree_structure(said.tree(header["outline"], arrays)), _said_of(kinds_in(header))
+        return jtu.tree_structure(said.tree(header["outline"], arrays)), _said_of(kinds_from(header["outputs"]))
     before = HAPPENED.copy()
     with NAMING(None):
         program, shapes = jax.make_jaxpr(function, return_shape=True)([_shaped(x) for x in arrays])
     leaves, structure = program.out_avals, jtu.tree_structure(shapes)
     if HAPPENED == before:
-        outline = json.loads(json.dumps(said.outline(jtu.tree_unflatten(structure, range(len(leaves))))))
-        if jtu.tree_structure(said.tree(outline, arrays)) != structure:
-            raise NotKept("its results are of a structure that has no outline")
+        outline = outline_of(said, structure, arrays)
         folder.write(path, digest, {"outline": outline, "outputs": [as_data(x) for x in leaves]}, b"")
     return structure, _said_of(leaves)
 
@@ -128,10 +123,6 @@ def _said_of(outputs: Iterable) -> tuple:
     return tuple((x.shape, x.dtype.name, bool(x.weak_type)) for x in outputs)
 
 
-def _kinds(outputs: tuple) -> list[ShapedArray]:
-    return [ShapedArray(shape, jnp.dtype(name), weak_type=weak) for shape, name, weak in outputs]
-
-
 def _never(*operands, **params):
     raise NotImplementedError("a name stands for a program, and is never run")
 
@@ -140,7 +131,7 @@ def _pushed(primals: Sequence, tangents: Sequence, *, of: Any, outputs: tuple):
     found = named_p.bind(*primals, of=of, outputs=outputs)
     moving = tuple(not isinstance(x, ad.Zero) for x in tangents)
     directions = [x for x, moves in zip(tangents, moving) if moves]
-    floats = _said_of(x.to_tangent_aval() for x in _kinds(outputs) if is_float(x))
+    floats = _said_of(x.to_tangent_aval() for x in kinds_from(outputs) if is_float(x))
     pushes = iter(pushed_p.bind(*primals, *directions, of=(of, moving), outputs=floats))
     return found, [next(pushes) if is_float(x) else no_tangent(x) for x in found]
 
@@ -161,7 +152,7 @@ def _in_lanes(operands: Sequence, axes: Sequence, *, of: Any, outputs: tuple, wh
 
 
 def _shapes(*operands, of: Any, outputs: tuple):
-    return _kinds(outputs)
+    return kinds_from(outputs)
 
 
 def _primitive(name: str, **rules) -> Any:

@@ -24,7 +24,7 @@ import re
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -228,11 +228,7 @@ class KeptProgram:
 
         def write() -> None:
             try:
-                tree = jtu.tree_unflatten(made.structure, range(made.structure.num_leaves))
-                outline = json.loads(json.dumps(self._said.outline(tree)))
-                again = jtu.tree_structure(self._said.tree(outline, arrays))
-                if again != made.structure:
-                    raise NotKept("its results are of a structure that has no outline")
+                outline = outline_of(self._said, made.structure, arrays)
                 header, program = parts or _parts_of(made.compiled)
                 if folder.write(*place, {"outline": outline, "facts": made.facts, **header}, program):
                     TALLY.found["written"] += 1
@@ -254,6 +250,15 @@ def _parts_now(call: Any) -> tuple[dict[str, Any], bytes] | None:
         return _parts_of(call)
     except (NotKept, *REFUSED):
         return None
+
+
+def outline_of(said: Said, structure: Any, arrays: list) -> Any:
+    """The outline of results, from which they come back; or `NotKept`."""
+    tree = jtu.tree_unflatten(structure, range(structure.num_leaves))
+    outline = json.loads(json.dumps(said.outline(tree)))
+    if jtu.tree_structure(said.tree(outline, arrays)) != structure:
+        raise NotKept("its results are of a structure that has no outline")
+    return outline
 
 
 def _without_call(arrays: list) -> list:
@@ -344,9 +349,9 @@ def as_data(x: Any) -> list:
     return [list(x.shape), x.dtype.name, bool(x.weak_type)]
 
 
-def kinds_in(header: dict[str, Any]) -> list[ShapedArray]:
-    """The kinds of results of a program that is kept."""
-    return [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in header["outputs"]]
+def kinds_from(said: Iterable) -> list[ShapedArray]:
+    """The kinds of results that `as_data` says."""
+    return [ShapedArray(tuple(shape), jnp.dtype(name), weak_type=weak) for shape, name, weak in said]
 
 
 def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> tuple[Any, list[ShapedArray]]:
@@ -357,7 +362,7 @@ def _call_of(header: dict[str, Any], program: bytes, arrays: list) -> tuple[Any,
     devices = list_of((device,))
     sharding = jax.sharding.SingleDeviceSharding(device)
     given = [ShapedArray(arrays[i].shape, jnp.dtype(arrays[i].dtype)) for i in header["reads"]]
-    results = kinds_in(header)
+    results = kinds_from(header["outputs"])
     if header["lapack"]:
         find_lapack()
     parts = unloaded(
