@@ -21,7 +21,7 @@ from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from lagjax.contexts import COLUMNS
-from lagjax.jaxtools.cache import FACTS, compiler_options, program_of
+from lagjax.jaxtools.cache import FACTS, compiler_options, is_array, program_of
 from lagjax.jaxtools.digest import trace_context
 from lagjax.jaxtools.kept import KeptProgram, Said, kind, kinds_from
 from lagjax.jaxtools.names import Traced, results_of, traced
@@ -159,10 +159,15 @@ def _is_known(x: Any) -> bool:
 def _run(*arrays: Array, of: Outside, outputs: tuple):
     program = program_of(of, lambda: of.compiled(len(outputs)))
     try:
-        return program(list(map(jnp.asarray, arrays)))
+        return program(_as_arrays(arrays))
     except jax.errors.JaxRuntimeError:
         # Equinox's wrapper has a better message for its checks.
-        return jitted(of)(list(map(jnp.asarray, arrays)))
+        return jitted(of)(_as_arrays(arrays))
+
+
+def _as_arrays(operands: Sequence) -> list:
+    # A constant comes as a Python number that knows its dtype.
+    return [x if is_array(x) else jnp.asarray(x) for x in operands]
 
 
 def _inside(*arrays: Array, of: Outside, outputs: tuple):
@@ -180,8 +185,7 @@ def _in_lanes(operands: Sequence, axes: Sequence, *, of: Outside, outputs: tuple
 
 
 def _pushed(primals: Sequence, tangents: Sequence, *, of: Outside, outputs: tuple):
-    # A constant comes as a Python number that knows its dtype.
-    primals = list(map(jnp.asarray, primals))
+    primals = _as_arrays(primals)
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero) and primals[i].size)
     if not moved:
         values = _outside_p.bind(*primals, of=of, outputs=outputs)

@@ -18,12 +18,13 @@ from lagjax.jaxtools.primitives import jitted, one_by_one
 from lagjax.jaxtools.tracing import as_usual, is_eager, is_traced
 
 
-def compiled(function: Callable, in_numpy: bool = False) -> Callable:
+def compiled(function: Callable, in_numpy: bool = False, in_line: bool = False) -> Callable:
     """Compile `function` for the structure and shapes of its pytrees; inside another program it becomes part of that.
 
-    Its programs are kept. With `in_numpy`, a call from Python returns NumPy arrays.
+    Its programs are kept. With `in_numpy`, a call from Python returns NumPy arrays. With `in_line`, it is no call of
+    its own in another program.
     """
-    as_part = jitted(function)
+    as_part = function if in_line else jitted(function)
     finish = partial(jtu.tree_map, np.asarray) if in_numpy else jax.block_until_ready
 
     @wraps(function)
@@ -40,7 +41,7 @@ def compiled(function: Callable, in_numpy: bool = False) -> Callable:
             return finish(program_of((function, static), lambda: _program(function, static))(arrays))
         except jax.errors.JaxRuntimeError:
             # Equinox's wrapper has a better message for the checks that equinox puts into a program.
-            return finish(as_part(*args))
+            return finish(jitted(function)(*args))
 
     return program
 

@@ -528,7 +528,7 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
     return solution
 
 
-@compiled
+@partial(compiled, in_line=True)
 def _accelerations_inside(model: Model, s: coordinates.State, differentiated: bool):
     equations = equations_of(model, fast=True, differentiated=differentiated)
     a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))

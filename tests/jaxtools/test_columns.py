@@ -111,6 +111,7 @@ def test_what_has_no_columns(run):
         lambda i: jax.grad(lambda x: both(x)[i])(many),
         lambda i: jax.jvp(lambda x: both(x)[i], (X,), (X**2,)),
         lambda i: jax.jit(jax.grad(lambda x: both(x)[i]))(X),
+        lambda i: jax.jit(lambda y: y * jax.grad(lambda x: both(x)[i])(X))(Y),
     ]
     for act in ways:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), act(0), act(1))
