@@ -152,7 +152,8 @@ def from_python(function: Callable[[list], PyTree], said: Said, key: Hashable, a
 def _is_known(x: Any) -> bool:
     """Whether there are values below all tracers of derivatives and lanes, those of both modes and of batches."""
     while isinstance(x, Tracer):
-        x = getattr(x, "primal" if hasattr(x, "tangent") else "val", None)
+        within = "primal" if hasattr(x, "tangent") else "val" if hasattr(x, "batch_dim") else ""
+        x = getattr(x, within, None)
     return x is not None
 
 

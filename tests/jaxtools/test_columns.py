@@ -116,6 +116,7 @@ def test_what_has_no_columns(run):
     for act in ways:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), act(0), act(1))
     assert run == []
+    assert "from_python" not in str(jax.make_jaxpr(lambda x: ours(x, Y, reverse))(X))
     # Many numbers, in reverse, of a slope by one.
     slopes = lambda f: jax.grad(lambda x: jax.grad(energy(f), 1)(x, Y))(many)
     np.testing.assert_allclose(
