@@ -42,8 +42,10 @@ from jax import lax
 from jax.core import ShapedArray
 from jaxtyping import PyTree
 
+from lagjax.contexts import COLUMNS
 from lagjax.integrate.replay import Replay, filled
 from lagjax.jaxtools import (
+    FEW,
     ad,
     front,
     is_float,
@@ -236,11 +238,6 @@ _turned_p = linear_map_primitive(
 )  # fmt: skip
 
 
-# Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
-# back through checkpoints. From where on a replay is cheaper was not measured.
-PUSH_UP_TO = 24
-
-
 def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool) -> PyTree:
     """Return the result of `solve(x, fixed, adjoint, differentiated)`, differentiable in both modes in `x`.
 
@@ -249,6 +246,8 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     closes over no traced value. `differentiated`: whether this solve is for a derivative; `recorded`: whether there is
     a record.
     """
+    if COLUMNS.value:
+        return solve(x, fixed, diffrax.ForwardMode(), True)[0]
     leaves, structure = jtu.tree_flatten((x, fixed))
     shapes = {}
 
@@ -360,7 +359,7 @@ def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
 
 
 def _are_few(leaves: Sequence):
-    return sum(a.size for a in leaves) <= PUSH_UP_TO
+    return sum(a.size for a in leaves) <= FEW
 
 
 # The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the number of leaves of x

@@ -38,8 +38,8 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.contexts import WATCHED
 from lagjax.jaxtools import (
-    WATCHED,
     TooLong,
     compiled,
     decided,
