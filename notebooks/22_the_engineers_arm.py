@@ -69,8 +69,8 @@ model.draw({"waist": 0.4, "shoulder": 0.6, "elbow": -1.0}).figure()
 #
 # `lj.inverse_dynamics` says which torques give the joints wanted accelerations. At rest, with none, they are what
 # holds the arm against gravity. The shoulder carries both links, the elbow one: with the angles $s$ and $e$,
-# $\tau_e = m_2 g\,c_2\cos(s + e)$ and $\tau_s = \tau_e + (m_1 c_1 + m_2 l_1)\,g\cos s$. The waist is vertical and carries
-# nothing.
+# $\tau_e = m_2 g\,c_2\cos(s + e)$ and $\tau_s = \tau_e + (m_1 c_1 + m_2 l_1)\,g\cos s$. The waist is vertical and
+# carries nothing.
 
 
 # %%
@@ -159,7 +159,7 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 2.8))
 for i, name in enumerate(names):
     left.plot(ts, without.q[name], color=f"C{i}", label=name)
     left.plot(ts, planned[:, i], "--", color=f"C{i}", lw=0.9)
-    right.step(ts, with_model.q["u"][:, i], where="post", color=f"C{i}", label=name)
+    right.plot(ts, with_model.q["u"][:, i], color=f"C{i}", label=name)
 left.set(xlabel="t, s", ylabel="angle, rad", title="spring and damper alone; dashed: the plan")
 right.set(xlabel="t, s", ylabel="torque, N m", title="with the model's torques")
 right.legend(fontsize=8)

@@ -352,10 +352,9 @@ def _forces(
     """The generalized force that these accelerations of coordinates need, with moments and forces on links."""
     joints, free = numbers_of_links(geometry, a.numbers), jnp.zeros_like(wrench)
     e, rate, links = q.quaternions, v.quaternions, geometry.links_of_quaternions
-    faster = jnp.zeros_like(e)
+    faster, size = jnp.zeros_like(e), jnp.sum(e**2, axis=1)[:, None]
     if len(links):
         both = jnp.concatenate([growth(e, rate)[:, None], spins(e, rate)], axis=1)
-        size = jnp.sum(e**2, axis=1)[:, None]
         # s̈ + Ω̇, of ë = ½ (Ω̇ + s̈) e + ½ (Ω + ṡ) ė.
         faster = jax.vmap(product)(2 * a.quaternions - jax.vmap(product)(both, rate), jax.vmap(conjugate)(e)) / size
         turning = of_links(faster[:, 1:], geometry.quaternions)

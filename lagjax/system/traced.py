@@ -310,7 +310,7 @@ def _finds_names(function: Callable, found) -> bool:
         return is_method and _finds_held(function.__self__, found)
     if type(function) is not types.FunctionType:
         of = type(function)
-        if not (_is_own(of) and dataclasses.is_dataclass(of) and of.__dataclass_params__.frozen):
+        if not (_is_own(of) and getattr(getattr(of, "__dataclass_params__", None), "frozen", False)):
             return False
         found.append(of)
         return all(_finds_held(getattr(function, field.name), found) for field in dataclasses.fields(of))
