@@ -5,7 +5,9 @@ is known only when JAX pushes tangents through (`jacfwd`, Levenberg-Marquardt) o
 The derivative of y = solve(x) is therefore bound as a linear map dx -> dy of its own: a primitive that is
 evaluated by forward mode and transposed by a replay of the steps (`pull`), or, for few derivatives, by forward mode
 along each of them. If nothing is differentiated, it leaves no trace in the compiled program. With many
-numbers to differentiate by, the solve that computes the values records its steps, and these are replayed.
+numbers to differentiate by, the solve that computes the values records its steps, and these are replayed. With few, and
+as many directions as numbers or directions that JAX does not know yet (`grad`, `jacfwd`), the solve that computes the
+values pushes all of them along, and J is a table; its own derivatives are those of values and J apart.
 
 Second derivatives by few numbers are those of this map, which is bilinear in dx and in the direction dz in which x
 moves:
