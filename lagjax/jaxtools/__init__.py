@@ -16,7 +16,7 @@ from lagjax.jaxtools.cache import (
     shape_of,
     varies,
 )
-from lagjax.jaxtools.columns import FEW, from_python
+from lagjax.jaxtools.columns import FEW, Columns, Lanes, along_columns, axes_of, from_python, have_columns
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.dependence import is_linear, pattern
 from lagjax.jaxtools.fuse import (

@@ -87,7 +87,7 @@ class Columns(NamedTuple):
                 values, found = jax.jvp(of_moving, tuple(moving), direction)
                 return values, [d for x, d in zip(values, found) if is_float(x)]
 
-            directions = _axes(moving)
+            directions = axes_of(moving)
             if len(directions[0]) > 1:
                 # The values are the same along all of them.
                 values, columns = jax.vmap(push)(*directions)
@@ -192,9 +192,9 @@ def _pushed(primals: Sequence, tangents: Sequence, *, of: Outside, outputs: tupl
         values = _outside_p.bind(*primals, of=of, outputs=outputs)
         return values, list(map(no_tangent, values))
     directions = [tangents[i] for i in moved]
-    numbers = sum(primals[i].size for i in moved)
-    if numbers > min(FEW, min(map(_directions, directions))):
+    if not have_columns([primals[i] for i in moved], directions):
         return _by_jax(primals, moved, directions, of)
+    numbers = sum(primals[i].size for i in moved)
     floats = [is_float(x) for x in kinds_from(outputs)]
     columns = tuple(((numbers, *shape), *rest) for (shape, *rest), moves in zip(outputs, floats) if moves)
     try:
@@ -203,8 +203,14 @@ def _pushed(primals: Sequence, tangents: Sequence, *, of: Outside, outputs: tupl
         # A function of the user's that has derivatives in reverse only; what else is wrong, JAX says.
         return _by_jax(primals, moved, directions, of)
     values, columns = found[: len(outputs)], found[len(outputs) :]
-    along = iter(_products(columns, directions))
+    along = iter(along_columns(columns, directions))
     return values, [next(along) if moves else no_tangent(x) for x, moves in zip(values, floats)]
+
+
+def have_columns(moved: Sequence, directions: Sequence) -> bool:
+    """Whether columns are the way to the derivatives by some arrays along these directions, of which JAX may know none
+    yet: by few numbers, and for as many directions at least."""
+    return 0 < sum(x.size for x in moved) <= min(FEW, *map(_directions, directions))
 
 
 def _directions(tangent: Any) -> float:
@@ -218,7 +224,7 @@ def _directions(tangent: Any) -> float:
 
 
 @jax.jit
-def _products(columns: list, directions: list) -> list:
+def along_columns(columns: list, directions: list) -> list:
     """The sums of columns, each times its number of the directions."""
     along = jnp.concatenate([jnp.ravel(d) for d in directions])
     return [jnp.tensordot(along.astype(x.dtype), x, 1) for x in columns]
@@ -237,7 +243,7 @@ def _with(arrays: Sequence, moved: Sequence[int], chosen: Sequence) -> list:
     return [new.get(i, x) for i, x in enumerate(arrays)]
 
 
-def _axes(arrays: Sequence) -> list:
+def axes_of(arrays: Sequence) -> list:
     """For each array the directions along all their numbers, with the axis of these in front."""
     ends = np.cumsum([0, *(x.size for x in arrays)])
     axes = [jnp.eye(ends[-1], x.size, -start, dtype=x.dtype) for start, x in zip(ends, arrays)]
