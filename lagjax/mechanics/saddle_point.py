@@ -626,7 +626,7 @@ def _seen(model: Model, t: Array, x: Array, u: Array, along: Float[Array, "k n"]
 
     time = lanes(jnp.ones(2, x.dtype), jnp.zeros_like(x))
     w = jnp.concatenate([along, along, unit])
-    every = lanes(both, u + still), time, lanes(both, still), lanes(a, unit), w
+    every = lanes(both, u[None] + still), time, lanes(both, still), lanes(a, unit), w
     found = lax.map(terms, every, batch_size=BLOCK)
     of_force = jnp.repeat(forces, count, axis=0)
     found, mass = jnp.split(found, [2 * count])
