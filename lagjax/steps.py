@@ -129,20 +129,22 @@ def equations_for_steps(model: Model) -> Equations:
     return equations_of(model, fast=True, fallback=bool(model.m), apart=True)
 
 
-def advanced(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array) -> tuple:
-    """The state (q, v) after a step from t to t + dt."""
-    y0 = tuple(map(equations.inside, y))
-    if equations.written is None:
-        y1 = _robust(equations, method, t, y0, dt)
-    else:
-        y1 = _fast(equations, method, t, y0, dt)
+def advanced(
+    equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array, way: Callable | None = None
+) -> tuple:
+    """The state (q, v) after a step from t to t + dt; by one `way` alone, or by the robust one where the fast fails."""
+    way = way or (_robust if equations.written is None else _fast_or_robust)
+    y1 = way(equations, method, t, tuple(map(equations.inside, y)), dt)
     return jax.tree.map(lambda x, old: x.astype(old.dtype), tuple(map(equations.outside, y1)), tuple(y))
 
 
 def _fast(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
     y1 = _explicit(method, lambda t, y: (equations.velocities(t, *y), equations.fast(t, *y)[0]), t, y, dt)
-    if equations.model.is_returned:
-        y1 = equations.projected(t + dt, *y1)
+    return equations.projected(t + dt, *y1) if equations.model.is_returned else y1
+
+
+def _fast_or_robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
+    y1 = _fast(equations, method, t, y, dt)
     if not equations.fallback:
         return y1
     # A branch also in a batch, where all lanes take it or none.
@@ -313,24 +315,30 @@ def _rolled(
     if not count:
         return jtu.tree_map(lambda x: jnp.asarray(x)[None], tuple(s[:3]))
     t = s.t + np.arange(count + 1) * dt
+    params = s.params if merge is None else merge(s.params, jtu.tree_map(lambda u: u[0], held))
+    equations = equations_for_steps(model_of(system, *s[:3], params))
     if merge is None:
         # What does not depend on the state is prepared once.
-        step, fixed = _next, (equations_for_steps(model_of(system, *s)), dt)
+        step, fixed = _next, (equations, dt)
     else:
         step, fixed = _next_with_control, (system, s.params, merge, dt)
-    states = steps_in_both_modes(partial(step, method=method), (s.q, s.v), (t[:-1], held), fixed)
+    # Many steps are made the fast way, and all once more the robust way if one of them fails: a step of both would be
+    # compiled, and differentiated, with a branch.
+    ways = (_fast, _robust) if equations.fallback else (_robust if equations.written is None else _fast,)
+    steps = [partial(step, method=method, way=way) for way in ways]
+    states = steps_in_both_modes(steps, (s.q, s.v), (t[:-1], held), fixed)
     q, v = jtu.tree_map(lambda x0, x: jnp.concatenate([x0[None], x]), (s.q, s.v), states)
     return t, q, v
 
 
-def _next(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta):
+def _next(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
     (t, _), (equations, dt) = row, fixed
-    return advanced(equations, method, t, y, dt)
+    return advanced(equations, method, t, y, dt, way)
 
 
-def _next_with_control(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta):
+def _next_with_control(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
     (t, u), (system, params, merge, dt) = row, fixed
-    return advanced(equations_for_steps(model_of(system, t, *y, merge(params, u))), method, t, y, dt)
+    return advanced(equations_for_steps(model_of(system, t, *y, merge(params, u))), method, t, y, dt, way)
 
 
 def _rows(controls: Any, dtype: DTypeLike):

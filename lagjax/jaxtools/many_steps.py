@@ -10,11 +10,15 @@ goes back from one to the one before, without any step made again to find where 
 So what reverse mode keeps are the states, and what one step needs is computed again from its state. Both are functions
 of the states like any other, and can be differentiated again.
 
+There may be two ways to make a step, a fast one that gives NaN where it fails, and another: if a step of a motion, or
+of any lane of a batch, fails the first way, all are made the second way, and so are their derivatives.
+
 Source: Griewank & Walther, *Evaluating Derivatives*, §3.2 (adjoints of a sequence of steps), ch. 12 (states kept).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 
 import jax
@@ -31,17 +35,19 @@ from lagjax.jaxtools.primitives import front, is_float, linear_map_primitive, no
 from lagjax.jaxtools.tracing import is_plain
 
 
-def steps_in_both_modes(step: Callable, y: PyTree, rows: PyTree, fixed: PyTree) -> PyTree:
+def steps_in_both_modes(ways: Sequence[Callable], y: PyTree, rows: PyTree, fixed: PyTree) -> PyTree:
     """The states after each of N steps `y = step(y, row, fixed)`, as one machine function where that is possible.
 
     >>> import jax
     >>> import jax.numpy as jnp
-    >>> grown = lambda rate: steps_in_both_modes(lambda y, h, r: y * (1 + r * h), 1.0, jnp.array([0.5, 0.5]), rate)
+    >>> step = lambda y, h, rate: y * (1 + rate * h)
+    >>> grown = lambda rate: steps_in_both_modes([step], 1.0, jnp.array([0.5, 0.5]), rate)
     >>> print(grown(2.0), jax.grad(lambda rate: grown(rate)[1])(2.0))
     [2. 4.] 2.0
 
-    **Arguments:** a state `y` of floats; `rows`, arrays with an axis of N in front; `fixed`, the same in all steps.
-    Leaves that are no arrays are compiled in. `step` must not close over traced values.
+    **Arguments:** `ways`, one function for a step, or two; a state `y` of floats; `rows`, arrays with an axis of N in
+    front; `fixed`, the same in all steps. Leaves that are no arrays are compiled in. A way must not close over traced
+    values.
 
     **Returns:** states like `y`, with an axis of N in front.
     """
@@ -50,28 +56,32 @@ def steps_in_both_modes(step: Callable, y: PyTree, rows: PyTree, fixed: PyTree) 
     arrays = [i for i, x in enumerate(leaves) if hasattr(x, "shape")]
     counts = len(jtu.tree_leaves(y)), len(jtu.tree_leaves(rows))
 
-    def of_leaves(*operands):
+    def of_leaves(way: Callable, *operands):
         given = list(leaves)
         for i, x in zip(arrays, operands):
             given[i] = x
-        return jtu.tree_leaves(step(*jtu.tree_unflatten(structure, given)))
+        return jtu.tree_leaves(way(*jtu.tree_unflatten(structure, given)))
 
     operands = [leaves[i] for i in arrays]
     leaves = [None if i in arrays else x for i, x in enumerate(leaves)]
+    flat = [partial(of_leaves, way) for way in ways]
     if is_plain():
-        found = _Steps(of_leaves, *counts, True).run(*operands)
+        found = _Steps(tuple(flat), *counts, True).run(*operands)
     else:
-        # Jitted, so that it is traced once.
-        found = _steps_p.bind(*map(jnp.asarray, operands), of=_Steps(jax.jit(of_leaves), *counts, False))
-    return jtu.tree_unflatten(jtu.tree_structure(y), found)
+        # Jitted, so that each is traced once.
+        found = _steps_p.bind(*map(jnp.asarray, operands), of=_Steps(tuple(map(jax.jit, flat)), *counts, False))
+    return jtu.tree_unflatten(jtu.tree_structure(y), found[: counts[0]])
 
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps of flat lists: `step(*y, *row, *fixed)` -> the next y; how many arrays of y and of rows there are; `lanes`:
-    whether they are those of a batch, whose axis follows that of the steps."""
+    """Steps of flat lists: each of `ways(*y, *row, *fixed)` -> the next y; how many arrays of y and of rows there are;
+    `lanes`: whether they are those of a batch, whose axis follows that of the steps.
 
-    step: Callable
+    Results are the states, and with two ways whether the first did not fail.
+    """
+
+    ways: tuple[Callable, ...]
     states: int
     rows: int
     lanes: bool
@@ -85,15 +95,34 @@ class _Steps:
         """A function of these steps at some arguments."""
         return function(*args) if self.lanes else one_function(function, *args)
 
+    @property
+    def results(self) -> int:
+        """How many there are."""
+        return self.states + len(self.ways) - 1
+
     def run(self, *operands) -> list[Array]:
         """The states after each step."""
+        first = self._run(self.ways[0], operands)
+        if len(self.ways) == 1:
+            return first
+        well = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in first]))
+        return [*lax.cond(well, lambda: first, lambda: self._run(self.ways[1], operands)), well]
+
+    def _run(self, way: Callable, operands: Sequence) -> list[Array]:
         y, rows, fixed = self.parts(operands)
 
         def one(y: list, row: list):
-            y = [x.astype(old.dtype) for x, old in zip(self.step(*y, *row, *fixed), y)]
+            y = [x.astype(old.dtype) for x, old in zip(way(*y, *row, *fixed), y)]
             return y, y
 
         return lax.scan(one, y, rows)[1]
+
+    def _by_way(self, derivative: Callable, points: Sequence, *args) -> list[Array]:
+        """A derivative of the way that was taken."""
+        if len(self.ways) == 1:
+            return derivative(self.ways[0], points, *args)
+        *points, well = points
+        return lax.cond(well, *(partial(derivative, way, points, *args) for way in self.ways))
 
     def _begins(self, points: Sequence) -> tuple[list, list, list]:
         """Where each step begins, the rows, and what is fixed, from the operands and the states after each step."""
@@ -103,6 +132,9 @@ class _Steps:
 
     def along(self, points: Sequence, directions: Sequence, moved: Sequence[int]) -> list[Array]:
         """The change of the states with the operands that are `moved`."""
+        return self._by_way(self._along, points, directions, moved)
+
+    def _along(self, way: Callable, points: Sequence, directions: Sequence, moved: Sequence[int]) -> list[Array]:
         begins, rows, fixed = self._begins(points)
         given, places = dict(zip(moved, directions)), self._places(moved)
         start = [given.get(i, jnp.zeros_like(x[0])) for i, x in enumerate(begins)]
@@ -110,20 +142,23 @@ class _Steps:
 
         def one(dy: list, here: tuple):
             y, row, d_row = here
-            _, dy = jax.jvp(*self._of([*y, *row, *fixed], places), [*dy, *d_row, *of_fixed])
+            _, dy = jax.jvp(*_of(way, [*y, *row, *fixed], places), [*dy, *d_row, *of_fixed])
             return dy, dy
 
         return lax.scan(one, start, (begins, rows, of_rows))[1]
 
     def back(self, points: Sequence, cotangents: Sequence, moved: Sequence[int]) -> list[Array]:
         """The transpose of that: the slopes by the operands that are `moved`."""
+        return self._by_way(self._back, points, cotangents, moved)
+
+    def _back(self, way: Callable, points: Sequence, cotangents: Sequence, moved: Sequence[int]) -> list[Array]:
         begins, rows, fixed = self._begins(points)
         places = self._places(moved)
         ends = np.cumsum([len(part) for part in places])[:-1]
 
         def one(after: tuple, here: tuple):
             (of_y, of_fixed), (y, row, added) = after, here
-            step, at = self._of([*y, *row, *fixed], places)
+            step, at = _of(way, [*y, *row, *fixed], places)
             found = jax.vjp(step, *at)[1]([a + b for a, b in zip(of_y, added)])
             of_y, of_row, share = found[: ends[0]], found[ends[0] : ends[1]], found[ends[1] :]
             return (list(of_y), [a + b for a, b in zip(of_fixed, share)]), list(of_row)
@@ -138,21 +173,23 @@ class _Steps:
         first, end = self.states, self.states + self.rows
         return list(range(first)), [i for i in moved if first <= i < end], [i for i in moved if i >= end]
 
-    def _of(self, at: list, places: tuple) -> tuple[Callable, list]:
-        """A step as a function of some of its arguments, and these."""
-        chosen = list(chain(*places))
-
-        def of_chosen(*given):
-            operands = list(at)
-            for i, x in zip(chosen, given):
-                operands[i] = x
-            return [x.astype(old.dtype) for x, old in zip(self.step(*operands), at)]
-
-        return of_chosen, [at[i] for i in chosen]
-
     def in_lanes(self, batched: Sequence[bool]) -> "_Steps":
         """The same for a batch."""
-        return replace(self, step=jax.vmap(self.step, [0 if b else None for b in batched]), lanes=True)
+        axes = [0 if b else None for b in batched]
+        return replace(self, ways=tuple(jax.vmap(way, axes) for way in self.ways), lanes=True)
+
+
+def _of(way: Callable, at: list, places: tuple) -> tuple[Callable, list]:
+    """A step as a function of some of its arguments, and these."""
+    chosen = list(chain(*places))
+
+    def of_chosen(*given):
+        operands = list(at)
+        for i, x in zip(chosen, given):
+            operands[i] = x
+        return [x.astype(old.dtype) for x, old in zip(way(*operands), at)]
+
+    return of_chosen, [at[i] for i in chosen]
 
 
 def _evaluated(*operands, of: _Steps):
@@ -161,15 +198,18 @@ def _evaluated(*operands, of: _Steps):
 
 def _shapes(*operands, of: _Steps):
     y, rows, _ = of.parts(operands)
-    return [ShapedArray((rows[0].shape[0], *x.shape), x.dtype) for x in y]
+    states = [ShapedArray((rows[0].shape[0], *x.shape), x.dtype) for x in y]
+    return states + [ShapedArray((), np.dtype(bool))] * (of.results - of.states)
 
 
 def _jvp(primals: Sequence, tangents: Sequence, *, of: _Steps):
-    states = _steps_p.bind(*primals, of=of)
+    found = _steps_p.bind(*primals, of=of)
     moved = tuple(i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero) and is_float(primals[i]))
+    still = [no_tangent(x) for x in found]
     if not moved:
-        return states, [no_tangent(y) for y in states]
-    return states, _tangent_p.bind(*primals, *states, *(tangents[i] for i in moved), of=of, moved=moved)
+        return found, still
+    directions = [tangents[i] for i in moved]
+    return found, [*_tangent_p.bind(*primals, *found, *directions, of=of, moved=moved), *still[of.states :]]
 
 
 def _batched(operands: Sequence, axes: Sequence, *, of: _Steps):
@@ -183,7 +223,7 @@ def _batched(operands: Sequence, axes: Sequence, *, of: _Steps):
             operands[i] = jnp.moveaxis(operands[i], 0, 1)
     batched = (True,) * first_row + batched[first_row:]
     found = _steps_p.bind(*operands, of=of.in_lanes(batched))
-    return found, [1] * len(found)
+    return found, [1] * of.states + [None] * (of.results - of.states)
 
 
 def _pushed(points: Sequence, directions: Sequence, *, of: _Steps, moved: Sequence[int]):
@@ -207,7 +247,7 @@ def _pulled(
 
 def _pushed_shapes(*operands, of: _Steps, moved: Sequence[int]):
     points, _ = split(operands, len(moved))
-    return [ShapedArray(x.shape, x.dtype) for x in split(points, of.states)[1]]
+    return [ShapedArray(x.shape, x.dtype) for x in split(points, of.results)[1][: of.states]]
 
 
 def _flat(of: _Steps, moved: Sequence[int]) -> Callable:

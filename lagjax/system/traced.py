@@ -339,9 +339,10 @@ def _is_plain(x: Array) -> bool:
 
 def _is_in_library(x: Any) -> bool:
     """Whether it is a function without a name in a library, such as the activation of a network's last layer."""
-    module = sys.modules.get(getattr(x, "__module__", None) or "")
-    of_module = type(x) is types.FunctionType and module is not None and x.__globals__ is vars(module)
-    return of_module and _is_library(module.__name__) and _finds_names(x, [])
+    module = getattr(x, "__module__", None) or ""
+    if type(x) is not types.FunctionType or not _is_library(module) or module not in sys.modules:
+        return False
+    return x.__globals__ is vars(sys.modules[module]) and _finds_names(x, [])
 
 
 # Functions stay as they are where lanes would save fewer operations: to bring operands together takes as many.
