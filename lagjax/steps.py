@@ -319,25 +319,27 @@ def _rolled(
     equations = equations_for_steps(model_of(system, *s[:3], params))
     if merge is None:
         # What does not depend on the state is prepared once.
-        step, fixed = _next, (equations, dt)
+        step, fixed = _next, (equations,)
     else:
-        step, fixed = _next_with_control, (system, s.params, merge, dt)
+        step, fixed = _next_with_control, (system, s.params, merge)
     # Many steps are made the fast way, and all once more the robust way if one of them fails: a step of both would be
     # compiled, and differentiated, with a branch.
     ways = (_fast, _robust) if equations.fallback else (_robust if equations.written is None else _fast,)
     steps = [partial(step, method=method, way=way) for way in ways]
-    states = steps_in_both_modes(steps, (s.q, s.v), (t[:-1], held), fixed)
+    # Each row has the length of its step: one that is known XLA writes into the stages, which it then computes again
+    # for each use. Lanes of a double pendulum take 1.7 times as long.
+    states = steps_in_both_modes(steps, (s.q, s.v), (t[:-1], jnp.broadcast_to(dt, (count,)), held), fixed)
     q, v = jtu.tree_map(lambda x0, x: jnp.concatenate([x0[None], x]), (s.q, s.v), states)
     return t, q, v
 
 
 def _next(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
-    (t, _), (equations, dt) = row, fixed
+    (t, dt, _), (equations,) = row, fixed
     return advanced(equations, method, t, y, dt, way)
 
 
 def _next_with_control(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
-    (t, u), (system, params, merge, dt) = row, fixed
+    (t, dt, u), (system, params, merge) = row, fixed
     return advanced(equations_for_steps(model_of(system, t, *y, merge(params, u))), method, t, y, dt, way)
 
 

@@ -16,10 +16,12 @@ of any lane of a batch, fails the first way, all are made the second way, and so
 Source: Griewank & Walther, *Evaluating Derivatives*, §3.2 (adjoints of a sequence of steps), ch. 12 (states kept).
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,20 +104,25 @@ class _Steps:
 
     def run(self, *operands) -> list[Array]:
         """The states after each step."""
-        first = self._run(self.ways[0], operands)
+        first, well = self._run(self.ways[0], operands)
         if len(self.ways) == 1:
             return first
-        well = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in first]))
-        return [*lax.cond(well, lambda: first, lambda: self._run(self.ways[1], operands)), well]
+        return [*lax.cond(well, lambda: first, lambda: self._run(self.ways[1], operands)[0]), well]
 
-    def _run(self, way: Callable, operands: Sequence) -> list[Array]:
+    def _run(self, way: Callable, operands: Sequence) -> tuple[list[Array], Array]:
+        """The states, and whether all are finite, if there is another way."""
         y, rows, fixed = self.parts(operands)
 
-        def one(y: list, row: list):
+        def one(before: tuple, row: list):
+            y, well = before
             y = [x.astype(old.dtype) for x, old in zip(way(*y, *row, *fixed), y)]
-            return y, y
+            if len(self.ways) > 1:
+                # Step by step: a program with a large sum is no single function. Zero times NaN or infinity is NaN.
+                well &= sum(jnp.sum(0 * x) for x in y) == 0
+            return (y, well), y
 
-        return lax.scan(one, y, rows)[1]
+        (_, well), states = in_pieces(one, (y, jnp.asarray(True)), rows)
+        return states, well
 
     def _by_way(self, derivative: Callable, points: Sequence, *args) -> list[Array]:
         """A derivative of the way that was taken."""
@@ -145,7 +152,7 @@ class _Steps:
             _, dy = jax.jvp(*_of(way, [*y, *row, *fixed], places), [*dy, *d_row, *of_fixed])
             return dy, dy
 
-        return lax.scan(one, start, (begins, rows, of_rows))[1]
+        return in_pieces(one, start, (begins, rows, of_rows))[1]
 
     def back(self, points: Sequence, cotangents: Sequence, moved: Sequence[int]) -> list[Array]:
         """The transpose of that: the slopes by the operands that are `moved`."""
@@ -164,7 +171,7 @@ class _Steps:
             return (list(of_y), [a + b for a, b in zip(of_fixed, share)]), list(of_row)
 
         zeros = [jnp.zeros_like(x[0]) for x in begins], [jnp.zeros_like(points[i]) for i in places[2]]
-        (start, shares), by_row = lax.scan(one, zeros, (begins, rows, list(cotangents)), reverse=True)
+        (start, shares), by_row = in_pieces(one, zeros, (begins, rows, list(cotangents)), reverse=True)
         found = dict(zip(chain(*places), [*start, *by_row, *shares]))
         return [found[i] for i in moved]
 
@@ -177,6 +184,35 @@ class _Steps:
         """The same for a batch."""
         axes = [0 if b else None for b in batched]
         return replace(self, ways=tuple(jax.vmap(way, axes) for way in self.ways), lanes=True)
+
+
+def in_pieces(one: Callable, carry: Any, rows: PyTree, reverse: bool = False) -> tuple[Any, PyTree]:
+    """`lax.scan`, as a loop over loops of about √N steps if N has such a divisor.
+
+    On a CPU, XLA compiles a loop that touches little memory as one function, here the inner one, also of many lanes.
+    """
+    count = jtu.tree_leaves(rows)[0].shape[0]
+    length = piece_length(count)
+
+    def cut(x: Array):
+        return x.reshape(count // length, length, *x.shape[1:])
+
+    def piece(carry: Any, rows: PyTree):
+        return lax.scan(one, carry, rows, reverse=reverse)
+
+    if length in (1, count):
+        return piece(carry, rows)
+    carry, found = lax.scan(piece, carry, jtu.tree_map(cut, rows), reverse=reverse)
+    return carry, jtu.tree_map(lambda x: x.reshape(count, *x.shape[2:]), found)
+
+
+def piece_length(count: int) -> int:
+    """The divisor of `count` next to its root.
+
+    >>> [piece_length(count) for count in (64, 50, 53)]
+    [8, 5, 1]
+    """
+    return max(n for n in range(1, math.isqrt(count) + 1) if count % n == 0)
 
 
 def _of(way: Callable, at: list, places: tuple) -> tuple[Callable, list]:
