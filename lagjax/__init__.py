@@ -12,7 +12,13 @@ functions return; their classes are imported from where they are defined, `from 
 T + V only for natural, time-independent coordinates.
 """
 
+import sys
+
 import lazy_loader
+
+if "jax" in sys.modules:
+    # Not later: JAX would compile again what it has compiled by then.
+    from lagjax import contexts as contexts
 
 __version__ = "0.2.0"
 

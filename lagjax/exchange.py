@@ -42,9 +42,10 @@ import numpy as np
 from jax import export as jax_export
 from jaxtyping import PyTree
 
+from lagjax.contexts import SILENT
 from lagjax.integrate import RESULTS, Trajectory
 from lagjax.integrate import in_words as result_in_words
-from lagjax.jaxtools import SILENT, calls_host, jaxpr_as_fun, once, poisoned
+from lagjax.jaxtools import calls_host, jaxpr_as_fun, once, poisoned
 from lagjax.mechanics import listed
 from lagjax.refusals import installed, must, must_be, must_be_function, must_not_meet
 from lagjax.system import OF_POSITION, OF_STATE, Holonomic, Nonholonomic, System

@@ -23,9 +23,9 @@ ROOT = Path(lagjax.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 # From the ground up: a module imports only from its own room or from those before it.
 ROOMS = (
-    "jaxtools", "refusals", "numerics", "display", "shapes", "files", "system", "mechanics", "learned", "steps",
-    "integrate", "guards", "exchange", "analysis", "work_precision", "sweep", "sliders", "fit", "two_points", "report",
-    "bodies", "models", "mechanisms", "scenes", "stability",
+    "contexts", "jaxtools", "refusals", "numerics", "display", "shapes", "files", "system", "mechanics", "learned",
+    "steps", "integrate", "guards", "exchange", "analysis", "work_precision", "sweep", "sliders", "fit", "two_points",
+    "report", "bodies", "models", "mechanisms", "scenes", "stability",
 )  # fmt: skip
 TOP = {"__init__", "__main__", "job"}
 FINDER = doctest.DocTestFinder()

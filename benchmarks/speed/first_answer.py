@@ -214,22 +214,21 @@ QUESTIONS = {
         ), GRADIENT.format(
             of="bare(by_hand, *start, params)(*jax.tree.map(jnp.asarray, start), params | {'g': g})[0]['x'][-1]",
             jit="jax.jit",
-        ), 2.0, kept=None,
+        ), 2.0,
     ),
     "ball with a contact": Question(BALL, SOLVED, None, 6.0),
     "gradient through a contact": Question(
         BALL, GRADIENT.format(of="lj.integrate(system, *start, params | {'g': g}, ts=ts).q[-1]", jit=""), None, 20.0,
-        kept=None,
     ),
     "gradient through a contact in 64 lanes": Question(
         BALL, "end = lambda h, g: lj.integrate(system, h, 0.0, {'g': g}, ts=ts).q[-1]\n"
         "lanes = jax.vmap(jax.grad(end, argnums=1), (0, None))\n"
-        "answer = lambda x: lanes(jnp.linspace(1.0, 1.2, 64), 9.81 * x)", None, 24.0, kept=None,
+        "answer = lambda x: lanes(jnp.linspace(1.0, 1.2, 64), 9.81 * x)", None, 24.0,
     ),
     "gradient of a mean of lanes through a contact": Question(
         BALL, "end = lambda h, g: lj.integrate(system, h, 0.0, {'g': g}, ts=ts).q[-1]\n"
         "mean = lambda g: jnp.mean(jax.vmap(end, (0, None))(jnp.linspace(1.0, 1.2, 64), g))\n"
-        "answer = lambda x: jax.grad(mean)(9.81 * x)", None, 29.0, kept=None,
+        "answer = lambda x: jax.grad(mean)(9.81 * x)", None, 29.0,
     ),
     "accelerations on the rod": Question(ROD, ACCELERATIONS, None, 0.6),
     "sweep of 1,000 pendulums": Question(

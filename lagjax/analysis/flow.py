@@ -43,6 +43,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.contexts import WATCHED
 from lagjax.integrate import (
     HybridTrajectory,
     Switches,
@@ -51,7 +52,7 @@ from lagjax.integrate import (
     solve_in_both_modes,
     switches_before_any,
 )
-from lagjax.jaxtools import WATCHED, compiled, is_eager, is_traced, stop_gradient
+from lagjax.jaxtools import compiled, is_eager, is_traced, stop_gradient
 from lagjax.mechanics import equations_of, resolved, with_first_order
 from lagjax.numerics import Dopri8, last_step, newton
 from lagjax.system import Hybrid, Model, State, System, constraints, coordinates, model_of

@@ -35,6 +35,7 @@ Source: Goldstein, *Classical Mechanics*, Eq. (2.1), (2.2).
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -478,16 +479,22 @@ def _action_of_trajectory(system, path, params: PyTree, t0, t1, pieces):
             )
     if is_eager() and not is_traced((path, t0, t1, s.params, eqx.filter(system, eqx.is_array))):
         return _along_the_steps(system, path, s.params, float(t0), float(t1))
+    ends = jnp.stack([jnp.asarray(end, t.dtype) for end in (t0, t1)])
+    return _in_one_solve(system, path, s.params, ends, pieces)
 
+
+@partial(compiled, in_line=True)
+def _in_one_solve(system, path, params: PyTree, ends: Array, pieces: int):
+    """The action between two times of a trajectory, and its error, in a program."""
+    t, q, v = path.t, path.q, path.v
     # From the earlier end, as the motion runs, to the later one.
     runs = -1 if path.static.how.backward else 1
-    ends = jnp.stack([jnp.asarray(end, t.dtype) for end in (t0, t1)])
     turned = runs * ends[0] > runs * ends[1]
     first, last = jnp.where(turned, ends[::-1], ends)
     edges = first + (last - first) * jnp.linspace(0.0, 1.0, max(pieces, len(t) - 1) + 1, dtype=t.dtype)
     nodes = quadrature.nodes(edges[:-1], edges[1:]).ravel()
     at = in_one_solve(path, nodes)
-    values = jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, s.params))(nodes, at.q, at.v)
+    values = jax.vmap(lambda t, q, v: system.lagrangian(t, q, v, params))(nodes, at.q, at.v)
     values = values.reshape(-1, quadrature.NODES.size)
     # NaN for a motion that failed, also where the nodes lie before that.
     complete = jnp.all(jnp.isfinite(jnp.concatenate([x.ravel() for x in jax.tree.leaves((q, v))])))

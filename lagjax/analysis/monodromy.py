@@ -37,8 +37,9 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from lagjax.analysis.flow import TOLERANCE, Flow, SwitchingFlow, any_flow, flow_of, independent_rows_of, scale_of
 from lagjax.analysis.shooting import TURN, in_parts, times_of
+from lagjax.contexts import WATCHED
 from lagjax.integrate import InElements, integrate, phases_in, traced_phases
-from lagjax.jaxtools import WATCHED, compiled, depends, is_eager, is_traced, numpy_of
+from lagjax.jaxtools import compiled, depends, is_eager, is_traced, numpy_of
 from lagjax.mechanics import are_angles, explain_failure, invariance
 from lagjax.system import (
     Hybrid,

@@ -346,6 +346,7 @@ def _searched(system, s, period, rtol, asked: OrbitRequest, rows, parts, turns, 
     return SearchResult(search.y, guess, search.at, converged, search.steps, apart)
 
 
+@compiled
 def implicit(system, s, rtol, asked: OrbitRequest, rows, found: SearchResult) -> SearchResult:
     """The same orbit with its derivatives by the system, parameters and held quantities, from one more Newton step."""
     flow, t = any_flow(system, s, rtol, rows), s.t

@@ -13,7 +13,6 @@ from lagjax.integrate.load import check_is_system, described_system, load_trajec
 from lagjax.integrate.pictures import curves, draw, drawn, film_of_lanes, still, subject_of
 from lagjax.integrate.replay import Replay
 from lagjax.integrate.results import ENDED_WELL, RESULTS, angle_mask, ended_well, in_words, is_among, message
-from lagjax.integrate.settings import PATIENCE
 from lagjax.integrate.solve.legs import JumpWarning
 from lagjax.integrate.solve.phases import OfPhases, Plastic, phases_in, runs_backward, traced_phases
 from lagjax.integrate.solve.programs import nystrom_for

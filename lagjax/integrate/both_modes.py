@@ -42,10 +42,17 @@ from jax import lax
 from jax.core import ShapedArray
 from jaxtyping import PyTree
 
+from lagjax.contexts import COLUMNS
 from lagjax.integrate.replay import Replay, filled
 from lagjax.jaxtools import (
+    FEW,
+    Columns,
+    Lanes,
     ad,
+    along_columns,
+    axes_of,
     front,
+    have_columns,
     is_float,
     jaxpr_as_fun,
     linear_map_primitive,
@@ -236,11 +243,6 @@ _turned_p = linear_map_primitive(
 )  # fmt: skip
 
 
-# Up to this many derivatives of one number, pushing all of them forward was cheaper to run and to compile than one pull
-# back through checkpoints. From where on a replay is cheaper was not measured.
-PUSH_UP_TO = 24
-
-
 def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: bool) -> PyTree:
     """Return the result of `solve(x, fixed, adjoint, differentiated)`, differentiable in both modes in `x`.
 
@@ -249,6 +251,8 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
     closes over no traced value. `differentiated`: whether this solve is for a derivative; `recorded`: whether there is
     a record.
     """
+    if COLUMNS.value:
+        return solve(x, fixed, diffrax.ForwardMode(), True)[0]
     leaves, structure = jtu.tree_flatten((x, fixed))
     shapes = {}
 
@@ -257,18 +261,18 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
         shapes["y"], shapes[type(adjoint)] = map(jtu.tree_structure, found)
         return tuple(jtu.tree_leaves(part) for part in found)
 
-    def outputs(adjoint: Any, *operands):
+    def results(adjoint: Any, *operands):
         leaves, record = operands[: structure.num_leaves], operands[structure.num_leaves :]
         if isinstance(adjoint, Replay):
             adjoint = replace(adjoint, record=jtu.tree_unflatten(shapes[Replay], record) if record else None)
-        return [y for y in solve_flat(adjoint, True, *leaves)[0] if is_float(y)]
+        return solve_flat(adjoint, True, *leaves)[0]
 
     # Undifferentiated, the solve is a program that other transformations may look into, as into a call.
     program = jax.make_jaxpr(lambda *leaves: solve_flat(diffrax.ForwardMode(), False, *leaves)[0])(*leaves)
     with_record = jax.jit(partial(solve_flat, Replay(), True))
     rules = _Solve(
         with_record if recorded else None,
-        outputs,
+        results,
         lambda *record: jtu.tree_unflatten(shapes[Replay], record).record.count == 0,
         len(jtu.tree_leaves(x)),
     )
@@ -280,13 +284,13 @@ def solve_in_both_modes(solve: Callable, x: PyTree, fixed: PyTree, recorded: boo
 class _Solve:
     """How to differentiate a solve, a function of arrays, with respect to the first `size` of them.
 
-    `recorded(*leaves)` gives the arrays of the result and of the record; None without a record. `outputs(adjoint,
-    *leaves, *record)` gives the floating arrays of the result, for a derivative; `no_steps(*record)` whether the motion
-    was refused. `axes`: the lane axis of each array; None without lanes.
+    `recorded(*leaves)` gives the arrays of the result and of the record; None without a record. `results(adjoint,
+    *leaves, *record)` gives those of the result, for a derivative; `no_steps(*record)` whether the motion was refused.
+    `axes`: the lane axis of each array; None without lanes.
     """
 
     recorded: Callable | None
-    outputs: Callable
+    results: Callable
     no_steps: Callable
     size: int
     axes: tuple | None = None
@@ -308,12 +312,12 @@ class _Solve:
     def in_lanes(self, axes, count: int):
         """Return the same for lanes, whose axis comes first in the results."""
 
-        def outputs(adjoint: Any, *operands):
+        def results(adjoint: Any, *operands):
             more = [0] * (len(operands) - len(axes))
-            return jax.vmap(partial(self.outputs, adjoint), [*axes, *more], axis_size=count)(*operands)
+            return jax.vmap(partial(self.results, adjoint), [*axes, *more], axis_size=count)(*operands)
 
         recorded = self.recorded and jax.vmap(self.recorded, axes, axis_size=count)
-        return _Solve(recorded, outputs, self.no_steps, self.size, tuple(axes))
+        return _Solve(recorded, results, self.no_steps, self.size, tuple(axes))
 
 
 def _solved(*leaves, program: Any, rules: _Solve):
@@ -328,6 +332,9 @@ def _solved_jvp(primals: Sequence, tangents: Sequence, *, program: Any, rules: _
     # Arrays without a tangent are constants: a tangent of zeros would be carried through every step.
     moved = [i for i in range(rules.size) if not isinstance(tangents[i], ad.Zero)]
 
+    directions = [tangents[i] for i in moved]
+    if have_columns([primals[i] for i in moved], directions):
+        return _by_columns(primals, moved, directions, program, rules)
     if rules.recorded is None or not moved or _are_few(primals[i] for i in moved):
         # Bind the primitive, so that a second derivative finds this rule again.
         values, record = _solve_p.bind(*primals, program=program, rules=rules), []
@@ -336,19 +343,72 @@ def _solved_jvp(primals: Sequence, tangents: Sequence, *, program: Any, rules: _
     if not moved:
         return values, [no_tangent(y) for y in values]
     # The record only says around which motion to replay; it is not differentiated.
-    leaves = [*primals, *stop_gradient(record)]
-    order = moved + [i for i in range(len(leaves)) if i not in moved]
-    place = [order.index(i) for i in range(len(leaves))]
+    dy = iter(_changes(primals, stop_gradient(record), moved, directions, values, rules, many=False))
+    return values, [next(dy) if is_float(y) else no_tangent(y) for y in values]
+
+
+def _changes(
+    leaves: Sequence, record: Sequence, moved: Sequence[int], directions: Sequence, values: Sequence, rules: _Solve,
+    many: bool,
+):  # fmt: skip
+    """The changes of the results along directions of the arrays that are `moved`."""
+    operands, count = [*leaves, *record], len(leaves)
+    order = [*moved, *(i for i in range(len(operands)) if i not in moved)]
+    place = [order.index(i) for i in range(len(operands))]
 
     def outputs(adjoint: Any, *operands):
         operands = [operands[i] for i in place]
-        leaves, record = operands[: len(primals)], operands[len(primals) :]
-        return rules.outputs(adjoint, *rules.without_refused(leaves, record), *record)
+        leaves, record = operands[:count], operands[count:]
+        found = rules.results(adjoint, *rules.without_refused(leaves, record), *record)
+        return [y for y in found if is_float(y)]
 
     shapes = tuple((y.shape, y.dtype) for y in values if is_float(y))
-    params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=False)
-    dy = iter(_tangent_p.bind(*(leaves[i] for i in order), *(tangents[i] for i in moved), **params))
+    params = dict(outputs=outputs, shapes=shapes, size=len(moved), many=many)
+    return _tangent_p.bind(*(operands[i] for i in order), *directions, **params)
+
+
+def _by_columns(primals: Sequence, moved: Sequence[int], directions: Sequence, program: Any, rules: _Solve):
+    """The results and their changes, from one solve with the derivatives by all numbers that are `moved`."""
+
+    def apart(*leaves):
+        values = _solve_p.bind(*leaves, program=program, rules=rules)
+        axes = axes_of([leaves[i] for i in moved])
+        return [*values, *_changes(leaves, [], moved, axes, values, rules, many=True)]
+
+    results = program.out_avals
+    numbers = sum(primals[i].size for i in moved)
+    columns = [ShapedArray((numbers, *y.shape), y.dtype) for y in results if is_float(y)]
+    at_once = Columns(tuple(moved)).of(lambda leaves: list(rules.results(diffrax.ForwardMode(), *leaves)))
+    found = _columns_p.bind(*primals, at_once=at_once, apart=apart, shapes=(*results, *columns))
+    values, columns = found[: len(results)], found[len(results) :]
+    dy = iter(along_columns(columns, directions))
     return values, [next(dy) if is_float(y) else no_tangent(y) for y in values]
+
+
+def _columns(*leaves, at_once: Callable, apart: Callable, shapes: tuple):
+    return at_once(list(leaves))
+
+
+def _columns_shapes(*leaves, at_once: Callable, apart: Callable, shapes: tuple):
+    return list(shapes)
+
+
+def _columns_jvp(primals: Sequence, tangents: Sequence, **params):
+    moved = [i for i, t in enumerate(tangents) if not isinstance(t, ad.Zero)]
+    chosen = tuple(primals[i] for i in moved)
+    _, found = jax.jvp(
+        lambda *chosen: params["apart"](*filled(primals, moved, chosen)), chosen, tuple(tangents[i] for i in moved)
+    )
+    values = _columns_p.bind(*primals, **params)
+    return values, [d if is_float(y) else no_tangent(y) for y, d in zip(values, found)]
+
+
+def _columns_batched(operands: Sequence, axes, *, at_once: Callable, apart: Callable, shapes: tuple):
+    operands, batched, count = front(operands, axes)
+    lanes = Lanes(batched)
+    shapes = tuple(ShapedArray((count, *y.shape), y.dtype) for y in shapes)
+    lanes_apart = lambda *leaves: lanes.of(lambda one: apart(*one))(leaves)
+    return _columns_p.bind(*operands, at_once=lanes.of(at_once), apart=lanes_apart, shapes=shapes), [0] * len(shapes)
 
 
 def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
@@ -360,7 +420,7 @@ def _solved_batched(operands: Sequence, axes, *, program: Any, rules: _Solve):
 
 
 def _are_few(leaves: Sequence):
-    return sum(a.size for a in leaves) <= PUSH_UP_TO
+    return sum(a.size for a in leaves) <= FEW
 
 
 # The operands of the derivative are the leaves of x, of what is fixed, and of dx; `size` is the number of leaves of x
@@ -538,6 +598,9 @@ def _lanes(x, fixed: Sequence, dx: Sequence, per_lane, batched_fixed, lanes, par
 
 _solve_p = primitive(
     "lagjax_trajectory", _solved, _solved_shapes, several=True, jvp=_solved_jvp, batched=_solved_batched
+)
+_columns_p = primitive(
+    "lagjax_trajectory_columns", _columns, _columns_shapes, several=True, jvp=_columns_jvp, batched=_columns_batched
 )
 _tangent_p = linear_map_primitive(
     "lagjax_trajectory_tangent", _tangent, _tangent_transpose, _tangent_shapes, lambda params: params["size"],

@@ -64,10 +64,10 @@ def at(trajectory, t: ArrayLike) -> Snapshot:
     dtype = trajectory.t.dtype
     t = _times(t, dtype)
     if not is_eager() or is_traced((trajectory, t)):
-        return _traced(trajectory, t)
+        return _at_all(trajectory, t)
     if trajectory.t.ndim > 1:
         _check_inside(t, np.asarray(trajectory.t)[..., 0], np.asarray(trajectory.t)[..., -1])
-        return _of_batch(trajectory, t)
+        return _at_all(trajectory, t)
     _check_ended(trajectory, t)
     times = t.ravel()
     known = _known_of(trajectory)
@@ -170,8 +170,9 @@ def _before(known: Instants, t, backward: bool):
     return xp.clip(index, 0, len(times) - 1)
 
 
-def _traced(trajectory, t):
-    """Return the motion at t in a traced program: NaN where there is no motion."""
+@partial(compiled, in_line=True)
+def _at_all(trajectory, t):
+    """Return the motion at t, of lanes as well, in a program: NaN where there is no motion."""
     if trajectory.in_phases:
         raise TypeError(IN_PHASES)
     of_one = partial(_at_one, trajectory)
@@ -179,10 +180,7 @@ def _traced(trajectory, t):
         of_one = jax.vmap(of_one)
     if trajectory.t.ndim == 1:
         return of_one(t)
-    return jax.vmap(lambda lane: _traced(lane, t))(trajectory)
-
-
-_of_batch = compiled(_traced)
+    return jax.vmap(lambda lane: _at_all(lane, t))(trajectory)
 
 
 def _at_one(trajectory, t):

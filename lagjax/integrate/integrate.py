@@ -12,6 +12,7 @@ import diffrax
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from lagjax.contexts import SILENT, WATCHED
 from lagjax.integrate import arguments
 from lagjax.integrate.events.event import Crossing
 from lagjax.integrate.failure import raise_at_run_time, raise_failure, warn_of_events, warn_of_missed_end
@@ -23,7 +24,7 @@ from lagjax.integrate.solve.legs import warn_of_lost
 from lagjax.integrate.solve.phases import run
 from lagjax.integrate.solve.reports import report
 from lagjax.integrate.trajectory import Trajectory
-from lagjax.jaxtools import SILENT, WATCHED, is_traced
+from lagjax.jaxtools import is_traced
 from lagjax.numerics import EqualSteps
 from lagjax.system import Hybrid, System, by_name
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from lagjax.contexts import PATIENCE
 from lagjax.numerics import EqualSteps
 
 # A right-hand side of up to this many operations is copied to each of a method's stages; a longer one is compiled once,
@@ -16,8 +16,6 @@ from lagjax.numerics import EqualSteps
 # in a loop, but a rod's first answer comes an eighth sooner, that of eight coupled masses in half the time. Derivatives
 # are taken without copies: the first takes two thirds of the time, each of the next ones a fifth more.
 UNROLL_UP_TO, UNROLL_AT_ONCE_UP_TO = 250, 30
-# In a batch, whose lanes wait for each other: the number of steps after which a motion is given up, to be run alone.
-PATIENCE = jax.make_user_context(default_value=None)
 
 
 # Making an equinox module takes longer than computing a short motion.

@@ -16,7 +16,8 @@ from lagjax.jaxtools.cache import (
     shape_of,
     varies,
 )
-from lagjax.jaxtools.compiled import NAMING, compiled, named, surroundings_for_names
+from lagjax.jaxtools.columns import FEW, Columns, Lanes, along_columns, axes_of, from_python, have_columns
+from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.dependence import is_linear, pattern
 from lagjax.jaxtools.fuse import (
     PRODUCT,
@@ -65,6 +66,7 @@ from lagjax.jaxtools.jaxpr import (
 )
 from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, NotKept, Said, Unusable
 from lagjax.jaxtools.many_steps import steps_in_both_modes
+from lagjax.jaxtools.names import named, surroundings_for_names
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,
     IN_TIME,
@@ -92,9 +94,6 @@ from lagjax.jaxtools.primitives import (
 from lagjax.jaxtools.scalarize import LARGE, TooLong, written_out
 from lagjax.jaxtools.tracing import (
     HAPPENED,
-    REGULAR_FIRST,
-    SILENT,
-    WATCHED,
     as_usual,
     at_once,
     decided,

@@ -26,6 +26,8 @@ from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Bool, PyTree
 
+from lagjax.contexts import REGULAR_FIRST, WATCHED
+
 # Run with 0.10.2: all tests; with 0.10.1: the fast ones; with the others: those of this package, a pendulum and a rod.
 KNOWN = {"0.10.1", "0.10.2", "0.11.0", "0.11.1", "0.11.2", "0.12.0", "0.12.0.1"}
 # Read once: compiled programs are kept, and the two kinds must not mix.
@@ -52,14 +54,6 @@ def is_plain() -> bool:
 # A new thread traces nothing, also where this module is imported inside a program.
 with ThreadPoolExecutor(1) as _thread:
     _EAGER = _thread.submit(get_opaque_trace_state).result()
-
-# Whether a caller watches the course of motions, lane by lane. A JAX context: inside it, functions that the user has
-# jitted are traced again.
-WATCHED = jax.make_user_context(default_value=False)
-# Whether failures are reported by their codes alone, in a program that cannot raise an error to anybody.
-SILENT = jax.make_user_context(default_value=False)
-# Whether the caller solves again with the robust method when equations assumed regular turn out singular.
-REGULAR_FIRST = jax.make_user_context(default_value=False)
 
 # What has happened, and how often, that has to happen in each process: a program that does it while it is traced is
 # not kept for another one.

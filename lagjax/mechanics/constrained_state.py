@@ -511,9 +511,7 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
     # A value that a function closes over may be traced where no argument is.
     given = s, eqx.filter(model, eqx.is_array)
     if not is_eager() or is_traced(given):
-        equations = equations_of(model, fast=True, differentiated=is_differentiated(given))
-        a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
-        return equations.outside(a), multipliers
+        return _accelerations_inside(model, s, is_differentiated(given))
     equations = equations_of(model)
     if not isinstance(equations.form, Dense):
         found = equations.verdict(s.t, s.q, s.v)
@@ -528,6 +526,13 @@ def accelerations_at(model: Model, s: coordinates.State) -> tuple[PyTree[Array],
     if not valid or explain_singular(np.asarray(found.matrix), model, s):
         raise ValueError(explain_failure(model, s) or f"the accelerations are not finite {where(s)}.")
     return solution
+
+
+@partial(compiled, in_line=True)
+def _accelerations_inside(model: Model, s: coordinates.State, differentiated: bool):
+    equations = equations_of(model, fast=True, differentiated=differentiated)
+    a, multipliers = equations.solution_or_nan(s.t, equations.inside(s.q), equations.inside(s.v))
+    return equations.outside(a), multipliers
 
 
 def constraint_force(system: System, t: ArrayLike, q: PyTree, v: PyTree, params: PyTree) -> dict[str, PyTree[Array]]:

@@ -39,8 +39,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from lagjax.contexts import WATCHED
 from lagjax.jaxtools import (
-    WATCHED,
     TooLong,
     compiled,
     decided,

@@ -33,12 +33,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from lagjax.contexts import WATCHED
 from lagjax.jaxtools import (
     ADDITIVE,
     BILINEAR,
     LINEAR_IN_FIRST,
     PERIODIC,
-    WATCHED,
     Literal,
     TooLong,
     calls_host,

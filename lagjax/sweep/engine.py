@@ -29,11 +29,10 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, PyTree
 
+from lagjax.contexts import NAMING, PATIENCE, REGULAR_FIRST
 from lagjax.display import waiting
-from lagjax.integrate import ENDED_WELL, PATIENCE, RESULTS, Trajectory, reporting, watched
+from lagjax.integrate import ENDED_WELL, RESULTS, Trajectory, reporting, watched
 from lagjax.jaxtools import (
-    NAMING,
-    REGULAR_FIRST,
     TOGETHER,
     ClosedJaxpr,
     Jaxpr,

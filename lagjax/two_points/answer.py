@@ -339,6 +339,7 @@ def is_same(a: Connection, b: Connection) -> bool:
 # -- In a program. --
 
 
+@compiled
 def inside(model: Model, ends: Ends, guess: PathGuess, count: int, outputs: int, rtol) -> Connection:
     """The answer from one start in a program, with derivatives in both modes."""
     start = stop_gradient(nodes_of(*stop_gradient((model, ends)), guess, count, DEGREE))

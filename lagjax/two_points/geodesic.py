@@ -34,7 +34,7 @@ from lagjax.integrate import Trajectory, integrate
 from lagjax.jaxtools import compiled, is_eager, is_traced
 from lagjax.mechanics import accelerations_at
 from lagjax.refusals import must_be_function, must_name
-from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare
+from lagjax.system import Model, State, System, check_system, constraints, coordinates, model_of, prepare, traced_system
 from lagjax.two_points.answer import Connection, is_same
 from lagjax.two_points.connect import ELEMENTS, connected
 from lagjax.two_points.elements import linear_motion, rule_of_degree
@@ -228,8 +228,8 @@ def _of(system, s, connection: Connection) -> Geodesic:
     # Between conjugate ends the start velocity has fewer digits than the action.
     moves = connection.trajectory is not None and not (known and connection.kind.startswith("degenerate"))
     length, starting, ending = _lengths(
-        system, s, connection.start_velocity, jax.tree.map(lambda x: x[-1], (connection.q, connection.v)),
-        connection.action, moves,
+        traced_system(system, s), s, connection.start_velocity,
+        jax.tree.map(lambda x: x[-1], (connection.q, connection.v)), connection.action, moves,
     )  # fmt: skip
     return Geodesic(length, starting, ending, eqx.tree_at(lambda c: c.others, connection, ()))
 

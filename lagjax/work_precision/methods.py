@@ -23,8 +23,9 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, PyTree
 
+from lagjax.contexts import REGULAR_FIRST
 from lagjax.integrate import Trajectory, arguments, integrate, nystrom_for, reporting, runs_backward
-from lagjax.jaxtools import REGULAR_FIRST, compiler_options, hashable_partition, kinds, program_of, to_jax
+from lagjax.jaxtools import compiler_options, hashable_partition, kinds, program_of, to_jax
 from lagjax.mechanics import is_free_of_velocities
 from lagjax.numerics import Dopri8, EqualSteps, Nystrom, Tsit5
 from lagjax.refusals import PACKAGES, must

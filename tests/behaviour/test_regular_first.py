@@ -10,10 +10,11 @@ import pytest
 from jax import lax
 
 import lagjax as lj
+from lagjax.contexts import REGULAR_FIRST, WATCHED
 from lagjax.integrate import in_turn
 from lagjax.integrate.solve import reports
 from lagjax.jaxtools.cache import PROGRAMS
-from lagjax.jaxtools.tracing import REGULAR_FIRST, WATCHED, takes_for_regular
+from lagjax.jaxtools.tracing import takes_for_regular
 from lagjax.sweep import engine
 from lagjax.sweep.axes import axes_of
 from tests.plain import not_plain

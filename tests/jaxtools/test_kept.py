@@ -376,6 +376,14 @@ doors = {
     "orbit": lambda: lj.periodic_orbit(system, (rest | {"a": 0.3}, rest), 8.8, {"l": 2.0}).period,
     "exponents": lambda: lj.lyapunov_exponents(system, q, v, {"l": 2.0}, ts=np.linspace(0.0, 30.0, 31)).exponents,
     "fit": lambda: lj.fit(system, record(), {"l": 1.0}, free="l").params,
+    "slope": lambda: jax.value_and_grad(end)(1.5),
+    "pushes": lambda: jax.jacfwd(end)(1.5),
+    "curvature": lambda: jax.hessian(end)(1.5),
+    "lanes of slopes": lambda: jax.vmap(jax.grad(end))(jnp.array([1.0, 1.5])),
+    "slope of lanes": lambda: jax.grad(lambda l: jnp.sum(jax.vmap(end)(l * jnp.array([1.0, 1.5]))))(1.5),
+    "slope of accelerations": lambda: jax.grad(
+        lambda l: lj.accelerations(system, 0.0, q, v, {"l": l})[0]["a"]
+    )(2.0),
     "sweep of slopes": lambda: lj.sweep(lambda at: jax.grad(end)(at["l"]), lengths).values,
     "sweep of curvatures": lambda: lj.sweep(lambda at: jax.hessian(end)(at["l"]), lengths).values,
     "sweep of pushes": lambda: lj.sweep(lambda at: jax.jacfwd(end)(at["l"]), lengths).values,
@@ -423,14 +431,15 @@ def test_motions_in_new_processes(tmp_path):
     assert counts == [(0, 1)] and changed == others[0] and folder.size(tmp_path)[0] == 2
 
 
-FEW = "accelerations,rollout,normal_modes,sweep"
+FEW = "accelerations,rollout,normal_modes,sweep,slope"
 MORE = "equilibria,orbit,exponents,fit,sweep of slopes,sweep of pushes,sweep of lanes,sweep of rests"
+FROM_PYTHON = "pushes,curvature,lanes of slopes,slope of lanes,slope of accelerations"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "doors, count",
-    [(FEW, 6), pytest.param(f"{MORE},sweep of curvatures", 11, marks=pytest.mark.exhaustive)],
+    [(FEW, 7), pytest.param(f"{MORE},{FROM_PYTHON},sweep of curvatures", 16, marks=pytest.mark.exhaustive)],
 )
 def test_doors_in_new_processes(tmp_path, doors, count):
     """The same bits without the folder, with an empty one, and from it, where nothing is compiled any more."""

@@ -70,7 +70,7 @@ def test_a_trajectory_knows():
 @pytest.mark.exhaustive
 def test_long_lanes_are_run_alone(monkeypatch):
     """Other lanes do not wait for them; lanes that hit the user's own step limit are not run again."""
-    monkeypatch.setattr(engine, "PATIENCE", 30)
+    monkeypatch.setattr(engine, "STEPS_TOGETHER", 30)
     run = lambda limit: jax.jit(lambda point: swing(point, max_steps=limit).q[-1])
     alone = run(2**16)
     swept = quiet(alone)

@@ -41,6 +41,7 @@ from lagjax.jaxtools import (
     as_usual,
     compiler_options,
     filled_up,
+    from_python,
     hashable_partition,
     is_eager,
     jitted,
@@ -106,7 +107,10 @@ def _inside(problem: Problem) -> Trajectory:
     def meant():
         return [((regular, repeats), False), *_meant(static, not regular)]
 
-    found = named(of_arrays, Said(meant, _outline, partial(_said_tree, static)), arrays)
+    said = Said(meant, _outline, partial(_said_tree, static))
+    found = named(of_arrays, said, arrays)
+    if found is None and problem.settings.adjoint is None:
+        found = from_python(one_by_one(of_arrays), said, (static, regular, repeats), arrays)
     return _traced(problem, regular, repeats) if found is None else found[0]
 
 

@@ -31,12 +31,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from lagjax.contexts import PATIENCE, REGULAR_FIRST, WATCHED
 from lagjax.integrate.results import ENDED_WELL, RESULTS, Errors, columns, ended_well, is_among, scaled_error
-from lagjax.integrate.settings import PATIENCE
 from lagjax.integrate.trajectory import Trajectory
 from lagjax.jaxtools import (
-    REGULAR_FIRST,
-    WATCHED,
     ClosedJaxpr,
     anywhere,
     applied,
