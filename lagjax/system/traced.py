@@ -2,7 +2,8 @@
 
 At each call from Python, each of the user's functions is traced on shapes, and a compiled program is used again only
 for the same jaxprs; arrays that a function reads from outside, however it comes by them, are arguments of the program.
-A function that names nothing from outside but library modules, builtins and functions like itself is traced once.
+A function that names nothing from outside but library modules, builtins, numbers and functions like itself is traced
+once: with another number of that name it is another function.
 
 So no value of the user's is ever read but by running his function, and no object stands in for another. Small arrays
 that a function reads are part of its jaxpr, as single numbers are. Tracing takes about half a millisecond.
@@ -89,7 +90,7 @@ def _binds(function: Callable, arguments):
 # jaxpr: the equations can then leave out what is multiplied by their zeros.
 SMALL, SMALL_INDICES = 1024, 4096
 # What a function may name and still be traced once: these libraries, but nothing in them that reads the outside.
-LIBRARIES = {"jax", "numpy", "math", "cmath", "operator", "functools", "itertools", "equinox"}
+LIBRARIES = {"jax", "numpy", "math", "cmath", "operator", "functools", "itertools", "equinox", "lagjax"}
 CHANGING = {
     "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "open", "input", "eval", "exec", "globals",
     "locals", "vars", "__import__", "modules", "environ", "import_module", "__globals__", "__dict__", "config",
@@ -271,9 +272,9 @@ def _is_small(x: Array):
 
 
 def names_outside(function: Callable) -> tuple | None:
-    """A function, its code and what both name from outside: library modules, builtins and functions like itself.
+    """A function, its code and what both name from outside: libraries, builtins, numbers and functions like itself.
 
-    None where it may read anything else. No value is looked at.
+    None where it may read anything else. No value is looked at: a number is known by being the very same object.
     """
     found: list = []
     return tuple(found) if _finds_names(function, found) else None
@@ -285,12 +286,16 @@ def _finds_names(function: Callable, found) -> bool:
     if any(x is function for x in found):
         return True
     names, opens_outside = _names_of(function.__code__)
-    if function.__closure__ or function.__defaults__ or function.__kwdefaults__ or function.__dict__ or opens_outside:
+    if function.__defaults__ or function.__kwdefaults__ or function.__dict__ or opens_outside:
+        return False
+    try:
+        enclosed = [cell.cell_contents for cell in function.__closure__ or ()]
+    except ValueError:
+        # One that is not filled yet.
         return False
     found += [function, function.__code__]
-    for name in names:
-        x = function.__globals__.get(name, MISSING)
-        if x is not MISSING and not _is_of_library(x) and not _finds_names(x, found):
+    for x in (*(function.__globals__.get(name, MISSING) for name in names), *enclosed):
+        if x is not MISSING and type(x) not in NUMBERS and not _is_of_library(x) and not _finds_names(x, found):
             return False
         found.append(Itself(x))
     return True
@@ -329,7 +334,15 @@ def _is_plain(x: Array) -> bool:
         return True
     if isinstance(x, eqx.Module) and _is_library(type(x).__module__):
         return all(_is_plain(getattr(x, field.name, None)) for field in dataclasses.fields(x))
-    return _is_of_library(x)
+    return _is_of_library(x) or _is_in_library(x)
+
+
+def _is_in_library(x: Any) -> bool:
+    """Whether it is a function without a name in a library, such as the activation of a network's last layer."""
+    module = getattr(x, "__module__", None) or ""
+    if type(x) is not types.FunctionType or not _is_library(module) or module not in sys.modules:
+        return False
+    return x.__globals__ is vars(sys.modules[module]) and _finds_names(x, [])
 
 
 # Functions stay as they are where lanes would save fewer operations: to bring operands together takes as many.
