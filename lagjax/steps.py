@@ -33,7 +33,6 @@ from lagjax.jaxtools import (
     compiled,
     is_array,
     is_traced,
-    kept_as_call,
     numpy_of,
     one_function_in_both_modes,
     shape_of,
@@ -156,7 +155,7 @@ def _robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple
     independent = equations.independent(t, *y)
 
     def rates(t: Array, y: tuple):
-        return equations.velocities(t, *y), kept_as_call(equations.accelerations(t, *y, None, independent))[0]
+        return equations.velocities(t, *y), equations.accelerations_alone(t, *y, None, independent)
 
     # Beside the fast way this one is compiled in vain for nearly all motions: in a loop, with one copy of a network in
     # the force in place of four.

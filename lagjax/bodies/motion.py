@@ -43,7 +43,12 @@ S has a column for each freedom of the joint. A column of zeros stands for one t
 that turns with a joint has an inertia on its diagonal of D, and no part in what the joint passes on. A free body has
 a = -I⁻¹ p; one that moves as given has its acceleration for c.
 
-Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes; §9.6 (rotors).
+**The forces** that a motion needs, by the recursion of Newton and Euler: the accelerations outward, the forces inward.
+
+    a = X a_p + c + S ẇ,     f = I a + p + Σ Xᵀ f of the children,     τ = Sᵀ f + armature ẇ
+
+Source: Featherstone, *Rigid Body Dynamics Algorithms*, §7.3 and Table 7.1, there along the links' axes; §9.6 (rotors);
+§5.3 and Table 5.1 (Newton and Euler).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -63,8 +68,9 @@ from lagjax.bodies.links import FixedNumbers, Geometry, LinkNumbers
 from lagjax.bodies.loads import Load, Weight
 from lagjax.numerics import dense
 
-# So few links are written out, one by one; more of them in a loop.
-FEW = 3
+# So few links are written out, one by one; more of them in a loop. The derivative of a motion of three compiles in 36 s
+# of processor time in a loop, written out in 48, and the motion takes 37 ms in place of 48.
+FEW = 1
 
 
 class Coordinates(NamedTuple):
@@ -430,11 +436,20 @@ class Accelerated(NamedTuple):
     links: Float[Array, "n 6"]
 
 
-def accelerated(
-    geometry: Geometry, given: LinkNumbers, motion: LinkMotion, torque: Float[Array, "n k"], wrench: Float[Array, "n 6"]
-) -> Accelerated:
-    """The accelerations under forces `torque` of joints, and moments and forces on centres of mass, `wrench`."""
-    dtype = motion.turn.dtype
+class Inertial(NamedTuple):
+    """What the links have of their own: S, the inertia beside D of freedoms, c, I along the axes of space, ω × I ω, and
+    the way d from the parent's centre."""
+
+    freedoms: Float[Array, "n 6 k"]
+    beside: Float[Array, "n k"]
+    bias: Float[Array, "n 6"]
+    inertia: Float[Array, "n 3 3"]
+    gyroscopic: Float[Array, "n 3"]
+    shift: Float[Array, "n 3"]
+
+
+def inertial(geometry: Geometry, given: LinkNumbers, motion: LinkMotion) -> Inertial:
+    """What does not depend on forces and accelerations."""
     turns, slides = (x[:, None, :] for x in (given.fixed.turns, given.fixed.slides))
     spin, arm, joint_spin = motion.spin, motion.arm, motion.joint_spin
     before = spin - joint_spin
@@ -451,13 +466,21 @@ def accelerated(
         bias = jnp.where(geometry.driven[:, None], given.driven.acceleration, bias)
     inertia = times(times(motion.turn, given.inertia), jnp.swapaxes(motion.turn, 1, 2))
     gyroscopic = cross(spin, applied(inertia, spin))
+    return Inertial(freedoms, beside, bias, inertia, gyroscopic, motion.offset + arm)
+
+
+def accelerated(
+    geometry: Geometry, given: LinkNumbers, motion: LinkMotion, torque: Float[Array, "n k"], wrench: Float[Array, "n 6"]
+) -> Accelerated:
+    """The accelerations under forces `torque` of joints, and moments and forces on centres of mass, `wrench`."""
+    dtype = motion.turn.dtype
+    freedoms, beside, bias, inertia, gyroscopic, shift = inertial(geometry, given, motion)
     mass = given.mass[:, None, None] * jnp.eye(3, dtype=dtype)[None]
     zero = jnp.zeros_like(inertia)
     own = jnp.concatenate([jnp.concatenate([inertia, zero], axis=2), jnp.concatenate([zero, mass], axis=2)], axis=1)
     # The last column is p.
     load = jnp.concatenate([gyroscopic, jnp.zeros_like(gyroscopic)], axis=1) - wrench
     own = jnp.concatenate([own, load[:, :, None]], axis=2)
-    shift = motion.offset + arm
     has_free = bool(geometry.free.any())
 
     def inward_link(children: Array | None, x: tuple, at_ground: bool) -> tuple[Array | None, tuple]:
@@ -497,6 +520,41 @@ def accelerated(
     given_outward = rows, force, freedoms, bias, shift, free
     links, joints = outward(geometry, given.fixed, outward_link, jnp.zeros(6, dtype), given_outward)
     return Accelerated(joints, links)
+
+
+class Forced(NamedTuple):
+    """Forces of joints (n, k), and the moments and forces (n, 6) that links need from their parents."""
+
+    joints: Float[Array, "n k"]
+    links: Float[Array, "n 6"]
+
+
+def forced(
+    geometry: Geometry, given: LinkNumbers, motion: LinkMotion, joints: Float[Array, "n k"], free: Float[Array, "n 6"],
+    wrench: Float[Array, "n 6"],
+) -> Forced:  # fmt: skip
+    """The forces of joints under which these accelerate so; `free`: the accelerations of free bodies."""
+    dtype = motion.turn.dtype
+    freedoms, _, bias, inertia, gyroscopic, shift = inertial(geometry, given, motion)
+    carried = bias + free + applied(freedoms, joints)
+
+    def outward_link(parent: Array | None, x: tuple) -> tuple[Array, None]:
+        carried, shift = x
+        if parent is None:
+            return carried, None
+        return carried + parent + jnp.concatenate([jnp.zeros(3, dtype), cross(parent[:3], shift)]), None
+
+    links, _ = outward(geometry, given.fixed, outward_link, jnp.zeros(6, dtype), (carried, shift))
+    moment, force = applied(inertia, links[:, :3]) + gyroscopic, given.mass[:, None] * links[:, 3:]
+    own = jnp.concatenate([moment, force], axis=1) - wrench
+
+    def inward_link(children: Array | None, x: tuple, at_ground: bool) -> tuple[Array, Array]:
+        own, shift = x
+        both = own if children is None else own + children
+        return both + jnp.concatenate([cross(shift, both[3:]), jnp.zeros(3, dtype)]), both
+
+    needed = inward(geometry, given.fixed, inward_link, jnp.zeros(6, dtype), (own, shift))
+    return Forced(applied(jnp.swapaxes(freedoms, 1, 2), needed) + given.armature * joints, needed)
 
 
 def _shifted(body: Float[Array, "6 7"], d: Float[Array, "3"]) -> Float[Array, "6 7"]:

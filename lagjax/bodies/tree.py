@@ -12,7 +12,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from lagjax.bodies.assemble import usual_shapes
-from lagjax.bodies.body import Body, OfPlaced, Pose, PoseOnTree, SystemFunction, check_bodies, floats, product
+from lagjax.bodies.body import (
+    Body,
+    OfPlaced,
+    Pose,
+    PoseOnTree,
+    SystemFunction,
+    check_bodies,
+    conjugate,
+    floats,
+    product,
+)
 from lagjax.bodies.joints import named
 from lagjax.bodies.links import Geometry, LinkNumbers, check_armature, links_of
 from lagjax.bodies.loads import Acting, Load, check_loads
@@ -23,6 +33,7 @@ from lagjax.bodies.motion import (
     accelerated,
     applied,
     flat,
+    forced,
     growth,
     joint_rates,
     moments,
@@ -239,12 +250,26 @@ class Dynamics(NamedTuple):
         if self.potential is not None:
             slope = jax.grad(self.potential, argnums=1)(t, q, params)
             force = jax.tree.map(lambda x, y: x - y, force, slope)
-        given, motion = _moving(geometry, t, q, v, params)
-        wrench = jnp.zeros_like(motion.turn[:, :2].reshape(-1, 6))
-        if any(load.potential is not None for load in self.loads):
-            wrench = wrenches(geometry, given, self.loads, motion, (t, q, v, params))
+        given, motion, wrench = self._loaded(t, q, v, params)
         a = _accelerations(geometry, given, motion, wrench, *(flat(geometry, x) for x in (q, v, force)))
         return {name: jax.tree.map(jnp.zeros_like, y) for name, y in q.items()} | unflat(geometry, a)
+
+    def newton_euler_recursion(self, t: Array, q: PyTree, v: PyTree, a: PyTree, params: PyTree) -> PyTree:
+        """The generalized force under which this L has these accelerations, by the recursion."""
+        geometry = self.geometry
+        given, motion, wrench = self._loaded(t, q, v, params)
+        force = _forces(geometry, given, motion, wrench, *(flat(geometry, x) for x in (q, v, a)))
+        force = {name: jax.tree.map(jnp.zeros_like, y) for name, y in q.items()} | unflat(geometry, force)
+        if self.potential is None:
+            return force
+        return jax.tree.map(lambda x, y: x + y, force, jax.grad(self.potential, argnums=1)(t, q, params))
+
+    def _loaded(self, t: Array, q: PyTree, v: PyTree, params: PyTree) -> tuple[LinkNumbers, LinkMotion, Array]:
+        """The links, and the moments and forces of the loads' potentials on them."""
+        given, motion = _moving(self.geometry, t, q, v, params)
+        if all(load.potential is None for load in self.loads):
+            return given, motion, jnp.zeros_like(motion.turn[:, :2].reshape(-1, 6))
+        return given, motion, wrenches(self.geometry, given, self.loads, motion, (t, q, v, params))
 
     def placed(self, t, q: PyTree, v: PyTree, params: PyTree) -> tuple[Placed, Any]:
         """q and v as loads and closures read them; with no rates at all, q alone."""
@@ -312,6 +337,41 @@ def _accelerations(
     faster = jnp.concatenate([grows[:, None], turning], axis=1)
     bent = (jax.vmap(product)(faster, e) + jax.vmap(product)(both, rate)) / 2
     return Coordinates(numbers, bent, found.links[links, 3:])
+
+
+@partial(jax.jit, static_argnums=0)
+def _forces(
+    geometry: Geometry,
+    given: LinkNumbers,
+    motion: LinkMotion,
+    wrench: Array,
+    q: Coordinates,
+    v: Coordinates,
+    a: Coordinates,
+) -> Coordinates:
+    """The generalized force that these accelerations of coordinates need, with moments and forces on links."""
+    joints, free = numbers_of_links(geometry, a.numbers), jnp.zeros_like(wrench)
+    e, rate, links = q.quaternions, v.quaternions, geometry.links_of_quaternions
+    faster, size = jnp.zeros_like(e), jnp.sum(e**2, axis=1)[:, None]
+    if len(links):
+        both = jnp.concatenate([growth(e, rate)[:, None], spins(e, rate)], axis=1)
+        # s̈ + Ω̇, of ë = ½ (Ω̇ + s̈) e + ½ (Ω + ṡ) ė.
+        faster = jax.vmap(product)(2 * a.quaternions - jax.vmap(product)(both, rate), jax.vmap(conjugate)(e)) / size
+        turning = of_links(faster[:, 1:], geometry.quaternions)
+        if geometry.k == 3:
+            joints = jnp.where(geometry.ball[:, None], turning, joints)
+        both = jnp.concatenate([turning, of_links(a.positions, geometry.quaternions)], axis=1)
+        free = jnp.where(geometry.free[:, None], both, 0.0)
+    found = forced(geometry, given, motion, joints, free, wrench)
+    numbers = of_links(found.joints[:, 0], geometry.links_of_numbers)
+    if not len(links):
+        return Coordinates(numbers, q.quaternions, q.positions)
+    moment = found.links[links, :3]
+    if geometry.k == 3:
+        moment = jnp.where(geometry.free[links, None], moment, found.joints[links])
+    grows = (_of_growth(geometry, given) * faster[:, 0])[:, None]
+    slope = 2 * jax.vmap(product)(jnp.concatenate([grows, moment], axis=1), e) / size
+    return Coordinates(numbers, slope, found.links[links, 3:])
 
 
 def _of_growth(geometry: Geometry, given: LinkNumbers) -> Array:

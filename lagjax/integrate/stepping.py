@@ -49,7 +49,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax.integrate.settings import Settings
-from lagjax.jaxtools import kept_as_call, one_function, stop_gradient
+from lagjax.jaxtools import one_function, stop_gradient
 from lagjax.mechanics import Equations, all_finite, to_manifold
 from lagjax.numerics import Interpolation, Quintic, Radau5
 
@@ -443,7 +443,7 @@ class Field(eqx.Module):
 
     def __call__(self, t: Array, y: PyTree, args: PyTree):
         independent = args.independent if isinstance(args, StageConstraints) else None
-        a, _ = kept_as_call(self.equations.accelerations(t, *y, self.feedback, independent))
+        a = self.equations.accelerations_alone(t, *y, self.feedback, independent)
         return self.equations.velocities(t, *y), a
 
 

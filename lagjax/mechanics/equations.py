@@ -356,6 +356,11 @@ class Equations(eqx.Module):
         """
         return _accelerations(self.form, self.model, t, q, v, baumgarte_rate, independent)
 
+    def accelerations_alone(self, t: Array, q: PyTree, v: PyTree, baumgarte_rate=None, independent=None) -> PyTree:
+        """The accelerations the robust way, as a call: the shortest multipliers of dependent constraints take longer
+        than these, and XLA leaves out only what no call returns."""
+        return kept_as_call(_accelerations_alone(self.form, self.model, t, q, v, baumgarte_rate, independent))
+
     def independent(
         self, t: Array, q: PyTree, v: PyTree, dependent_below: float | None = None
     ) -> Bool[Array, " m"] | None:
@@ -425,6 +430,11 @@ def _accelerations(form, model: Model, t: Array, q: PyTree, v: PyTree, baumgarte
     state = t, *model.vectors(q, v)
     a, multipliers = form.accelerations(model, *state, baumgarte_rate, independent)
     return model.tree(completed(model, *state, a)), model.split(multipliers)
+
+
+@jitted
+def _accelerations_alone(form, model: Model, *given):
+    return _accelerations(form, model, *given)[0]
 
 
 @jitted

@@ -6,7 +6,9 @@ acceleration a,
     M a = F + Aᵀ λ + τ        τ = dp/dt - ∂L/∂q - Q + ∂R/∂v - Aᵀ λ,        dp/dt = ∂p/∂t + (∂p/∂q) v + (∂p/∂v) a
 
 and dp/dt is one derivative of p along (1, v, a): M is never formed and nothing is solved, so that the work grows as
-that of L. Without constraints this is all: Pinocchio's `rnea`, and the `qfrc_inverse` of MuJoCo's `mj_inverse`.
+that of L. Without constraints this is all: Pinocchio's `rnea`, and the `qfrc_inverse` of MuJoCo's `mj_inverse`. A tree
+of bodies knows M a - F of its L by the recursion of Newton and Euler (`lagjax/bodies/motion.py`), of a third as many
+operations as these derivatives: an arm of three joints has its first answer in 1.5 s of processor time in place of 10.
 
 *With constraints* an acceleration does not say what its force is. A force Aᵀ μ along the constraints changes their
 multipliers and no motion: τ + Aᵀ μ with λ - μ is as good. (MuJoCo's constraints are soft: there the acceleration says
@@ -32,8 +34,15 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lagjax.jaxtools import compiled, is_traced, one_function_in_both_modes
 from lagjax.mechanics.constrained_state import accelerations_at
 from lagjax.mechanics.diagnosis import describe
-from lagjax.mechanics.lagrangian import forcing_and_inertia, mass_and_forcing, response, with_states
-from lagjax.system import Model, State, System, constraints, coordinates, prepare, with_rates
+from lagjax.mechanics.lagrangian import (
+    applied_force,
+    forcing_and_inertia,
+    mass_and_forcing,
+    resolved,
+    response,
+    with_states,
+)
+from lagjax.system import Call, Model, State, System, Traced, constraints, coordinates, prepare, traced_call, with_rates
 
 # How far an acceleration may miss A a = gamma, as a share of the largest term: it may come from a table or a spline.
 ADMISSIBLE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 1e-3}
@@ -82,15 +91,25 @@ def inverse_dynamics(
     """
     model, s = prepare(system, t, q, v, params)
     a = _like(s, with_rates(system, q, a))
+    own = _recursion(system, s, a)
     if not model.m:
-        return _force(model, s, a, {}), {}
+        return _force(model, s, a, {}, own), {}
     multipliers = accelerations_at(model, s)[1]
     off, misses = _departure(model, s, a)
     if is_traced((off, misses)):
         a = jtu.tree_map(lambda x: jnp.where(jnp.any(misses), jnp.nan, x), a)
     elif np.any(misses):
         raise ValueError(_inadmissible(model, s, np.asarray(off), np.asarray(misses)))
-    return _force(model, s, a, multipliers), multipliers
+    return _force(model, s, a, multipliers, own), multipliers
+
+
+def _recursion(system: System, s: State, a: PyTree) -> Traced | None:
+    """M a - F of L alone by the recursion of a tree of bodies, which has one beside its forward dynamics."""
+    recursion = getattr(getattr(system.forward_dynamics, "__self__", None), "newton_euler_recursion", None)
+    if recursion is None:
+        return None
+    call = Call("inverse dynamics", recursion, ("t", "q", "v", "a", "params"))
+    return traced_call(call, {"t": s.t, "q": s.q, "v": s.v, "a": a, "params": s.params}, lambda call, value: None)
 
 
 def _like(s: State, a: PyTree) -> PyTree[Array]:
@@ -134,16 +153,19 @@ def _inadmissible(model: Model, s: State, off: np.ndarray, misses: np.ndarray) -
 
 
 @compiled
-def _force(model: Model, s: State, a: PyTree, multipliers: dict[str, Array]):
-    return one_function_in_both_modes(_force_of, model, s, a, multipliers)
+def _force(model: Model, s: State, a: PyTree, multipliers: dict[str, Array], own: Traced | None):
+    return one_function_in_both_modes(_force_of, model, s, a, multipliers, own)
 
 
-def _force_of(model: Model, s: State, a: PyTree, multipliers: dict[str, Array]):
+def _force_of(model: Model, s: State, a: PyTree, multipliers: dict[str, Array], own: Traced | None):
     # A massless coordinate has the velocity that is given, and the force that it needs.
     model, (x, u) = with_states(model), model.vectors(s.q, s.v)
     first = model.form.first_order
-    forcing, inertia = forcing_and_inertia(model, s.t, x, u)
-    force = inertia(model.vector(a)) - forcing
+    if own is None:
+        forcing, inertia = forcing_and_inertia(model, s.t, x, u)
+        force = inertia(model.vector(a)) - forcing
+    else:
+        force = model.vector(own(*s[:3], a, s.params)) - applied_force(model, s.t, x, resolved(model, s.t, x, u))
     if model.m:
         stacked = model.stacked(multipliers)
         _, pull = jax.vjp(lambda u: constraints.velocity_residual(model, s.t, x, u), u)

@@ -553,10 +553,10 @@ class ForwardDynamics(NamedTuple):
     def verdict(self, model: Model, t: Array, x: Array, u: Array) -> Verdict:
         """Solve the equations at one state, and say whether they are finite, regular, those of L, and agree."""
         state = model, t, x, u
-        a, multipliers = self.accelerations(*state)
-        unit = np.eye(model.n, dtype=x.dtype)
-        mass = lax.map(lambda w: _momentum_rate(*state, (0.0, jnp.zeros_like(x), w), w), unit, batch_size=BLOCK)
         along = np.random.default_rng(0).uniform(0.5, 1.0, (DIRECTIONS, model.n)).astype(x.dtype)
+        seen = _seen(*state, along)
+        a, multipliers = self.accelerations(*state) if model.m else (seen.a, jnp.zeros(0, x.dtype))
+        mass = seen.mass
         singular, contradictory = ~is_determined(*state), jnp.asarray(False)
         if model.m:
             solver = _solver(*state, None)
@@ -567,7 +567,7 @@ class ForwardDynamics(NamedTuple):
             misses = _misses(solver.rows, a, mass, forces)
             contradictory = jnp.any(misses.contradictory(solver.independent, DEPENDENT_BELOW[np.dtype(x.dtype)], x, u))
         known = jnp.concatenate([a, multipliers, jnp.ravel(model.lagrangian(t, x, u))])
-        finite = jnp.all(jnp.isfinite(known)) & ~jnp.any(missed(*state, along)[1])
+        finite = jnp.all(jnp.isfinite(known)) & ~jnp.any(seen.is_missed)
         return Verdict(a, multipliers, finite, singular, contradictory, mass)
 
     def solution_or_nan(self, *state):
@@ -581,6 +581,16 @@ class ForwardDynamics(NamedTuple):
         return self.name
 
 
+class Seen(NamedTuple):
+    """By how much accelerations miss M a = F along directions, and where that is more than round-off; the accelerations
+    without constraints, and the diagonal of M."""
+
+    by: Float[Array, " k"]
+    is_missed: Bool[Array, " k"]
+    a: Float[Array, " n"]
+    mass: Float[Array, " n"]
+
+
 def missed(
     model: Model, t: Array, x: Array, u: Array, along: Float[Array, "k n"]
 ) -> tuple[Float[Array, " k"], Bool[Array, " k"]]:
@@ -588,23 +598,42 @@ def missed(
 
     The larger of the misses at these velocities and at others, where Coriolis terms have their part.
     """
+    return _seen(model, t, x, u, along)[:2]
+
+
+def _seen(model: Model, t: Array, x: Array, u: Array, along: Float[Array, "k n"]) -> Seen:
+    """That, and more: the second derivatives of L are in the program once, in lanes."""
     size = jnp.max(jnp.abs(u))
     other = u + jnp.where(size > 0, size, 1.0) * jnp.cos(jnp.arange(u.size, dtype=u.dtype))
 
-    def terms(u: Array) -> Array:
+    def moving(u: Array) -> tuple[Array, Array, Array]:
         u = resolved(model, t, x, u)
         force = applied_force(model, t, x, u)
-        onward = jnp.ones_like(t), u, _solved_by_them(model, t, x, u)(force)
+        return u, _solved_by_them(model, t, x, u)(force), force
 
-        def of(w: Array) -> Array:
-            _, slope = jax.jvp(lambda x: model.lagrangian(t, x, u), (x,), (w,))
-            return jnp.stack([_momentum_rate(model, t, x, u, onward, w), -slope, -force @ w])
+    both, a, forces = jax.vmap(moving)(jnp.stack([u, other]))
+    along, unit = _without_first_order(model, along), jnp.eye(u.size, dtype=x.dtype)
+    still = jnp.zeros_like(unit)
+    count = len(along)
 
-        return jax.vmap(of)(_without_first_order(model, along))
+    def lanes(of_both: Array, of_mass: Array) -> Array:
+        return jnp.concatenate([jnp.repeat(of_both, count, axis=0), of_mass])
 
-    found = jax.vmap(terms)(jnp.stack([u, other]))
+    def terms(lane: tuple) -> Array:
+        u, dt, dx, dv, w = lane
+        _, slope = jax.jvp(lambda x: model.lagrangian(t, x, u), (x,), (w,))
+        return jnp.stack([_momentum_rate(model, t, x, u, (dt, dx, dv), w), -slope])
+
+    time = lanes(jnp.ones(2, x.dtype), jnp.zeros_like(x))
+    w = jnp.concatenate([along, along, unit])
+    every = lanes(both, u + still), time, lanes(both, still), lanes(a, unit), w
+    found = lax.map(terms, every, batch_size=BLOCK)
+    of_force = jnp.repeat(forces, count, axis=0)
+    found, mass = jnp.split(found, [2 * count])
+    found = jnp.concatenate([found, -jnp.sum(of_force * w[: 2 * count], axis=1)[:, None]], axis=1)
+    found = found.reshape(2, count, 3)
     by = jnp.max(jnp.abs(jnp.sum(found, axis=2)), axis=0)
-    return by, ~(by <= AGREES[np.dtype(x.dtype)] * jnp.max(jnp.abs(found)))
+    return Seen(by, ~(by <= AGREES[np.dtype(x.dtype)] * jnp.max(jnp.abs(found))), a[0], mass[:, 0])
 
 
 def _momentum_rate(model: Model, t: Array, x: Array, u: Array, onward: tuple, w: Array) -> Float[Array, ""]:

@@ -3,7 +3,8 @@
 At each call from Python, each of the user's functions is traced on shapes, and a compiled program is used again only
 for the same jaxprs; arrays that a function reads from outside, however it comes by them, are arguments of the program.
 A function that names nothing from outside but library modules, builtins, numbers and functions like itself is traced
-once: with another number of that name it is another function.
+once: with another number of that name it is another function. So are joints, energies and loads of bodies that hold
+numbers and such functions.
 
 So no value of the user's is ever read but by running his function, and no object stands in for another. Small arrays
 that a function reads are part of its jaxpr, as single numbers are. Tracing takes about half a millisecond.
@@ -274,15 +275,47 @@ def _is_small(x: Array):
 def names_outside(function: Callable) -> tuple | None:
     """A function, its code and what both name from outside: libraries, builtins, numbers and functions like itself.
 
-    None where it may read anything else. No value is looked at: a number is known by being the very same object.
+    None where it may read anything else. No value is looked at: a number is known by being the very same object. An
+    object of lagjax's that cannot be changed, as a joint or the energy of bodies, is a function with what it holds:
+    numbers, text, functions and other such objects.
     """
     found: list = []
     return tuple(found) if _finds_names(function, found) else None
 
 
+def _finds_held(x: Any, found: list) -> bool:
+    """The same for what an object of lagjax's holds."""
+    if x is None or type(x) in (bool, int, float, complex, str):
+        found.append((type(x), repr(x)))
+        return True
+    if type(x) is tuple or isinstance(x, tuple) and _is_own(type(x)):
+        found.append((type(x), len(x)))
+        return all(_finds_held(part, found) for part in x)
+    if isinstance(x, types.FunctionType) and _is_own(x) and _is_at_its_place(x):
+        found.append(Itself(x))
+        return True
+    return _finds_names(x, found)
+
+
+def _is_own(x: Any) -> bool:
+    return x.__module__.partition(".")[0] == __name__.partition(".")[0]
+
+
+def _is_at_its_place(x: Any) -> bool:
+    return getattr(sys.modules.get(x.__module__), x.__name__, None) is x
+
+
 def _finds_names(function: Callable, found) -> bool:
+    if isinstance(function, types.MethodType):
+        found.append(function.__func__)
+        is_method = getattr(type(function.__self__), function.__name__, None) is function.__func__
+        return is_method and _finds_held(function.__self__, found)
     if type(function) is not types.FunctionType:
-        return False
+        of = type(function)
+        if not (_is_own(of) and getattr(getattr(of, "__dataclass_params__", None), "frozen", False)):
+            return False
+        found.append(of)
+        return all(_finds_held(getattr(function, field.name), found) for field in dataclasses.fields(of))
     if any(x is function for x in found):
         return True
     names, opens_outside = _names_of(function.__code__)
@@ -328,7 +361,7 @@ def _is_library(name: str) -> bool:
 
 def _is_plain(x: Array) -> bool:
     """Whether an argument is numbers and text in dictionaries, lists, tuples and modules of the libraries."""
-    if type(x) in CONTAINERS:
+    if type(x) in CONTAINERS or isinstance(x, tuple) and _is_own(type(x)):
         return all(map(_is_plain, x.values() if isinstance(x, dict) else x or ()))
     if is_array(x) or isinstance(x, np.generic) or type(x) in (bool, int, float, complex, str):
         return True

@@ -1,5 +1,7 @@
 """Trees on bodies that move as given, against closed forms in frames that move, and Lagrange's equations."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.display import InSpace
-from tests.bodies.test_tree import a_body, a_place, like, missed
+from tests.bodies.test_tree import a_body, a_place, every_joint, like, missed
 
 
 def shaken(t, params):
@@ -45,6 +47,29 @@ def test_a_plate_on_a_table_that_turns_and_is_shaken():
     )
     moving = np.array([2.0 * np.cos(2.0 * t), t]) + turn @ (rate + spin * across(r))
     np.testing.assert_allclose(tree.rates(q, v, params, t)["plate"].position, [*moving, -np.sin(t)], atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["every joint", "few links"])
+def test_the_two_recursions_undo_each_other(which):
+    """Accelerations under the force that these accelerations need are these; twin: the force somewhere else."""
+    if which == "every joint":
+        rng, tree, system, params = every_joint()
+    else:
+        rng, params = np.random.default_rng(5), {"rate": 1.1}
+        # Links are written out.
+        tree = lj.bodies.Tree([TABLE, PLATE], {"on": lj.bodies.revolute(a_place(rng, TABLE), a_place(rng, PLATE))})
+        system = tree.system([lj.bodies.weight([PLATE])])
+    q, elsewhere, v, a = (like(rng, tree.reference()) for _ in range(4))
+    forward: Any = system.forward_dynamics
+
+    @jax.jit
+    def off(of_force):
+        force = forward.__self__.newton_euler_recursion(0.7, of_force, v, a, params)
+        found = forward(0.7, q, v, force, params)
+        return jnp.max(jnp.stack([jnp.max(jnp.abs(x - y)) for x, y in zip(*map(jax.tree.leaves, (found, a)))]))
+
+    assert off(q) < 1e-11 and off(elsewhere) > 1e-2
 
 
 def test_refused_trees_on_driven_bodies():

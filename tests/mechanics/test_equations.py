@@ -7,6 +7,7 @@ import pytest
 
 import lagjax as lj
 from lagjax.analysis.explain import _how_solved
+from lagjax.jaxtools import kept_as_call
 from lagjax.jaxtools.jaxpr import equations as equations_in
 from lagjax.mechanics import equations, sparse_saddle_point
 from lagjax.mechanics.constrained_state import to_manifold
@@ -216,3 +217,23 @@ def test_the_choice_in_words(monkeypatch):
     assert said() == "2 accelerations and 1 multiplier by elimination without the zeros"
     monkeypatch.setattr(equations, "is_small", lambda *problem: False)
     assert "3 equations by elimination" in said()
+
+
+@not_plain
+@pytest.mark.slow
+def test_accelerations_alone_leave_out_the_multipliers(monkeypatch):
+    """In a loop over steps there is no search for the shortest multipliers; twin: as one call with them there is."""
+    _, banded, _, (t, q, v, _) = in_three_ways(monkeypatch)
+
+    def steps(rates):
+        def step(state):
+            return state[0] + 1, rates(t, state[1], v)
+
+        return jax.jit(lambda q: jax.lax.while_loop(lambda state: state[0] < 3, step, (0, q)))
+
+    alone, both = (
+        steps(rates).lower(q).compile()
+        for rates in (lambda *x: banded.accelerations_alone(*x), lambda *x: kept_as_call(banded.accelerations(*x))[0])
+    )
+    np.testing.assert_array_equal(flat(alone(q)), flat(both(q)))
+    assert " conditional(" in str(both.as_text()) and " conditional(" not in str(alone.as_text())

@@ -349,6 +349,24 @@ def with_eval(t, q, v, params): return eval("constant") * q
         at()
 
 
+def test_what_bodies_and_joints_compute_is_traced_once():
+    """A joint and the energy of bodies hold numbers that nobody changes; twins: a mass from outside, another number."""
+    held, ground = {"mass": 2.0}, lj.bodies.ground.at()
+    energies = []
+    for mass in (2.0, 2.0, 3.0, lambda params: params, lambda params: held["mass"]):
+        bob = lj.bodies.Body("bob", mass, (1.0, 1.0, 1.0))
+        system = lj.bodies.multibody([bob], {"pivot": lj.bodies.spherical(ground, bob.at((0.0, 0.0, 1.0)))})
+        assert traced.names_outside(system.constraints["pivot"].function) is not None or callable(mass)
+        energies.append(traced.names_outside(system.lagrangian))
+    assert energies[0] == energies[1] and energies[2] not in (None, energies[0]) and energies[3] is not None
+    assert energies[4] is None
+    pose = lj.bodies.Pose.at((0.0, 0.0, -1.0))
+    s = coordinates.state(0.0, {"bob": pose}, {"bob": pose.moving((1.0, 0.0, 0.0))}, None)
+    first = traced_system(system, s).lagrangian
+    held["mass"] = 4.0
+    assert traced_system(system, s).lagrangian != first
+
+
 def test_code_in_params_is_run():
     """A function among the parameters may read another number each time."""
     held = [1.0]

@@ -165,7 +165,9 @@ def _start(equations: Equations, q: PyTree, v: PyTree, ts: Array, settings: Sett
     else:
         if project:
             q, v, _ = returned(equations, t, q, v, *tolerances_at(given, ts, settings, sizes_so_far))
-        verdict = equations.verdict(t, q, v)
+        # Nothing of it is differentiated, and it is half of the program of a tree.
+        fixed, at = stop_gradient((equations, (t, q, v)))
+        verdict = fixed.verdict(*at)
     a, _, finite, singular, contradictory, mass, known, whole = stop_gradient(verdict)
     tolerances = rtol, atol = tolerances_at(given, ts, settings, sizes_so_far, a)
     if equations.model.m:
