@@ -9,15 +9,12 @@ small system, and in arrays otherwise or where those fail. Nothing controls the 
 
     x_{k+1} = step(x_k, u_k),    k = 0 ... N - 1
 
-Reverse mode goes back over pieces of about √N steps: it keeps the state at the start of each piece, and runs a piece
-again with all that its derivative needs. So memory grows with √N times what one step needs, and the steps are made
-twice.
-
-Source: Griewank & Walther, *Evaluating Derivatives*, ch. 12 (reversal by checkpoints).
+Reverse mode goes back from one state to the one before, and makes each step again from the state at which it began,
+with all that its derivative needs (`jaxtools/many_steps.py`): its memory is that of the states and of one step.
 """
 
-import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -39,6 +36,7 @@ from lagjax.jaxtools import (
     numpy_of,
     one_function_in_both_modes,
     shape_of,
+    steps_in_both_modes,
     varies,
 )
 from lagjax.mechanics import Equations, all_finite, equations_of, to_manifold
@@ -127,23 +125,25 @@ def _step(system: System, s: State, dt: Array, method: ExplicitRungeKutta):
 def equations_for_steps(model: Model) -> Equations:
     """The equations of a model; with constraints, which may depend on each other, also those of the robust way."""
     # Without the robust way a program compiles in a third of the time, and a definite mass matrix does not need it.
-    return equations_of(model, fast=True, fallback=bool(model.m))
+    return equations_of(model, fast=True, fallback=bool(model.m), apart=True)
 
 
-def advanced(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array) -> tuple:
-    """The state (q, v) after a step from t to t + dt."""
-    y0 = tuple(map(equations.inside, y))
-    if equations.written is None:
-        y1 = _robust(equations, method, t, y0, dt)
-    else:
-        y1 = _fast(equations, method, t, y0, dt)
+def advanced(
+    equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array, way: Callable | None = None
+) -> tuple:
+    """The state (q, v) after a step from t to t + dt; by one `way` alone, or by the robust one where the fast fails."""
+    way = way or (_robust if equations.written is None else _fast_or_robust)
+    y1 = way(equations, method, t, tuple(map(equations.inside, y)), dt)
     return jax.tree.map(lambda x, old: x.astype(old.dtype), tuple(map(equations.outside, y1)), tuple(y))
 
 
 def _fast(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
     y1 = _explicit(method, lambda t, y: (equations.velocities(t, *y), equations.fast(t, *y)[0]), t, y, dt)
-    if equations.model.is_returned:
-        y1 = equations.projected(t + dt, *y1)
+    return equations.projected(t + dt, *y1) if equations.model.is_returned else y1
+
+
+def _fast_or_robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple, dt: Array):
+    y1 = _fast(equations, method, t, y, dt)
     if not equations.fallback:
         return y1
     # A branch also in a batch, where all lanes take it or none.
@@ -157,7 +157,9 @@ def _robust(equations: Equations, method: ExplicitRungeKutta, t: Array, y: tuple
     def rates(t: Array, y: tuple):
         return equations.velocities(t, *y), equations.accelerations_alone(t, *y, None, independent)
 
-    y1 = _explicit(method, rates, t, y, dt)
+    # Beside the fast way this one is compiled in vain for nearly all motions: in a loop, with one copy of a network in
+    # the force in place of four.
+    y1 = _explicit(method, rates, t, y, dt, in_a_loop=equations.written is not None)
     if not equations.model.is_returned:
         return y1
     round_off = jnp.asarray(ROUND_OFFS * jnp.finfo(dt.dtype).eps, dt.dtype)
@@ -181,8 +183,8 @@ class _Rate(diffrax.AbstractTerm):
         return jax.tree.map(lambda k: k * control, vf)
 
 
-def _explicit(method: ExplicitRungeKutta, rates: Any, t: Array, y: tuple, dt: Array):
-    return method.step(_Rate(rates, dt), t, t + dt, y, None, None, True)[0]
+def _explicit(method: ExplicitRungeKutta, rates: Any, t: Array, y: tuple, dt: Array, in_a_loop: bool = False):
+    return replace(method, in_a_loop=in_a_loop).step(_Rate(rates, dt), t, t + dt, y, None, None, True)[0]
 
 
 def explicit_method(method: Any) -> ExplicitRungeKutta:
@@ -235,8 +237,8 @@ def rollout(
     [0. 1. 3. 4.] [0. 2. 2. 0.]
 
     A control is an entry of `params`, which L, the force, the dissipation and the constraints read by its name; in step
-    k its value is the k-th row of `controls`. It works under `jit`, `vmap`, `jax.grad` (reverse mode keeps √N states
-    and runs N steps again), `jacfwd`, and in scans.
+    k its value is the k-th row of `controls`. It works under `jit`, `vmap`, `jax.grad` (reverse mode makes each step
+    once more), `jacfwd`, and in scans.
 
     **Main arguments:**
 
@@ -312,53 +314,32 @@ def _rolled(
     if not count:
         return jtu.tree_map(lambda x: jnp.asarray(x)[None], tuple(s[:3]))
     t = s.t + np.arange(count + 1) * dt
-    run = partial(_run, method=method, count=count)
-    states = one_function_in_both_modes(run, system, s, t[:-1], held, merge, dt)
+    params = s.params if merge is None else merge(s.params, jtu.tree_map(lambda u: u[0], held))
+    equations = equations_for_steps(model_of(system, *s[:3], params))
+    if merge is None:
+        # What does not depend on the state is prepared once.
+        step, fixed = _next, (equations,)
+    else:
+        step, fixed = _next_with_control, (system, s.params, merge)
+    # Many steps are made the fast way, and all once more the robust way if one of them fails: a step of both would be
+    # compiled, and differentiated, with a branch.
+    ways = (_fast, _robust) if equations.fallback else (_robust if equations.written is None else _fast,)
+    steps = [partial(step, method=method, way=way) for way in ways]
+    # Each row has the length of its step: one that is known XLA writes into the stages, which it then computes again
+    # for each use. Lanes of a double pendulum take 1.7 times as long.
+    states = steps_in_both_modes(steps, (s.q, s.v), (t[:-1], jnp.broadcast_to(dt, (count,)), held), fixed)
     q, v = jtu.tree_map(lambda x0, x: jnp.concatenate([x0[None], x]), (s.q, s.v), states)
     return t, q, v
 
 
-def _run(system: System, s: State, t: Array, held: PyTree, merge: Merge | None, dt: Array, method, count: int):
-    """The states after each step."""
-    inner = piece_length(count)
-    outer = -(-count // inner)
-    # Steps that fill up the last piece have no length, and repeat the last control.
-    dts = jnp.where(np.arange(outer * inner) < count, dt, jnp.zeros_like(dt))
-    rows = jtu.tree_map(lambda x: _pieces(x, outer, inner), (t, held))
-    rows = *rows, dts.reshape(outer, inner)
-    fixed = equations_for_steps(model_of(system, *s)) if merge is None else None
-
-    def one(y: tuple, row: tuple):
-        t, u, dt = row
-        equations = fixed
-        if merge is not None:
-            equations = equations_for_steps(model_of(system, t, *y, merge(s.params, u)))
-        y = advanced(equations, method, t, y, dt)
-        return y, y
-
-    @partial(jax.checkpoint, prevent_cse=False)
-    def piece(y: tuple, rows: tuple):
-        return lax.scan(one, y, rows)
-
-    _, states = lax.scan(piece, (s.q, s.v), rows)
-    return jtu.tree_map(lambda x: x.reshape(outer * inner, *x.shape[2:])[:count], states)
+def _next(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
+    (t, dt, _), (equations,) = row, fixed
+    return advanced(equations, method, t, y, dt, way)
 
 
-def _pieces(x: Array, outer: int, inner: int):
-    missing = outer * inner - x.shape[0]
-    x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))]) if missing else x
-    return x.reshape(outer, inner, *x.shape[1:])
-
-
-def piece_length(count: int) -> int:
-    """Near √count, such that few steps are missing in the last piece.
-
-    >>> [piece_length(count) for count in (64, 50, 53)]
-    [8, 5, 6]
-    """
-    root = math.isqrt(count)
-    near = range(max(1, root * 2 // 3), root * 3 // 2 + 1)
-    return min(near, key=lambda length: (-count % length, abs(length - root)))
+def _next_with_control(y: tuple, row: tuple, fixed: tuple, method: ExplicitRungeKutta, way: Callable):
+    (t, dt, u), (system, params, merge) = row, fixed
+    return advanced(equations_for_steps(model_of(system, t, *y, merge(params, u))), method, t, y, dt, way)
 
 
 def _rows(controls: Any, dtype: DTypeLike):

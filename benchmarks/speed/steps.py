@@ -5,14 +5,24 @@ Question: does a training loop lose time by writing L in place of the accelerati
 long motion by hand keeps a checkpoint for each of √N pieces of N steps (`jax.checkpoint`). Both run in turn in one
 process; a speed is the time by hand divided by ours.
 
+With `--networks` the force is a network (equinox's MLP of q and v, tanh), of a pendulum, of a double pendulum with a
+vector and with a dict of coordinates, and of a mass in the plane on a rod, which by hand is returned to it by division.
+Rows say the time of ours divided by that by hand: of the motion and of its gradient by the weights, in `jax.jit` and
+called from Python, where the scan by hand is jitted, and the first answer of each, tracing and compiling.
+
     python -m benchmarks.speed.steps --processor-time
+    python -m benchmarks.speed.steps --networks --processor-time
 """
 
 import argparse
 import time
+from collections.abc import Callable
 from functools import partial
+from itertools import product
+from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +33,8 @@ from benchmarks import measure
 
 DT, ENVIRONMENTS, STEPS = 0.02, 1024, 64
 PARAMS = {"m": 1.0, "l": 1.0, "g": 9.81}
+# Steps and their length under networks of these widths and depths.
+WITH_STEPS, WITH_NETWORK, NETWORKS = 400, 0.01, ((32, 2), (64, 3))
 
 
 def lagrangian(t, q, v, p):
@@ -138,15 +150,168 @@ def one_lane(options):
     )
 
 
+def by_network(t, q, v, p):
+    """The force, a network of all coordinates and velocities."""
+    return p["net"](jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves((q, v))]))
+
+
+def by_name(y):
+    """Two angles by name."""
+    return {"one": y[0], "two": y[1]}
+
+
+def together(q):
+    """Two named angles in one vector."""
+    return jnp.stack([q["one"], q["two"]])
+
+
+def on_rod(q, v, force):
+    """The accelerations of a unit mass with weight on a unit rod."""
+    force = force - jnp.array([0.0, PARAMS["g"]])
+    return force - (v @ v + q @ force) / (q @ q) * q
+
+
+def of_two(q, v, force):
+    """Those of the double pendulum under a torque on each rod."""
+    only_first = accelerations(q, v, PARAMS, force[0])
+    c = jnp.cos(q[0] - q[1])
+    return only_first + force[1] * jnp.stack([-c, 2 * jnp.ones_like(c)]) / (2 - c**2)
+
+
+def returned(q, v):
+    """A state returned to the unit rod."""
+    q = q / jnp.sqrt(q @ q)
+    return q, v - (v @ q) * q
+
+
+class UnderNetwork(NamedTuple):
+    """A system, its accelerations by hand, a start, and the return to the constraint by hand."""
+
+    system: lj.System
+    by_hand: Callable
+    start: tuple
+    back: Callable = lambda q, v: (q, v)
+
+
+UNIT_ROD = {"rod": lj.Holonomic(lambda t, q, p: 0.5 * (q @ q - 1.0))}
+UNDER_NETWORKS = {
+    "pendulum": UnderNetwork(
+        lj.System(lambda t, q, v, p: 0.5 * v**2 + p["g"] * jnp.cos(q), force=by_network),
+        lambda q, v, force: force - PARAMS["g"] * jnp.sin(q), (0.5, 0.3),
+    ),
+    "double pendulum": UnderNetwork(
+        lj.System(lagrangian, force=by_network), of_two,
+        (np.array([0.5, 0.8]), np.array([0.3, -0.2])),
+    ),
+    "double pendulum by names": UnderNetwork(
+        lj.System(
+            lambda t, q, v, p: lagrangian(t, together(q), together(v), p),
+            force=lambda *state: by_name(by_network(*state)),
+        ),
+        lambda q, v, force: by_name(of_two(together(q), together(v), together(force))),
+        ({"one": 0.5, "two": 0.8}, {"one": 0.3, "two": -0.2}),
+    ),
+    "rod": UnderNetwork(
+        lj.System(lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[1], UNIT_ROD, force=by_network), on_rod,
+        (np.array([0.6, -0.8]), np.array([0.4, 0.3])), returned,
+    ),
+}  # fmt: skip
+
+
+def rolled_by_hand(case, q, v, p, steps):
+    """The states after each of so many steps of Kutta's method."""
+
+    def f(q, v):
+        return case.by_hand(q, v, case.system.force(0.0, q, v, p))
+
+    def moved(y, h, k):
+        return jax.tree.map(lambda x, k: x + h * k, y, k)
+
+    def step(y, _):
+        q, v = y
+        k1, l1 = v, f(q, v)
+        k2, l2 = moved(v, WITH_NETWORK / 2, l1), f(moved(q, WITH_NETWORK / 2, k1), moved(v, WITH_NETWORK / 2, l1))
+        k3, l3 = moved(v, WITH_NETWORK / 2, l2), f(moved(q, WITH_NETWORK / 2, k2), moved(v, WITH_NETWORK / 2, l2))
+        k4, l4 = moved(v, WITH_NETWORK, l3), f(moved(q, WITH_NETWORK, k3), moved(v, WITH_NETWORK, l3))
+        sums = (
+            jax.tree.map(lambda a, b, c, d: a + 2 * b + 2 * c + d, *k) for k in ((k1, k2, k3, k4), (l1, l2, l3, l4))
+        )
+        y = case.back(*(moved(x, WITH_NETWORK / 6, k) for x, k in zip(y, sums)))
+        return y, y
+
+    return lax.scan(step, (q, v), None, steps)[1]
+
+
+def rolled(case, q, v, p, steps):
+    """The same by `rollout`."""
+    _, q, v = lj.rollout(case.system, q, v, p, steps, WITH_NETWORK)
+    return jax.tree.map(lambda x: x[1:], (q, v))
+
+
+def networks(options):
+    """Print a line for each system, network, number of lanes and quantity."""
+    for name, (width, depth), lanes in product(UNDER_NETWORKS, NETWORKS, (1, 64)):
+        title = f"{name}, {width} x {depth}, {lanes} lanes"
+        if options.only in title:
+            under_network(title, UNDER_NETWORKS[name], width, depth, lanes, options.repeats)
+
+
+def under_network(title, case, width, depth, lanes, repeats):
+    """Print the lines of one system with one network."""
+    inputs = sum(np.size(x) for x in jax.tree.leaves(case.start))
+    outputs = "scalar" if inputs == 2 else inputs // 2
+    net = eqx.nn.MLP(inputs, outputs, width, depth, activation=jnp.tanh, key=jax.random.key(0))
+    weights, rest = eqx.partition({"net": net}, eqx.is_array)
+    q, v = jax.tree.map(jnp.asarray, case.start)
+    if lanes > 1:
+        # The same start, seen in other mirrors and at other speeds, stays on a rod.
+        speeds = jnp.linspace(0.5, 1.5, lanes)
+        q = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), q)
+        v = jax.tree.map(lambda x: jnp.multiply.outer(speeds, x), v)
+
+    def motion(rolled, weights):
+        def one(q, v):
+            return rolled(case, q, v, PARAMS | eqx.combine(weights, rest), WITH_STEPS)
+
+        return (jax.vmap(one) if lanes > 1 else one)(q, v)
+
+    # From Python the scan by hand is jitted, and what is made of its results is not.
+    scan, rollout = jax.jit(partial(motion, rolled_by_hand)), partial(motion, rolled)
+
+    def slopes(motion):
+        return jax.grad(lambda weights: sum(jnp.mean(x**2) for x in jax.tree.leaves(motion(weights))))
+
+    for what, (hand, mine) in {"motion": (scan, rollout), "gradient": (slopes(scan), slopes(rollout))}.items():
+        programs, firsts = [], []
+        for function in (hand, mine):
+            started = time.process_time()
+            programs.append(jax.jit(function).lower(weights).compile())
+            firsts.append(time.process_time() - started)
+        found = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(f(weights))]) for f in programs]
+        inside = measure.in_turn(*(partial(f, weights) for f in programs), repeats=repeats)
+        outside = measure.in_turn(partial(hand, weights), partial(mine, weights), repeats=repeats)
+        print(
+            f"{title}, {what:8}: {inside.ratio(1, 0)[0]:.2f} of the time by hand ({1e3 * inside.medians[0]:.1f} ms); "
+            f"from Python {outside.ratio(1, 0)[0]:.2f} ({1e3 * outside.medians[0]:.1f} ms); first "
+            f"{firsts[1] / firsts[0]:.1f} ({firsts[0]:.1f} s); differ by {np.max(np.abs(found[0] - found[1])):.0e}",
+            flush=True,
+        )
+
+
 def main():
     """Print one line for each comparison."""
     parser = argparse.ArgumentParser(description="Steps beside a Runge-Kutta loop by hand.")
     parser.add_argument("--processor-time", action="store_true")
+    parser.add_argument("--networks", action="store_true", help="with a network in the force, and nothing else")
+    parser.add_argument("--only", default="", help="networks whose row contains it")
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.processor_time:
         measure.CLOCK["seconds"] = time.process_time
+    if options.networks:
+        networks(options)
+        return
     one_lane(options)
     random = np.random.default_rng(0)
 

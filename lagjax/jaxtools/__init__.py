@@ -65,6 +65,7 @@ from lagjax.jaxtools.jaxpr import (
     written,
 )
 from lagjax.jaxtools.kept import LATER, TALLY, KeptProgram, NotKept, Said, Unusable
+from lagjax.jaxtools.many_steps import steps_in_both_modes
 from lagjax.jaxtools.names import named, surroundings_for_names
 from lagjax.jaxtools.open_jumps import (
     COMPARISONS,

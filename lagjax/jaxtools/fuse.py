@@ -589,6 +589,23 @@ def _pushed_batched(operands: Sequence, axes: Sequence, *, of: _Function, moved:
     return found, [0] * len(found)
 
 
+def function_of(function: Callable, lanes: bool, *operands) -> list:
+    """A function of arrays, which returns a list of them, in both modes; `lanes`: whether it is one of a batch."""
+    return _function_p.bind(*operands, of=_Function(function, lanes))
+
+
+def function_in_lanes(function: Callable, lanes: bool, operands: Sequence, axes: Sequence) -> tuple[list, list]:
+    """The same in a batch, with the axes of its results."""
+    operands, batched, _ = front(operands, axes)
+    found = _function_p.bind(*operands, of=_Function(function, lanes).in_lanes(batched, lanes))
+    return found, [0] * len(found)
+
+
+def pushed_again(function: Callable, lanes: bool, primals: Sequence, tangents: Sequence) -> list:
+    """The derivatives of its results."""
+    return _function_jvp(primals, tangents, of=_Function(function, lanes))[1]
+
+
 _function_p = primitive(
     "lagjax_function", _evaluated, _shapes, several=True, jvp=_function_jvp, batched=_function_batched
 )

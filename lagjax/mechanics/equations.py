@@ -35,6 +35,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -43,6 +44,7 @@ from lagjax.jaxtools import (
     TooLong,
     compiled,
     decided,
+    depends,
     is_array,
     is_plain,
     jitted,
@@ -98,12 +100,14 @@ SMALL_CORRECTION = 1e-7
 class WrittenOut(NamedTuple):
     """`equations(model, t, q, v)` -> (a, multipliers stacked), with more: `Known`; `project(same)` -> (q, v).
 
-    `may_fail` says whether either may give NaN where the robust way does not.
+    `may_fail` says whether either may give NaN where the robust way does not. With `force_apart` the force is computed
+    in arrays, and is an argument of `equations`.
     """
 
     equations: Numbers
     project: Numbers | None
     may_fail: bool
+    force_apart: bool = False
 
     @property
     def length(self) -> int:
@@ -117,9 +121,26 @@ def has_networks(model: Model | PyTree) -> bool:
     return any(x.ndim > 1 and x.size >= MATRIX for x in arrays)
 
 
-def is_small(model: Model) -> bool:
-    """Whether the equations of a system are to be written out."""
-    if is_plain() or has_networks(model) or model.solves_itself:
+def has_networks_in_force_alone(model: Model) -> bool:
+    """Whether nothing but the force of a model takes matrices as large as those of a network."""
+    if model.system.force is None or model.reacts or model.form.first_order is not None:
+        return False
+    arrays, rest = eqx.partition(model, is_array)
+
+    def others(arrays: Model, t: Array, x: Array, u: Array):
+        model = eqx.combine(arrays, rest)
+        dissipation = None if model.system.dissipation is None else model.dissipation(t, x, u)
+        return model.lagrangian(t, x, u), dissipation, constraints.residuals(model, t, x, u)
+
+    t, y = (jax.ShapeDtypeStruct(shape, model.form.dtype) for shape in ((), (model.n,)))
+    program = jax.make_jaxpr(others)(arrays, t, y, y).jaxpr
+    large = [x for x in program.invars[:-3] if x.aval.ndim > 1 and x.aval.size >= MATRIX]
+    return not depends(program, large)
+
+
+def is_small(model: Model, force_apart: bool = False) -> bool:
+    """Whether the equations of a system are to be written out, all of them or with the `force_apart`."""
+    if is_plain() or model.solves_itself or has_networks(model) and not force_apart:
         return False
     if model.n + model.m > (CONSTRAINED_UP_TO if model.m else UP_TO):
         return False
@@ -127,18 +148,21 @@ def is_small(model: Model) -> bool:
     return not without_mass(model).any()
 
 
-def write_out(model: Model) -> WrittenOut | None:
+def write_out(model: Model, force_apart: bool = False) -> WrittenOut | None:
     """Write out the equations of a small system in single numbers. None if L makes them too long."""
     diagonal = model.m == 0 and is_diagonal(model)
     most = CONSTRAINED_LONG if model.m else LONG
     try:
-        equations = Numbers(partial(_equations, diagonal), model, most=ON_THE_WAY * most, has_more=True)
+        of_state = partial(_equations, diagonal)
+        equations = Numbers(of_state, model, most=ON_THE_WAY * most, has_more=True, force_apart=force_apart)
     except TooLong:
         return None
     if equations.length > most:
         return None
-    project = Numbers(partial(_projected, equations.more), model) if model.is_returned else None
-    return WrittenOut(equations, project, may_fail=not diagonal)
+    # M and A, which the return takes from the equations, are the same under any force.
+    known_of = partial(equations.more, force=(np.zeros((), model.form.dtype),) * model.n if force_apart else None)
+    project = Numbers(partial(_projected, known_of), model) if model.is_returned else None
+    return WrittenOut(equations, project, not diagonal, force_apart)
 
 
 def _equations(diagonal, model: Model, t: Array, q: PyTree, v: PyTree):
@@ -313,7 +337,10 @@ class Equations(eqx.Module):
     def fast(self, t: Array, q: PyTree, v: PyTree):
         """The accelerations, and the multipliers in one vector, by the written-out equations."""
         assert self.written is not None
-        return kept_as_call(self.written.equations.at(self.prepared[0], t, q, v))
+        force = None
+        if self.written.force_apart:
+            force = tuple(x.astype(t.dtype) for x in self.model.force_at(t, q, v))
+        return kept_as_call(self.written.equations.at(self.prepared[0], t, q, v, force))
 
     def projected(self, t: Array, q: PyTree, v: PyTree):
         """The state returned to the constraints, by the written-out equations; NaN where it is not near them."""
@@ -349,21 +376,25 @@ class Equations(eqx.Module):
         return self.form.row_sizes(self.model, t, *self.model.vectors(q, v))
 
 
-def equations_of(model: Model, *, fast: bool = False, fallback: bool = True, differentiated: bool = False) -> Equations:
+def equations_of(
+    model: Model, *, fast: bool = False, fallback: bool = True, differentiated: bool = False, apart: bool = False
+) -> Equations:
     """The equations of a model.
 
     With `fast` the equations of a small system are also written out, and take states number by number
-    (`Equations.inside`); not if they are to be `differentiated` and are long. Without `fallback` they are assumed
-    regular; the caller deals with states where they are not.
+    (`Equations.inside`); not if they are to be `differentiated` and are long. With `apart` also those with a network in
+    the force alone, whose force is an argument. Without `fallback` they are assumed regular; the caller deals with
+    states where they are not.
     """
     written, users, prepared = None, None, (None, None)
     model = with_first_order(model)
-    if fast and is_small(model):
+    apart = apart and has_networks(model) and has_networks_in_force_alone(model)
+    if fast and is_small(model, apart):
         numbers = in_numbers(model)
         leaves, structure = jtu.tree_flatten(numbers)
         leaves = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves)
         # In a watched motion a failed check of the user's becomes NaN in the equations.
-        written = _written(structure, leaves, WATCHED.value)
+        written = _written(structure, leaves, WATCHED.value, apart)
         if differentiated and written is not None and written.length > LONG_TO_DIFFERENTIATE:
             written = None
         else:
@@ -389,8 +420,8 @@ def _named(model: Model) -> str:
 
 # A motion is traced several times (with and without the robust way, for derivatives, in lanes) with these equations.
 @once
-def _written(structure, leaves: tuple, watched: bool) -> WrittenOut | None:
-    return write_out(jtu.tree_unflatten(structure, leaves))
+def _written(structure, leaves: tuple, watched: bool, apart: bool) -> WrittenOut | None:
+    return write_out(jtu.tree_unflatten(structure, leaves), apart)
 
 
 # Jitted, so that JAX traces L once for all the places of a compiled trajectory that need it.

@@ -99,16 +99,20 @@ class Numbers:
     What depends on the model alone is computed by `prepare`, once; `at` does the rest. `calls_host` says whether a
     user's function calls Python at run time. Beyond about `most` operations it raises `TooLong`.
 
-    A function that `has_more` returns its result and what else it knows, which only `with_more_at` returns.
+    A function that `has_more` returns its result and what else it knows, which only `with_more_at` returns. With
+    `force_apart` the force, a tuple of numbers, is an argument like q and v, and that of the model is not called.
     """
 
-    def __init__(self, function: Callable, model: Model, most=math.inf, has_more: bool = False):
-        arrays, static = eqx.partition((model, *model.form.example), varies)
+    def __init__(
+        self, function: Callable, model: Model, most=math.inf, has_more: bool = False, force_apart: bool = False
+    ):
+        force = model.form.example[1] if force_apart else None
+        arrays, static = eqx.partition((model, *model.form.example, force), varies)
         self.shapes = []
 
         def of_leaves(*leaves):
-            args = eqx.combine(jtu.tree_unflatten(jtu.tree_structure(arrays), leaves), static)
-            found = function(*args)
+            model, *state, force = eqx.combine(jtu.tree_unflatten(jtu.tree_structure(arrays), leaves), static)
+            found = function(_under(force, model) if force_apart else model, *state)
             self.shapes += map(jtu.tree_structure, found if has_more else (found,))
             return jtu.tree_leaves(found)
 
@@ -120,7 +124,7 @@ class Numbers:
         program = _without_unused(program)
         full = jax.make_jaxpr(lambda *leaves: written_out(program, *leaves, most=most))(*like)
         self.program = _without_unused(full)
-        of_problem, of_state = _leaves_of(arrays, (0,)), _leaves_of(arrays, (1, 2, 3))
+        of_problem, of_state = _leaves_of(arrays, (0,)), _leaves_of(arrays, (1, 2, 3, 4))
         self.state_variables = [self.program.jaxpr.invars[i] for i in of_state]
         early, late = staged(self.program, of_problem, of_state)
         count = self.shapes[0].num_leaves
@@ -140,23 +144,29 @@ class Numbers:
         """What does not depend on the state; None if there is nothing, since equinox mishandles `()`."""
         return tuple(self._early(*jtu.tree_leaves(eqx.filter(model, varies)))) or None
 
-    def at(self, prepared, t: Array, q: PyTree, v: PyTree):
+    def at(self, prepared, t: Array, q: PyTree, v: PyTree, force: tuple | None = None):
         """The function's result at a state."""
-        return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v))))
+        return jtu.tree_unflatten(self.shapes[0], self._late(prepared or (), *jtu.tree_leaves((t, q, v, force))))
 
     def with_more_at(self, prepared, t: Array, q: PyTree, v: PyTree) -> list:
         """The function's result and what else it returns, at a state."""
         found = iter(self._late_with_more(prepared or (), *jtu.tree_leaves((t, q, v))))
         return [jtu.tree_unflatten(shape, islice(found, shape.num_leaves)) for shape in self.shapes]
 
-    def more(self, model: Model, t: Array, q: PyTree, v: PyTree):
+    def more(self, model: Model, t: Array, q: PyTree, v: PyTree, force: tuple | None = None):
         """What else the function returns."""
         alone = outputs_of(self.program, range(self.shapes[0].num_leaves, len(self.program.out_avals)))
-        return jtu.tree_unflatten(self.shapes[1], run(alone, jtu.tree_leaves(eqx.filter((model, t, q, v), varies))))
+        given = jtu.tree_leaves(eqx.filter((model, t, q, v, force), varies))
+        return jtu.tree_unflatten(self.shapes[1], run(alone, given))
 
     def __call__(self, model: Model, t: Array, q: PyTree, v: PyTree):
         """The function's result."""
         return self.at(self.prepare(model), t, q, v)
+
+
+def _under(force: tuple, model: Model) -> Model:
+    """The model under a given force."""
+    return model.mapped(lambda function, role: (lambda *state: force) if role == "force" else function)
 
 
 def _without_unused(program):

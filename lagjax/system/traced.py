@@ -2,8 +2,9 @@
 
 At each call from Python, each of the user's functions is traced on shapes, and a compiled program is used again only
 for the same jaxprs; arrays that a function reads from outside, however it comes by them, are arguments of the program.
-A function that names nothing from outside but library modules, builtins and functions like itself is traced once; so
-are joints, energies and loads of bodies that hold numbers and such functions.
+A function that names nothing from outside but library modules, builtins, numbers and functions like itself is traced
+once: with another number of that name it is another function. So are joints, energies and loads of bodies that hold
+numbers and such functions.
 
 So no value of the user's is ever read but by running his function, and no object stands in for another. Small arrays
 that a function reads are part of its jaxpr, as single numbers are. Tracing takes about half a millisecond.
@@ -90,7 +91,7 @@ def _binds(function: Callable, arguments):
 # jaxpr: the equations can then leave out what is multiplied by their zeros.
 SMALL, SMALL_INDICES = 1024, 4096
 # What a function may name and still be traced once: these libraries, but nothing in them that reads the outside.
-LIBRARIES = {"jax", "numpy", "math", "cmath", "operator", "functools", "itertools", "equinox"}
+LIBRARIES = {"jax", "numpy", "math", "cmath", "operator", "functools", "itertools", "equinox", "lagjax"}
 CHANGING = {
     "random", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "open", "input", "eval", "exec", "globals",
     "locals", "vars", "__import__", "modules", "environ", "import_module", "__globals__", "__dict__", "config",
@@ -272,10 +273,11 @@ def _is_small(x: Array):
 
 
 def names_outside(function: Callable) -> tuple | None:
-    """A function, its code and what both name from outside: library modules, builtins and functions like itself.
+    """A function, its code and what both name from outside: libraries, builtins, numbers and functions like itself.
 
-    An object of lagjax's that cannot be changed, as a joint or the energy of bodies, is a function with what it holds:
-    numbers, text, functions and other such objects. None where it may read anything else.
+    None where it may read anything else. No value is looked at: a number is known by being the very same object. An
+    object of lagjax's that cannot be changed, as a joint or the energy of bodies, is a function with what it holds:
+    numbers, text, functions and other such objects.
     """
     found: list = []
     return tuple(found) if _finds_names(function, found) else None
@@ -317,12 +319,16 @@ def _finds_names(function: Callable, found) -> bool:
     if any(x is function for x in found):
         return True
     names, opens_outside = _names_of(function.__code__)
-    if function.__closure__ or function.__defaults__ or function.__kwdefaults__ or function.__dict__ or opens_outside:
+    if function.__defaults__ or function.__kwdefaults__ or function.__dict__ or opens_outside:
+        return False
+    try:
+        enclosed = [cell.cell_contents for cell in function.__closure__ or ()]
+    except ValueError:
+        # One that is not filled yet.
         return False
     found += [function, function.__code__]
-    for name in names:
-        x = function.__globals__.get(name, MISSING)
-        if x is not MISSING and not _is_of_library(x) and not _finds_names(x, found):
+    for x in (*(function.__globals__.get(name, MISSING) for name in names), *enclosed):
+        if x is not MISSING and type(x) not in NUMBERS and not _is_of_library(x) and not _finds_names(x, found):
             return False
         found.append(Itself(x))
     return True
@@ -361,7 +367,15 @@ def _is_plain(x: Array) -> bool:
         return True
     if isinstance(x, eqx.Module) and _is_library(type(x).__module__):
         return all(_is_plain(getattr(x, field.name, None)) for field in dataclasses.fields(x))
-    return _is_of_library(x)
+    return _is_of_library(x) or _is_in_library(x)
+
+
+def _is_in_library(x: Any) -> bool:
+    """Whether it is a function without a name in a library, such as the activation of a network's last layer."""
+    module = getattr(x, "__module__", None) or ""
+    if type(x) is not types.FunctionType or not _is_library(module) or module not in sys.modules:
+        return False
+    return x.__globals__ is vars(sys.modules[module]) and _finds_names(x, [])
 
 
 # Functions stay as they are where lanes would save fewer operations: to bring operands together takes as many.

@@ -20,6 +20,7 @@ from lagjax.integrate.events.event import traced_guard
 from lagjax.jaxtools import cache
 from lagjax.system import coordinates, traced
 from lagjax.system.checks import traced_system
+from tests.by_numpy import network
 from tests.counting import compiles
 from tests.systems import PARAMS, TS, pendulum_lagrangian
 
@@ -311,12 +312,13 @@ def test_large_arrays_are_arguments():
 
 
 def test_what_names_nothing_outside_is_traced_once():
-    """Library modules, builtins and functions like itself may be named; twins: values, imports, random numbers."""
+    """Libraries, builtins, numbers and functions like itself may be named; twins: tables, imports, random numbers."""
     names = {"jnp": jnp, "np": np}
     source = """
 def helper(q): return sum([jnp.cos(q), np.pi])
 def plain(t, q, v, params): return 0.5 * v**2 + helper(q) + params["k"] * q
-def with_value(t, q, v, params): return 0.5 * v**2 + constant * q
+def with_number(t, q, v, params): return 0.5 * v**2 + constant * q
+def with_table(t, q, v, params): return 0.5 * v**2 + table[0] * q
 def with_import(t, q, v, params):
     import time
     return 0.5 * v**2 + time.time() * q
@@ -326,9 +328,16 @@ def with_eval(t, q, v, params): return eval("constant") * q
 """
     exec(source, names)
     assert traced.names_outside(names["plain"]) is not None
-    names["constant"] = 1.0
-    for name in ("with_value", "with_import", "with_random", "with_default", "with_eval"):
+    names |= {"constant": 1.0, "table": [1.0]}
+    for name in ("with_table", "with_import", "with_random", "with_default", "with_eval"):
         assert traced.names_outside(names[name]) is None, name
+    # The same number is the same function, in a cell too; another one is another.
+    of = lambda g: lambda t, q, v, params: 0.5 * v**2 + g * q
+    celled, first = of(1.0), traced.names_outside(names["with_number"])
+    assert first is not None and first == traced.names_outside(names["with_number"])
+    assert traced.names_outside(celled) is not None and traced.names_outside(of([1.0])) is None
+    names["constant"] = 2.0
+    assert first != traced.names_outside(names["with_number"])
     plain = lj.System(names["plain"])
     at = lambda: float(lj.jacobi_integral(plain, 0.0, 0.0, 0.0, {"k": 1.0}))
     np.testing.assert_allclose(at(), -1 - np.pi)
@@ -366,6 +375,19 @@ def test_code_in_params_is_run():
     for g in VALUES:
         held[0] = g
         assert float(lj.jacobi_integral(system, 0.0, 1.0, 0.0, params)) == g
+
+
+def test_networks_in_params_are_code_of_libraries():
+    """With them a force is traced once for all weights; twin: an activation of the user's own is run each time."""
+    system = lj.System(lambda t, q, v, params: 0.5 * v**2, force=lambda t, q, v, params: params["net"](q[None]))
+    cube = lambda x: x**3
+
+    def program(activation):
+        params = {"net": network(1, "scalar", 2, 1, activation=activation)}
+        return getattr(traced_system(system, coordinates.state(0.0, 1.0, 0.0, params)).force, "program")
+
+    assert program(jnp.tanh) is program(jnp.tanh)
+    assert program(cube) is not program(cube)
 
 
 def test_a_function_called_at_run_time():
