@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lagjax.jaxtools import Said, columns, from_python, outlined, rebuilt
+from tests.tiers import exhaustive_but
 
 X, Y = jnp.array([0.3, -0.7, 1.1]), jnp.asarray(2.0)
 SAID = Said(lambda: [], lambda tree: outlined(tree, {}), lambda outline, arrays: rebuilt(outline, {}))
@@ -88,9 +89,10 @@ WAYS = {
     "curvature in reverse": (lambda f: jax.jacrev(jax.jacrev(energy(f)))(X, Y), ["Columns", "Columns"]),
     "linear map": (lambda f: jax.jit(jax.linearize(lambda x: f(x, Y)["total"], X)[1])(X), ["Columns"]),
 }  # fmt: skip
+FAST = "slopes", "lanes of slopes", "slope of lanes", "curvature in reverse"
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", exhaustive_but(FAST, WAYS))
 def test_as_by_jax(way, run):
     """Every way gives what JAX gives, in one program and one run; again, by the same program."""
     act, steps = WAYS[way]
@@ -106,7 +108,7 @@ def test_what_has_no_columns(run):
     """Many numbers, a direction by several, and all that is in a program of the user's: JAX's own way."""
     reverse = lambda arrays: reference(*arrays[:2])
     many = jnp.linspace(0.1, 1.0, columns.FEW + 1)
-    both = lambda x: [energy(f)(x, Y) for f in (partial(ours, function=reverse), reference)]
+    both = lambda x: [energy(f)(x, Y) for f in (partial(ours, function=reverse), jax.jit(reference))]
     ways = [
         lambda i: jax.grad(lambda x: both(x)[i])(many),
         lambda i: jax.jvp(lambda x: both(x)[i], (X,), (X**2,)),
