@@ -61,6 +61,7 @@ ASKED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", exhaustive_but(("accelerations",), ASKED))
 def test_values_and_slopes(what):
     """As in closed form, of one k and of lanes; another k compiles nothing."""

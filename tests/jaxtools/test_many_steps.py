@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lagjax.jaxtools import steps_in_both_modes
 
@@ -46,6 +47,7 @@ def all_of(function):
     return jax.tree.leaves(jax.jit(found)(0.5, 0.3))
 
 
+@pytest.mark.slow
 def test_derivatives_of_many_steps():
     """Those of a loop by hand, by the second way where the first fails; twin: where it does not fail."""
     right = all_of(by_hand)
