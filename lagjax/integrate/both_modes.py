@@ -45,14 +45,15 @@ from jax.core import ShapedArray
 from jaxtyping import PyTree
 
 from lagjax.contexts import COLUMNS
-from lagjax.integrate.replay import Replay, filled
+from lagjax.integrate.replay import Replay
 from lagjax.jaxtools import (
     FEW,
     Columns,
     Lanes,
     ad,
-    along_columns,
     axes_of,
+    changes_from,
+    filled,
     front,
     have_columns,
     is_float,
@@ -382,9 +383,7 @@ def _by_columns(primals: Sequence, moved: Sequence[int], directions: Sequence, p
     columns = [ShapedArray((numbers, *y.shape), y.dtype) for y in results if is_float(y)]
     at_once = Columns(tuple(moved)).of(lambda leaves: list(rules.results(diffrax.ForwardMode(), *leaves)))
     found = _columns_p.bind(*primals, at_once=at_once, apart=apart, shapes=(*results, *columns))
-    values, columns = found[: len(results)], found[len(results) :]
-    dy = iter(along_columns(columns, directions))
-    return values, [next(dy) if is_float(y) else no_tangent(y) for y in values]
+    return changes_from(found, len(results), directions)
 
 
 def _columns(*leaves, at_once: Callable, apart: Callable, shapes: tuple):
@@ -519,12 +518,8 @@ def _along_axes(like, wanted: Sequence, push, cotangents: Sequence):
     starts, total = np.cumsum([0, *sizes]), sum(sizes)
     if not total:
         return [jnp.zeros(a.shape, a.dtype) for a, w in zip(like, wanted) if w]
-    axes = [
-        jnp.eye(total, a.size, -start, dtype=a.dtype).reshape(total, *a.shape)
-        if w
-        else jnp.zeros((total, *a.shape), a.dtype)
-        for a, w, start in zip(like, wanted, starts)
-    ]
+    chosen = iter(axes_of([a for a, w in zip(like, wanted) if w]))
+    axes = [next(chosen) if w else jnp.zeros((total, *a.shape), a.dtype) for a, w in zip(like, wanted)]
     dy = push(*axes)
     of_outputs = [jnp.sum((d * ct[None]).reshape(total, -1), axis=1) for d, ct in zip(dy, cotangents)]
     slopes = reduce(jnp.add, of_outputs)

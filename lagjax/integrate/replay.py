@@ -50,6 +50,7 @@ from lagjax.integrate.stepping import ProjectedSolver
 from lagjax.jaxtools import (
     PRODUCT,
     ad,
+    filled,
     front,
     is_float,
     length,
@@ -171,14 +172,6 @@ def together(leaves: Sequence, motion: BackwardMotion, lanes: Lanes | None, of_o
 
     summed = summed if lanes is None else jax.vmap(summed)
     return jax.tree.map(lambda ct: summed(first, ct), of_outputs)
-
-
-def filled(leaves: Sequence, moved: Sequence, chosen):
-    """The arrays, with those at the indices `moved` replaced by `chosen`."""
-    every = list(leaves)
-    for i, x in zip(moved, chosen):
-        every[i] = x
-    return every
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from lagjax.jaxtools.cache import (
     shape_of,
     varies,
 )
-from lagjax.jaxtools.columns import FEW, Columns, Lanes, along_columns, axes_of, from_python, have_columns
+from lagjax.jaxtools.columns import FEW, Columns, Lanes, axes_of, changes_from, from_python, have_columns
 from lagjax.jaxtools.compiled import compiled
 from lagjax.jaxtools.dependence import is_linear, pattern
 from lagjax.jaxtools.fuse import (
@@ -81,6 +81,7 @@ from lagjax.jaxtools.open_jumps import (
 from lagjax.jaxtools.outline import NoOutline, outlined, rebuilt
 from lagjax.jaxtools.primitives import (
     ad,
+    filled,
     front,
     is_float,
     jaxpr_as_fun,

@@ -25,7 +25,7 @@ from lagjax.jaxtools.cache import FACTS, compiler_options, is_array, program_of
 from lagjax.jaxtools.digest import trace_context
 from lagjax.jaxtools.kept import KeptProgram, Said, kind, kinds_from
 from lagjax.jaxtools.names import Traced, results_of, traced
-from lagjax.jaxtools.primitives import ad, front, is_float, jitted, no_tangent, one_by_one, primitive
+from lagjax.jaxtools.primitives import ad, filled, front, is_float, jitted, no_tangent, one_by_one, primitive
 from lagjax.jaxtools.tracing import HAPPENED, is_differentiated
 
 # By up to so many numbers, pushing along all of them was cheaper to run and to compile than one pull back through
@@ -81,7 +81,7 @@ class Columns(NamedTuple):
             moving = [arrays[i] for i in self.moved]
 
             def of_moving(*chosen):
-                return function(_with(arrays, self.moved, chosen))
+                return function(filled(arrays, self.moved, chosen))
 
             def push(*direction):
                 values, found = jax.jvp(of_moving, tuple(moving), direction)
@@ -195,16 +195,14 @@ def _pushed(primals: Sequence, tangents: Sequence, *, of: Outside, outputs: tupl
     if not have_columns([primals[i] for i in moved], directions):
         return _by_jax(primals, moved, directions, of)
     numbers = sum(primals[i].size for i in moved)
-    floats = [is_float(x) for x in kinds_from(outputs)]
-    columns = tuple(((numbers, *shape), *rest) for (shape, *rest), moves in zip(outputs, floats) if moves)
+    kinds = zip(outputs, kinds_from(outputs))
+    columns = tuple(((numbers, *shape), *rest) for (shape, *rest), x in kinds if is_float(x))
     try:
         found = _outside_p.bind(*primals, of=of.then(Columns(moved)), outputs=(*outputs, *columns))
     except TypeError:
         # A function of the user's that has derivatives in reverse only; what else is wrong, JAX says.
         return _by_jax(primals, moved, directions, of)
-    values, columns = found[: len(outputs)], found[len(outputs) :]
-    along = iter(along_columns(columns, directions))
-    return values, [next(along) if moves else no_tangent(x) for x, moves in zip(values, floats)]
+    return changes_from(found, len(outputs), directions)
 
 
 def have_columns(moved: Sequence, directions: Sequence) -> bool:
@@ -223,8 +221,14 @@ def _directions(tangent: Any) -> float:
     return 1 if hasattr(tangent, "tangent") else np.inf
 
 
+def changes_from(found: Sequence, count: int, directions: Sequence) -> tuple[list, list]:
+    """The first `count` of what was found, the values, and their changes along directions, from their columns."""
+    values, along = list(found[:count]), iter(_products(list(found[count:]), list(directions)))
+    return values, [next(along) if is_float(x) else no_tangent(x) for x in values]
+
+
 @jax.jit
-def along_columns(columns: list, directions: list) -> list:
+def _products(columns: list, directions: list) -> list:
     """The sums of columns, each times its number of the directions."""
     along = jnp.concatenate([jnp.ravel(d) for d in directions])
     return [jnp.tensordot(along.astype(x.dtype), x, 1) for x in columns]
@@ -233,14 +237,8 @@ def along_columns(columns: list, directions: list) -> list:
 def _by_jax(primals: Sequence, moved: Sequence[int], directions: Sequence, of: Outside):
     part = program_of((_by_jax, of), lambda: jitted(of.in_both_modes))
     moving = tuple(primals[i] for i in moved)
-    values, found = jax.jvp(lambda *chosen: part(_with(primals, moved, chosen)), moving, tuple(directions))
+    values, found = jax.jvp(lambda *chosen: part(filled(primals, moved, chosen)), moving, tuple(directions))
     return values, [d if is_float(x) else no_tangent(x) for x, d in zip(values, found)]
-
-
-def _with(arrays: Sequence, moved: Sequence[int], chosen: Sequence) -> list:
-    """The arrays, with those at the indices `moved` replaced by `chosen`."""
-    new = dict(zip(moved, chosen))
-    return [new.get(i, x) for i, x in enumerate(arrays)]
 
 
 def axes_of(arrays: Sequence) -> list:

@@ -33,7 +33,7 @@ from jax.interpreters import ad
 from jaxtyping import Array, PyTree
 
 from lagjax.jaxtools.fuse import function_in_lanes, function_of, one_function, pushed_again
-from lagjax.jaxtools.primitives import front, is_float, linear_map_primitive, no_tangent, primitive, split
+from lagjax.jaxtools.primitives import filled, front, is_float, linear_map_primitive, no_tangent, primitive, split
 from lagjax.jaxtools.tracing import is_plain
 
 
@@ -59,10 +59,7 @@ def steps_in_both_modes(ways: Sequence[Callable], y: PyTree, rows: PyTree, fixed
     counts = len(jtu.tree_leaves(y)), len(jtu.tree_leaves(rows))
 
     def of_leaves(way: Callable, *operands):
-        given = list(leaves)
-        for i, x in zip(arrays, operands):
-            given[i] = x
-        return jtu.tree_leaves(way(*jtu.tree_unflatten(structure, given)))
+        return jtu.tree_leaves(way(*jtu.tree_unflatten(structure, filled(leaves, arrays, operands))))
 
     operands = [leaves[i] for i in arrays]
     leaves = [None if i in arrays else x for i, x in enumerate(leaves)]
@@ -220,10 +217,7 @@ def _of(way: Callable, at: list, places: tuple) -> tuple[Callable, list]:
     chosen = list(chain(*places))
 
     def of_chosen(*given):
-        operands = list(at)
-        for i, x in zip(chosen, given):
-            operands[i] = x
-        return [x.astype(old.dtype) for x, old in zip(way(*operands), at)]
+        return [x.astype(old.dtype) for x, old in zip(way(*filled(at, chosen, given)), at)]
 
     return of_chosen, [at[i] for i in chosen]
 

@@ -12,7 +12,7 @@ a batch later, in a `vmap` or a derivative outside.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial, wraps
 
 import equinox as eqx
@@ -161,10 +161,7 @@ def _pushed(function: Callable, primals: Sequence, tangents: Sequence):
 
     def along(primals: Sequence, moving):
         def of_moved(*chosen):
-            operands = list(primals)
-            for i, x in zip(moved, chosen):
-                operands[i] = x
-            return function(*operands)
+            return function(*filled(primals, moved, chosen))
 
         return jax.jvp(of_moved, tuple(primals[i] for i in moved), tuple(moving))
 
@@ -247,7 +244,8 @@ mlir.register_lowering(_library_p, mlir.lower_fun(_each, multiple_results=True),
 
 
 __all__ = [
-    "Primitive", "ad", "front", "is_float", "jaxpr_as_fun", "linear_map_primitive", "no_tangent", "primitive", "split",
+    "Primitive", "ad", "filled", "front", "is_float", "jaxpr_as_fun", "linear_map_primitive", "no_tangent", "primitive",
+    "split",
 ]  # fmt: skip
 
 
@@ -320,6 +318,14 @@ def linear_map_primitive(
 def split(operands: Sequence, count: int) -> tuple[tuple, tuple]:
     """The points and the last `count` operands, which are directions at them."""
     return tuple(operands[: len(operands) - count]), tuple(operands[len(operands) - count :])
+
+
+def filled(arrays: Sequence, moved: Sequence[int], chosen: Iterable) -> list:
+    """The arrays, with those at the indices `moved` replaced by `chosen`."""
+    every = list(arrays)
+    for i, x in zip(moved, chosen):
+        every[i] = x
+    return every
 
 
 def front(operands: Sequence, axes: Sequence[int | None]) -> tuple[list, tuple[bool, ...], int]:
