@@ -126,6 +126,21 @@ def test_what_has_no_columns(run):
     )
 
 
+@jax.custom_vjp
+def squared(x):
+    """A function of the user's with a derivative of its own, in reverse only."""
+    return x**2
+
+
+squared.defvjp(lambda x: (x**2, x), lambda x, slope: (3 * slope * x,))
+
+
+def test_derivatives_in_reverse_only():
+    """They are taken JAX's way, and are the user's own."""
+    function = lambda arrays: {"energy": jnp.sum(squared(arrays[0]))}
+    np.testing.assert_allclose(jax.grad(lambda x: ours(x, Y, function)["energy"])(X), 3 * X)
+
+
 AFTERWARDS = """
 import jax
 import jax.numpy as jnp
